@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.cli import EXTRA_OF_MODULE, SUB_COMMANDS
+from mrbokeh.cli import EXTRA_OF_MODULE, SUB_COMMANDS, main
 from mrbokeh.images.image_io import read_layer, write_layer
 from mrbokeh.images.layer import Layer
+from mrbokeh.system.errors import FAULT
 from tests.scenes.command_line import mrbokeh
 
 COMMANDS = [
@@ -135,3 +136,23 @@ def test_doctor_says_what_to_do_about_a_second_opencv(monkeypatch: pytest.Monkey
     assert found.found is None and "pip uninstall -y opencv-python opencv-contrib-python-headless" in found.remedy
     del installed["opencv-python"]
     assert next(each for each in doctor.findings() if each.name == doctor.OPENCV).found == "5.0"
+
+
+def test_a_fault_of_ours_is_one_sentence_with_its_traceback_in_a_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken() -> None:
+        raise ZeroDivisionError("division by zero\nin a loop")
+
+    monkeypatch.setattr("mrbokeh.cli.app", broken)
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr(sys, "argv", ["mrbokeh", "render", "--rgb", "a.exr"])
+    with pytest.raises(SystemExit) as stop:
+        main()
+    (kept,) = tmp_path.iterdir()
+    told = capsys.readouterr().err
+    assert stop.value.code == FAULT and "a fault of mrbokeh (ZeroDivisionError: division by zero)" in told and str(kept) in told
+    assert "Traceback" not in told and "mrbokeh render --rgb a.exr" in kept.read_text() and "in a loop" in kept.read_text()
+    monkeypatch.setattr(sys, "argv", ["mrbokeh", "--debug", "render"])
+    with pytest.raises(ZeroDivisionError):
+        main()

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from datasets_scripts.gallery.headless_chromium import CHROMIUM, Page, chromium_page
-from tests.scenes.made_viewfinder import LENS_RGB, VIEW_RGB, Made, in_time, made_viewfinder
+from tests.scenes.made_viewfinder import LENS_RGB, VIEW_RGB, Made, made_viewfinder
+from tests.scenes.waiting import in_time
 from viewfinder.server.access import Access
 from viewfinder.server.sessions import Role, Sessions
 

@@ -21,7 +21,7 @@ from mrbokeh.images.layer import clear
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import inverted
-from tests.live.test_sources_browser import Canvas, Sender
+from tests.scenes.browser_sender import Canvas, Sender
 from tests.scenes.phone_on_camera import (
     CAMERA_FROM_PHONE,
     PHONE,

@@ -8,7 +8,8 @@ from typing import Any
 import aiohttp
 import pytest
 
-from tests.scenes.made_viewfinder import Made, in_time, made_viewfinder
+from tests.scenes.made_viewfinder import Made, made_viewfinder
+from tests.scenes.waiting import in_time
 from viewfinder.server.access import Access, host_name, is_loopback, needed_role, objection
 from viewfinder.server.sessions import RateLimit, Role, Sessions
 

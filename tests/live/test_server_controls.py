@@ -10,7 +10,8 @@ import aiohttp
 import pytest
 
 from mrbokeh.system.errors import InputError
-from tests.scenes.made_viewfinder import MadeControls, in_time, made_viewfinder
+from tests.scenes.made_viewfinder import MadeControls, made_viewfinder
+from tests.scenes.waiting import in_time
 from viewfinder.server.control_messages import (
     Capture,
     Choose,

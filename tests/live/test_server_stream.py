@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import pytest
 
-from tests.scenes.made_viewfinder import LENS_RGB, SQUARE, MadeControls, in_time, made_frame, made_viewfinder
+from tests.scenes.made_viewfinder import LENS_RGB, SQUARE, MadeControls, made_frame, made_viewfinder
+from tests.scenes.waiting import in_time
 from viewfinder.frames import frame_header
 from viewfinder.server import jpeg_stream
 from viewfinder.server.jpeg_stream import JpegStream, jpeg_message

@@ -5,72 +5,25 @@ import json
 import math
 import random
 import threading
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
-from fractions import Fraction
 from threading import Event
 from typing import Any
 
 import aiohttp
 import aiortc
-import av
 import numpy as np
 import pytest
 from aiohttp import web
 
 from mrbokeh.system.errors import InputError
+from tests.scenes.browser_sender import HEIGHT, WIDTH, Canvas, Sender
+from tests.scenes.waiting import comes_true, in_time
 from viewfinder.frames import CameraFrame
 from viewfinder.sources.browser_camera import LONGEST_OFFER_BYTES, BrowserCameraSource
 from viewfinder.sources.camera_message import LONGEST_MESSAGE, CameraKnowledge
 
-WIDTH, HEIGHT, FPS = 160, 112, 20
 RED, GREEN = (40, 60, 200), (60, 190, 50)
-
-
-class Canvas(aiortc.VideoStreamTrack):
-    """One colour (blue, green, red) in a size that can be changed while it runs, as browsers do."""
-
-    def __init__(self, bgr: tuple[int, int, int]) -> None:
-        super().__init__()
-        self.bgr, self.size_px, self.noise, self._count = bgr, (WIDTH, HEIGHT), 0, 0
-
-    async def recv(self) -> av.VideoFrame:
-        await asyncio.sleep(1 / FPS)
-        width_px, height_px = self.size_px
-        picture = np.full((height_px, width_px, 3), self.bgr, np.uint8)
-        if self.noise:
-            # So that a frame takes several packets.
-            picture += np.random.default_rng(self._count).integers(0, self.noise, picture.shape, np.uint8) // 2
-        frame = av.VideoFrame.from_ndarray(picture, "bgr24")
-        # What WebRTC codecs take: limited range, BT.601.
-        frame = frame.reformat(format="yuv420p", dst_colorspace=5, dst_color_range=1)
-        self._count += 1
-        frame.pts, frame.time_base = self._count * 90000 // FPS, Fraction(1, 90000)
-        return frame
-
-
-class Sender:
-    """A WHIP client: `location` is where it ends."""
-
-    def __init__(self, url: str, track: Canvas, codec: str = "video/VP8") -> None:
-        self.url, self.track, self.answers = url, track, list[dict[str, Any]]()
-        self.peer = aiortc.RTCPeerConnection(aiortc.RTCConfiguration(iceServers=[]))
-        self.channel = self.peer.createDataChannel("camera")
-        self.channel.on("message", lambda text: self.answers.append(json.loads(text)))
-        transceiver = self.peer.addTransceiver(track, direction="sendonly")
-        codecs = aiortc.RTCRtpSender.getCapabilities("video").codecs
-        transceiver.setCodecPreferences([each for each in codecs if each.mimeType == codec])
-        self.location = ""
-
-    async def start(self, session: aiohttp.ClientSession) -> None:
-        await self.peer.setLocalDescription(await self.peer.createOffer())
-        headers = {"Content-Type": "application/sdp"}
-        async with session.post(self.url + "/whip", data=self.peer.localDescription.sdp.encode(), headers=headers) as answer:
-            text = await answer.text()
-            assert answer.status == 201, text
-            assert answer.content_type == "application/sdp"
-            self.location = answer.headers["Location"]
-        await self.peer.setRemoteDescription(aiortc.RTCSessionDescription(text, "answer"))
 
 
 class Reader:
@@ -105,14 +58,6 @@ class Reader:
         return bool(np.abs(frame.bgr.reshape(-1, 3).mean(axis=0) - bgr).max() < 8)
 
 
-async def comes_true(condition: Callable[[], object], limit_s: float = 20.0) -> None:
-    for _ in range(int(limit_s / 0.05)):
-        if condition():
-            return
-        await asyncio.sleep(0.05)
-    raise AssertionError("it never came true")
-
-
 @asynccontextmanager
 async def serving(source: BrowserCameraSource) -> AsyncIterator[tuple[str, aiohttp.ClientSession, Reader]]:
     app = web.Application()
@@ -130,10 +75,6 @@ async def serving(source: BrowserCameraSource) -> AsyncIterator[tuple[str, aioht
         reader.stop()
         await source.close()
         await runner.cleanup()
-
-
-def in_time(work: Callable[[], Awaitable[None]], limit_s: float = 60.0) -> None:
-    asyncio.run(asyncio.wait_for(work(), limit_s))  # type: ignore[arg-type]
 
 
 @pytest.fixture(autouse=True)

@@ -19,6 +19,7 @@ import pytest
 from aiortc.codecs.h264 import H264Encoder
 from aiortc.rtp import RtpPacket
 
+from tests.scenes.waiting import wait_until
 from viewfinder.frames import CameraFrame
 from viewfinder.sources.network_stream import NetworkStreamSource
 
@@ -131,13 +132,6 @@ def first_like(frames: Iterator[CameraFrame], bgr: tuple[int, int, int], limit_s
     raise AssertionError("the stream ended")
 
 
-def until(condition: Callable[[], bool], limit_s: float = 25.0) -> None:
-    start_s = time.monotonic()
-    while not condition():
-        assert time.monotonic() - start_s < limit_s
-        time.sleep(0.02)
-
-
 @contextmanager
 def opened(source: NetworkStreamSource) -> Iterator[tuple[Iterator[CameraFrame], Event]]:
     stopping = Event()
@@ -173,7 +167,7 @@ def test_udp_comes_goes_and_comes_again() -> None:
             assert frame.bgr.shape == (HEIGHT, WIDTH, 3) and source.status is None and source.transfer == "bt709"
             assert next(frames).sequence > frame.sequence
         thread, _ = pumped(frames)
-        until(lambda: source.status is not None and "does not answer" in source.status)
+        wait_until(lambda: source.status is not None and "does not answer" in source.status)
         stopping.set()
         thread.join(10)
         assert not thread.is_alive()
@@ -186,7 +180,7 @@ def test_a_stream_that_is_restarted_goes_on() -> None:
         with http_server(port, lambda handler, stop: respond_mpegts(handler, stop, RED)):
             before = first_like(frames, RED)
             assert before.bgr.shape == (56, 80, 3)
-        until(lambda: source.status is not None)
+        wait_until(lambda: source.status is not None)
         assert "trying again" in str(source.status) or "waiting" in str(source.status)
         with http_server(port, lambda handler, stop: respond_mpegts(handler, stop, GREEN)):
             after = first_like(frames, GREEN)
@@ -272,7 +266,7 @@ def test_a_network_camera_over_rtsp_is_switched_off_and_on() -> None:
         with rtsp_camera(port, RED):
             before = first_like(frames, RED)
             assert before.bgr.shape == (HEIGHT, WIDTH, 3)
-        until(lambda: source.status is not None)
+        wait_until(lambda: source.status is not None)
         with rtsp_camera(port, GREEN):
             assert first_like(frames, GREEN).sequence > before.sequence
             assert source.status is None
@@ -374,7 +368,7 @@ def test_nobody_there_is_a_sentence_without_the_password() -> None:
     source = NetworkStreamSource(f"rtsp://me:secret@127.0.0.1:{port}/cam")
     stopping = Event()
     thread, got = pumped(source.frames(stopping))
-    until(lambda: "does not answer" in str(source.status))
+    wait_until(lambda: "does not answer" in str(source.status))
     stopping.set()
     thread.join(10)
     assert not thread.is_alive() and got == []

@@ -13,13 +13,14 @@ from aiohttp import web
 from datasets_scripts.gallery.headless_chromium import CHROMIUM, chromium_page
 from mrbokeh.compositing.overlay import Overlay
 from mrbokeh.video.color import code_from_linear
-from tests.scenes.streaming_viewers import BARS, Feed, bars, in_time, output, streaming
+from tests.scenes.streaming_viewers import BARS, Feed, bars, output, streaming
+from tests.scenes.waiting import in_time
 from viewfinder.streaming.alpha_stream import AlphaStream, obs_routes
 from viewfinder.streaming.whep import Whep
 
 pytestmark = [
     pytest.mark.browser,
-    pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed; streams are tested by viewers in this process only"),
+    pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed; the page is tested by clients in Python only"),
 ]
 
 PAGE = """<video autoplay muted playsinline></video><script>

@@ -7,35 +7,18 @@ from typing import Any
 import av
 import pytest
 
-from tests.scenes.streaming_viewers import bars, noise, output, streaming
+from tests.scenes.streaming_viewers import bars, ignore, noise, output, streaming, taken
+from tests.scenes.waiting import wait_until
 from viewfinder.streaming import encoded_stream
 from viewfinder.streaming.encoded_stream import EncodedStream
-from viewfinder.streaming.viewer_queue import EncodedFrame, ViewerQueue
-
-
-def ignore() -> None:
-    """Where nobody has to be woken."""
-
-
-def until(true: Any, limit_s: float = 10.0) -> None:
-    give_up_s = time.monotonic() + limit_s
-    while not true():
-        assert time.monotonic() < give_up_s, "never true"
-        time.sleep(0.001)
+from viewfinder.streaming.viewer_queue import EncodedFrame
 
 
 def push(stream: EncodedStream, sequence: int, codec: str = "H264", *, captured_s: float | None = None) -> None:
     """Show one picture and wait until it is encoded."""
     before = stream.encoded[codec]
     stream.show(output(noise(sequence), sequence, captured_s if captured_s is not None else sequence / 30))
-    until(lambda: stream.encoded[codec] > before)
-
-
-def taken(viewer: ViewerQueue) -> list[EncodedFrame]:
-    frames = []
-    while (frame := viewer.take()) is not None:
-        frames.append(frame)
-    return frames
+    wait_until(lambda: stream.encoded[codec] > before)
 
 
 def sequences(frames: list[EncodedFrame]) -> list[int]:
@@ -60,7 +43,7 @@ def test_three_viewers_get_the_packets_of_one_encoding() -> None:
         viewers = [stream.watch("H264", ignore) for _ in range(3)]
         for i in range(5):
             push(stream, i)
-        until(lambda: all(viewer.waiting == 5 for viewer in viewers))
+        wait_until(lambda: all(viewer.waiting == 5 for viewer in viewers))
         first, second, third = (taken(viewer) for viewer in viewers)
         assert stream.encoded == {"H264": 5}
         assert sequences(first) == [0, 1, 2, 3, 4]
@@ -78,7 +61,7 @@ def test_each_codec_is_encoded_once_while_it_has_viewers() -> None:
         stream.leave(vp8)
         push(stream, 3)
         assert stream.encoded == {"H264": 4, "VP8": 3}
-        until(lambda: set(stream._encoders) == {"H264"})
+        wait_until(lambda: set(stream._encoders) == {"H264"})
 
 
 def test_pictures_that_wait_are_replaced_before_they_are_encoded(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -98,9 +81,9 @@ def test_pictures_that_wait_are_replaced_before_they_are_encoded(monkeypatch: py
             stream.show(output(bars(), i, i / 30))
             assert entered.wait(10)
         gate.set()
-        until(lambda: stream.encoded["H264"] == 3)
+        wait_until(lambda: stream.encoded["H264"] == 3)
         # 1 was in work while the others came and went; 9 is the newest of them.
-        until(lambda: viewer.waiting == 3)
+        wait_until(lambda: viewer.waiting == 3)
         assert sequences(taken(viewer)) == [0, 1, 9]
 
 
@@ -110,7 +93,7 @@ def test_a_viewer_who_falls_behind_loses_all_and_comes_back_with_a_keyframe() ->
         seen = []
         for i in range(10):
             push(stream, i)
-            until(lambda: quick.waiting)
+            wait_until(lambda: quick.waiting)
             seen += taken(quick)
         # Four fitted; the fifth emptied the queue, and nobody made keyframes for a viewer who does not look.
         assert (slow.waiting, slow.dropped, slow.wants_frames) == (0, 10, False)
@@ -119,7 +102,7 @@ def test_a_viewer_who_falls_behind_loses_all_and_comes_back_with_a_keyframe() ->
         assert slow.wants_frames
         for i in range(10, 13):
             push(stream, i)
-            until(lambda: quick.waiting)
+            wait_until(lambda: quick.waiting)
             seen += taken(quick)
         back = taken(slow)
         assert sequences(back) == [10, 11, 12]
@@ -135,7 +118,7 @@ def test_nothing_is_encoded_for_viewers_who_all_stopped_looking() -> None:
         viewer = stream.watch("H264", ignore)
         for i in range(3):
             push(stream, i)
-        until(lambda: not stream.wants_frame)
+        wait_until(lambda: not stream.wants_frame)
         stream.show(output(bars(), 3))
         time.sleep(0.05)
         assert stream.encoded["H264"] == 3
@@ -156,7 +139,7 @@ def test_keyframes_asked_for_come_so_far_apart() -> None:
             push(stream, i)
         # One request, one keyframe.
         assert stream.keyframes["H264"] == 2
-        until(lambda: viewer.waiting == 7)
+        wait_until(lambda: viewer.waiting == 7)
         assert [frame.is_keyframe for frame in taken(viewer)] == [True, False, False, False, True, False, False]
 
 
@@ -167,7 +150,7 @@ def test_a_newcomer_begins_with_a_keyframe() -> None:
         push(stream, 1)
         newcomer = stream.watch("H264", ignore)
         push(stream, 2)
-        until(lambda: newcomer.waiting)
+        wait_until(lambda: newcomer.waiting)
         assert [(frame.header["sequence"], frame.is_keyframe) for frame in taken(newcomer)] == [(2, True)]
 
 
@@ -184,8 +167,8 @@ def test_a_change_of_size_goes_on_with_a_keyframe_of_the_new_size() -> None:
         viewer = stream.watch("H264", ignore)
         for i, size in enumerate([(320, 180), (320, 180), (161, 113), (161, 113)]):
             stream.show(output(bars(*size), i, i / 30))
-            until(lambda i=i: stream.encoded["H264"] == i + 1)
-        until(lambda: viewer.waiting == 4)
+            wait_until(lambda i=i: stream.encoded["H264"] == i + 1)
+        wait_until(lambda: viewer.waiting == 4)
         frames = taken(viewer)
         assert [frame.is_keyframe for frame in frames] == [True, False, True, False]
         decoder: Any = av.CodecContext.create("h264", "r")
@@ -200,7 +183,7 @@ def test_capture_times_are_those_of_the_packets() -> None:
         viewer = stream.watch("H264", ignore)
         for i, captured_s in enumerate(times_s):
             push(stream, i, captured_s=captured_s)
-        until(lambda: viewer.waiting == 6)
+        wait_until(lambda: viewer.waiting == 6)
         frames = taken(viewer)
     assert [frame.captured_s for frame in frames] == times_s
     # 90 kHz from the first one on; what is shown twice or steps back comes one tick later than what was before it.
@@ -227,9 +210,9 @@ def test_a_picture_that_cannot_be_encoded_does_not_end_the_stream(monkeypatch: p
         broken = stream._encoders["H264"]
         monkeypatch.setattr(broken, "encode", lambda *_: 1 / 0)
         stream.show(output(bars(), 1, 1.0))
-        until(lambda: stream._encoders.get("H264") is not broken)
+        wait_until(lambda: stream._encoders.get("H264") is not broken)
         push(stream, 2, captured_s=2.0)
-        until(lambda: viewer.waiting == 2)
+        wait_until(lambda: viewer.waiting == 2)
         assert [(frame.header["sequence"], frame.is_keyframe) for frame in taken(viewer)] == [(0, True), (2, True)]
 
 

@@ -2,8 +2,6 @@
 
 import sys
 import threading
-import time
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -129,13 +127,6 @@ def opened(monkeypatch: pytest.MonkeyPatch) -> list[FakeCamera]:
 
 def picture(width_px: int, height_px: int, code: int) -> OutputFrame:
     return OutputFrame(np.full((height_px, width_px, 3), (code, 0, 7), np.uint8), 0.0, 0, FrameStatus(1.0, 2.0))
-
-
-def wait_until(true: Callable[[], object]) -> None:
-    end_s = time.monotonic() + 5.0
-    while not true():
-        assert time.monotonic() < end_s, "never true"
-        time.sleep(0.01)
 
 
 def test_pictures_arrive_in_the_size_of_the_first(opened: list[FakeCamera]) -> None:

@@ -1,17 +1,21 @@
-"""WHEP with viewers in this process: real HTTP, ICE, DTLS and SRTP on loopback, real encoders and decoders."""
+"""WHEP with viewers in this process: real HTTP, ICE, DTLS and SRTP on loopback; what may be posted, and the addresses in offers."""
 
 import asyncio
 import re
 import threading
+import time
 
 import aiohttp
 import numpy as np
 import pytest
+from aiortc import RTCSessionDescription
 
 from mrbokeh.video.color import color_of
 from mrbokeh.video.frames import display_bgr
-from tests.scenes.streaming_viewers import BARS, HEIGHT, WIDTH, Feed, Viewer, bar_centres, comes_true, in_time, serving, streaming, watching
+from tests.scenes.streaming_viewers import BARS, HEIGHT, WIDTH, Feed, Viewer, bar_centres, serving, streaming, watching
+from tests.scenes.waiting import comes_true, in_time
 from tests.scenes.whep_viewers import PATIENT, SDP, whep_of
+from viewfinder.streaming.session_description import with_address
 from viewfinder.streaming.whep import Whep
 
 
@@ -98,3 +102,163 @@ def test_nothing_stays_after_the_server_is_closed() -> None:
 
     in_time(work)
     assert not {thread.name for thread in threading.enumerate()} & {"encode", "feed", "video-decoder"}
+
+
+@pytest.mark.parametrize(
+    ("body", "sentence"),
+    [
+        (b"", "SDP offer"),
+        (b"hello", "SDP offer"),
+        (b"\xff\xfe", "UTF-8"),
+        (b"v=0\r\n" * 20000, "65536"),
+        (b"v=0\r\no=- 1 1 IN IP4 0.0.0.0\r\ns=-\r\nt=0 0\r\nm=audio 9 UDP/TLS/RTP/SAVPF 0\r\na=recvonly\r\n", "one video section"),
+        (b"v=0\r\no=- 1 1 IN IP4 0.0.0.0\r\ns=-\r\nt=0 0\r\nm=video x y z\r\n", "SDP offer"),
+    ],
+)
+def test_what_is_no_offer_is_refused_with_a_sentence(body: bytes, sentence: str) -> None:
+    async def work() -> None:
+        with streaming() as stream:
+            async with whep_of(stream) as (whep, url), aiohttp.ClientSession() as session:
+                async with session.post(f"{url}/whep", data=body, headers=SDP) as answer:
+                    assert answer.status == 400
+                    assert sentence in (await answer.json())["error"]
+                assert whep.viewers == 0
+
+    in_time(work)
+
+
+def test_offers_that_cannot_be_served_leave_nothing_behind() -> None:
+    async def refused(session: aiohttp.ClientSession, url: str, sdp: str) -> str:
+        async with session.post(f"{url}/whep", data=sdp, headers=SDP) as answer:
+            assert answer.status == 400
+            return (await answer.json())["error"]
+
+    async def work() -> None:
+        viewer = Viewer()
+        await viewer.peer.setLocalDescription()
+        sdp = viewer.peer.localDescription.sdp
+        with streaming() as stream:
+            async with whep_of(stream) as (whep, url), aiohttp.ClientSession() as session:
+                await refused(session, url, sdp.replace("H264/90000", "AV1/90000").replace("VP8/90000", "H265/90000"))
+                assert "one video section" in await refused(session, url, sdp.replace("a=recvonly", "a=sendonly"))
+                await refused(session, url, re.sub("a=ice-(ufrag|pwd).*\r\n", "", sdp))
+                await refused(session, url, re.sub("a=fingerprint.*\r\n", "", sdp))
+                async with session.post(f"{url}/whep", data=sdp) as answer:
+                    assert answer.status == 415
+                assert whep.viewers == 0
+                assert stream.viewers == ()
+        await viewer.peer.close()
+
+    in_time(work)
+
+
+def test_names_that_only_multicast_resolves_are_not_waited_for() -> None:
+    """Chromium's .local names cost a second each way; none of these resolves. The connection stands nevertheless, on loopback."""
+
+    async def work() -> None:
+        with streaming() as stream, Feed(stream):
+            async with whep_of(stream) as (whep, url), aiohttp.ClientSession() as session:
+                viewer = Viewer()
+                await viewer.peer.setLocalDescription()
+                sdp = viewer.peer.localDescription.sdp
+                named = re.sub(r"(a=candidate:(?:\S+ ){4})\S+", r"\1nobody-has-this-name.local", sdp)
+                assert named.count(".local ") == sdp.count("a=candidate:") > 0
+                one_of_them = re.findall(r"a=candidate:.*\r\n", named)[0]
+                started_s = time.perf_counter()
+                async with session.post(f"{url}/whep", data=named, headers=SDP) as answer:
+                    await viewer.peer.setRemoteDescription(RTCSessionDescription(await answer.text(), "answer"))
+                    place = url + answer.headers["Location"]
+                headers = {"Content-Type": "application/trickle-ice-sdpfrag"}
+                async with session.patch(place, data="a=mid:0\r\n" + one_of_them, headers=headers) as later:
+                    assert later.status == 204
+                assert time.perf_counter() - started_s < 0.9, "less than aioice waits for one name"
+                (connection,) = whep._viewers.values()
+                known = connection.track.sender.transport.transport.getRemoteCandidates()
+                assert {each.ip for each in known if each.type == "host"} == {"127.0.0.1"}
+                await viewer.next()
+                await viewer.peer.close()
+
+    in_time(work)
+
+
+def test_places_are_limited_and_given_back() -> None:
+    async def work() -> None:
+        with streaming() as stream, Feed(stream):
+            async with whep_of(stream, viewers_limit=1) as (whep, url), aiohttp.ClientSession() as session, watching(url) as viewer:
+                await viewer.next()
+                second = Viewer()
+                await second.peer.setLocalDescription()
+                async with session.post(f"{url}/whep", data=second.peer.localDescription.sdp, headers=SDP) as answer:
+                    assert answer.status == 503
+                    assert "at most 1 viewers" in (await answer.json())["error"]
+                async with session.delete(url + viewer.location) as answer:
+                    assert answer.status == 200
+                assert (whep.viewers, stream.viewers) == (0, ())
+                async with session.delete(url + viewer.location) as answer:
+                    assert answer.status == 404
+                await second.connect(url, session)
+                await second.next()
+                await second.peer.close()
+                # A peer that says goodbye is gone at once.
+                await comes_true(lambda: whep.viewers == 0 and not stream.wants_frame)
+
+    in_time(work)
+
+
+def test_addresses_may_come_later() -> None:
+    async def work() -> None:
+        with streaming() as stream, Feed(stream):
+            async with whep_of(stream) as (whep, url), aiohttp.ClientSession() as session:
+                viewer = Viewer()
+                await viewer.peer.setLocalDescription()
+                sdp = viewer.peer.localDescription.sdp
+                lines = re.findall(r"a=candidate:.*\r\n", sdp.split("m=application")[0])
+                bare = re.sub(r"a=(candidate:.*|end-of-candidates)\r\n", "", sdp)
+                async with session.post(f"{url}/whep", data=bare, headers=SDP) as answer:
+                    place = url + answer.headers["Location"]
+                    await viewer.peer.setRemoteDescription(RTCSessionDescription(await answer.text(), "answer"))
+                headers = {"Content-Type": "application/trickle-ice-sdpfrag"}
+                async with session.patch(place, data="a=mid:0\r\n" + "".join(lines), headers=headers) as answer:
+                    assert answer.status == 204
+                (connection,) = whep._viewers.values()
+                known = connection.track.sender.transport.transport.getRemoteCandidates()
+                assert {each.port for each in known} >= {int(line.split()[5]) for line in lines}
+                async with session.patch(place, data="a=candidate:nonsense\r\n", headers=headers) as answer:
+                    assert answer.status == 400
+                async with session.patch(place, data="a=mid:0\r\n") as answer:
+                    assert answer.status == 415
+                async with session.patch(url + "/whep/nobody", data="", headers=headers) as answer:
+                    assert answer.status == 404
+                async with session.options(f"{url}/whep") as answer:
+                    assert (answer.status, answer.headers["Accept-Post"]) == (204, "application/sdp")
+                await viewer.next()
+                await viewer.peer.close()
+
+    in_time(work)
+
+
+NAMED = "a=candidate:383979905 1 udp 2113937151 05002700-30d8-431e-98c5-8a90d07e5099.local 42153 typ host generation 0 network-cost 999\r\n"
+"""As headless Chromium writes it."""
+
+ANSWERED = "a=candidate:383979905 1 udp 2113937151 192.168.1.7 42153 typ host generation 0 network-cost 999\r\n"
+PLAIN = "a=candidate:1 1 udp 2113937151 10.0.0.3 9000 typ host\r\na=candidate:2 1 udp 1677 198.51.100.4 9000 typ srflx raddr 0.0.0.0\r\n"
+REST = "v=0\r\no=- 1 1 IN IP4 host.local 42153 typ\r\na=mid:0\r\n"
+
+
+def test_names_become_the_address_and_the_rest_stays() -> None:
+    second = NAMED.replace("42153", "5000").replace("05002700", "A7FF5B81").replace(".local", ".LOCAL")
+    expected = REST + ANSWERED + PLAIN + ANSWERED.replace("42153", "5000")
+    assert with_address(REST + NAMED + PLAIN + second, "192.168.1.7") == expected
+
+
+@pytest.mark.parametrize(
+    ("remote", "written"),
+    [("::1", "::1"), ("2001:db8::5", "2001:db8::5"), ("::ffff:192.168.1.7", "192.168.1.7")],
+)
+def test_addresses_of_the_other_kind(remote: str, written: str) -> None:
+    assert with_address(NAMED, remote) == ANSWERED.replace("192.168.1.7", written)
+
+
+@pytest.mark.parametrize("remote", [None, "", "phone.lan", "fe80::1%eth0", "192.168.1.7 evil", "a\r\na=x"])
+def test_what_is_no_address_for_all_is_not_written(remote: str | None) -> None:
+    assert with_address(NAMED, remote) == NAMED

@@ -11,6 +11,7 @@ import pytest
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 from tests.scenes.tracking_senders import encode_opentrackio, freed_message, opentrackio_document, packets, write_freed
+from tests.scenes.waiting import wait_until
 from viewfinder.focus.sources import TrackedLensFocus
 from viewfinder.frames import CameraFrame, LensState
 from viewfinder.tracking.freed import FreeDMessage, FreeDReading
@@ -52,14 +53,6 @@ def listening(decode: Decoder, **settings: float) -> Iterator[tuple[SocketTracke
     assert not tracker._thread.is_alive()
 
 
-def until(condition: Callable[[], object]) -> None:
-    """Waits for what another thread does."""
-    deadline = time.monotonic() + PATIENCE_S
-    while not condition():
-        assert time.monotonic() < deadline, "nothing happened"
-        time.sleep(0.002)
-
-
 @pytest.mark.parametrize("encoding", [JSON, CBOR])
 def test_poses_between_two_samples(encoding: int) -> None:
     """The sender's clock is a day ahead; at 40 % of the way between two samples the camera is at 40 % of its way."""
@@ -68,7 +61,7 @@ def test_poses_between_two_samples(encoding: int) -> None:
         for number, x_m in enumerate((0.0, 1.0)):
             sample = TrackingSample(pose_at(x_m), LensState(2.0, 2.8, 50.0), day + time.monotonic())
             send(*datagrams(sample, encoding, number, segment_bytes=100))
-            until(lambda number=number: len(tracker._history._times) == number + 1)
+            wait_until(lambda number=number: len(tracker._history._times) == number + 1)
             time.sleep(0.05)
         first_s, second_s = tracker._history._times
         assert 0.03 < second_s - first_s < PATIENCE_S
@@ -87,16 +80,16 @@ def test_silence_is_a_lost_track() -> None:
         assert tracker.track(frame_at(time.monotonic()), CAMERA) is None
         assert "have come" in str(tracker.remark)
         send(*datagrams(TrackingSample(pose_at(1.0), LensState(2.0))))
-        until(lambda: tracker._history.newest_s)
+        wait_until(lambda: tracker._history.newest_s)
         newest_s = tracker._history.newest_s
         assert newest_s is not None
         close = tracker.track(frame_at(newest_s + 0.01), CAMERA)
         assert close is not None and close.quality == pytest.approx(0.8)  # 10 of 50 ms
         assert tracker.track(frame_at(newest_s + 0.06), CAMERA) is None
         assert tracker.lens(frame_at(newest_s + 0.06)) == LensState()
-        until(lambda: "silent for" in str(tracker.remark))
+        wait_until(lambda: "silent for" in str(tracker.remark))
         send(*datagrams(TrackingSample(pose_at(2.0)), number=1))
-        until(lambda: tracker._history.newest_s != newest_s)
+        wait_until(lambda: tracker._history.newest_s != newest_s)
 
 
 def test_junk_is_counted_and_does_no_harm() -> None:
@@ -105,10 +98,10 @@ def test_junk_is_counted_and_does_no_harm() -> None:
     with listening(opentrackio_decoder(), hold_s=100.0) as (tracker, send):
         junk = [rng.bytes(40), b"", b"OTrk", good[:-1], good[:30] + b"x" + good[31:], *packets(b"{}", JSON, 3), *packets(b"\xff", CBOR, 4)]
         send(*junk)
-        until(lambda: tracker.malformed == len(junk))
+        wait_until(lambda: tracker.malformed == len(junk))
         assert "not understood" in str(tracker.remark)
         send(good)
-        until(lambda: tracker._history.newest_s)
+        wait_until(lambda: tracker._history.newest_s)
         assert tracker.remark is None and tracker.malformed == len(junk)
 
 
@@ -119,7 +112,7 @@ def test_freed_of_one_camera() -> None:
     other = FreeDMessage(1, (0.0, 0.0, 0.0), (9.0, 9.0, 9.0), 0, 0)
     with listening(freed_decoder(FreeDReading(), camera=2), hold_s=100.0) as (tracker, send):
         send(write_freed(other), write_freed(message), write_freed(other), b"junk")
-        until(lambda: tracker.malformed)
+        wait_until(lambda: tracker.malformed)
         assert len(tracker._history._times) == 1
         found = tracker.track(frame_at(time.monotonic()), CAMERA)
         assert found is not None and found.camera_from_world == pytest.approx(pose, abs=3e-5)

@@ -34,7 +34,7 @@ from tests.scenes.live_clip import (
     write_live_clip,
 )
 from tests.scenes.live_viewfinder import Live, Seen, Watcher, live, watcher
-from tests.scenes.streaming_viewers import comes_true, in_time
+from tests.scenes.waiting import comes_true, in_time
 
 WIDTH, HEIGHT = 480, 270
 CODEC_DB = 35.0

@@ -1,9 +1,8 @@
 """A viewfinder with a finished layer over a known plate, and WebSocket clients as the page is one."""
 
-import asyncio
 import json
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from fractions import Fraction
@@ -111,10 +110,6 @@ async def control(url: str, message: Any) -> tuple[int, dict[str, Any]]:
 
 async def set_focus(url: str, distance_m: Any) -> tuple[int, dict[str, Any]]:
     return await control(url, {"focus": {"distance_m": distance_m}})
-
-
-def in_time(work: Callable[[], Coroutine[Any, Any, None]], limit_s: float = 30.0) -> None:
-    asyncio.run(asyncio.wait_for(work(), limit_s))
 
 
 async def until(viewer: Viewer, true_of: Callable[[Shown], bool]) -> Shown:

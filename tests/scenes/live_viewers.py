@@ -1,5 +1,8 @@
-"""Viewers in a process of their own: `python -m tests.scenes.live_viewers URL COUNT SECONDS` prints a line as soon as all see pictures, and at
-the end one JSON object: `rates`, `ages_ms` and `stages_ms` (see tests/bench/bench_viewfinder.py)."""
+"""Viewers in a process of their own: `python -m tests.scenes.live_viewers URL COUNT SECONDS`.
+
+It prints a line as soon as all see pictures, and at the end one JSON object: `rates`, `ages_ms` and `stages_ms` (see
+tests/bench/bench_viewfinder.py).
+"""
 
 import asyncio
 import json

@@ -1,8 +1,7 @@
 """A small viewfinder for the tests of server and page: controls that remember, and pictures made of what they remember."""
 
-import asyncio
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine, Sequence
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from threading import Event, Lock, Thread
@@ -195,7 +194,3 @@ async def made_viewfinder(
                 yield Made(url, controls, jpeg, pictures, site)
     finally:
         jpeg.close()
-
-
-def in_time(work: Callable[[], Coroutine[Any, Any, None]], limit_s: float = 30.0) -> None:
-    asyncio.run(asyncio.wait_for(work(), limit_s))

@@ -3,7 +3,7 @@
 import asyncio
 import json
 import time
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from threading import Event, Thread
 from typing import Any
@@ -16,6 +16,7 @@ from aiortc import RTCConfiguration, RTCPeerConnection, RTCRtpReceiver, RTCSessi
 from viewfinder.frames import FrameStatus, OutputFrame
 from viewfinder.streaming.encoded_stream import EncodedStream
 from viewfinder.streaming.encoders import StreamQuality
+from viewfinder.streaming.viewer_queue import EncodedFrame, ViewerQueue
 from viewfinder.streaming.whep import Whep
 
 WIDTH, HEIGHT = 320, 180
@@ -146,11 +147,13 @@ async def watching(url: str, codecs: tuple[str, ...] = ("VP8", "H264")) -> Async
         await viewer.peer.close()
 
 
-async def comes_true(true: Callable[[], Any], limit_s: float = 10.0) -> None:
-    async with asyncio.timeout(limit_s):
-        while not true():
-            await asyncio.sleep(0.01)
+def ignore() -> None:
+    """Ignore the news: nobody has to be woken."""
 
 
-def in_time(work: Callable[[], Coroutine[Any, Any, None]], limit_s: float = 30.0) -> None:
-    asyncio.run(asyncio.wait_for(work(), limit_s))
+def taken(viewer: ViewerQueue) -> list[EncodedFrame]:
+    """Take all packets that wait for a viewer."""
+    frames = []
+    while (frame := viewer.take()) is not None:
+        frames.append(frame)
+    return frames
