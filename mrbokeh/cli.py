@@ -138,7 +138,7 @@ def _fault(error: Exception) -> str:
         file.write(" ".join(sys.argv) + "\n\n" + "".join(traceback.format_exception(error)))
     first = (str(error).splitlines() or [""])[0]
     return (
-        f"this is a fault of mrbokeh ({type(error).__name__}{': ' + first if first else ''}), your files are as they were. "
+        f"this is a fault of mrbokeh ({type(error).__name__}{': ' + first if first else ''}). "
         f"Please report it with {file.name}; `mrbokeh --debug ...` shows it here"
     )
 

@@ -38,6 +38,8 @@ RESIDUAL_WHITE = 0.98
 RESIDUAL_BLUR, RESIDUAL_LARGEST_BLUR_PX = 0.85, 2.0
 """Detail of a residual finer than this share of the difference in blur, 2 px at most, is not carried over: it is noise or another's."""
 
+_CLIPPED_FROM, _CLIPPED_AT = 0.97, 0.995
+
 
 def lens_at(stack: FocalStack, focus_m: float, lens: Lens | None = None) -> Lens:
     """Return the stack's lens at any focus, with the blur of its registered slices: f-number and scale interpolate in dioptres.
@@ -184,9 +186,6 @@ def leave_one_out(stack: FocalStack, renderer: Renderer) -> Iterator[LeftOut]:
         yield LeftOut(
             index=index, focus_distance_m=focus_m, rendered_db=predicted[0], with_residuals_db=predicted[1], nearest_slice_db=nearest
         )
-
-
-_CLIPPED_FROM, _CLIPPED_AT = 0.97, 0.995
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,8 @@ PLATE, VIRTUAL, LENS, RESULT = "The plate", "What is put in", "The lens", "The r
 BackendOption = Annotated[str, typer.Option(help="Who renders objects and scenes: auto, embree, wgpu or mitsuba.", rich_help_panel=VIRTUAL)]
 OverwriteOption = Annotated[bool, typer.Option(help="Replace what exists.", rich_help_panel=RESULT)]
 
+LOOK = "Its look"
+
 
 @dataclass(frozen=True)
 class NearOptions:
@@ -147,8 +149,6 @@ class ColourOptions:
 
 if TYPE_CHECKING:
     from mrbokeh.compositing.plate_look.finishing import LookOptions
-
-LOOK = "Its look"
 
 
 @dataclass(frozen=True)

@@ -39,27 +39,7 @@ _LEAST = np.float32(1e-5)
 Plane = Float32[np.ndarray, "height width"]
 Picture = Float32[np.ndarray, "height width 3"]
 
-
-def clean_colours(picture: Picture, alpha: Plane) -> tuple[Picture, Picture]:
-    """Return (F, B): colours of what the matte (0 to 1) holds and of the rest, unpremultiplied, not below 0; both continue everywhere."""
-    front, behind = picture, picture
-    share = alpha[..., None]
-    for size_px in _ROUNDS_PX:
-        front, behind = _mean(front, alpha, size_px), _mean(behind, np.float32(1.0) - alpha, size_px)
-        left_over = picture - share * front - (1.0 - share) * behind
-        front, behind = np.maximum(front + share * left_over, 0.0), np.maximum(behind + (1.0 - share) * left_over, 0.0)
-    return front, behind
-
-
-def _mean(picture: Picture, weight: Plane, size_px: int) -> Picture:
-    from cv2 import blur
-
-    total = blur(weight, (size_px, size_px))
-    return blur(picture * weight[..., None], (size_px, size_px)) / (total + _LEAST)[..., None]
-
-
 Mask = Bool[np.ndarray, "height width"]
-
 _HALF = 0.5
 _NEAR_EDGE_PX, _FAR_EDGE_PX = 3, 1  # the depth of what is near has a median over 5x5 pixels
 
@@ -147,36 +127,6 @@ class Between:
         return cut_in_two(plate.sharp_rgb, plate.depth_m, is_near, _reach_px(plate.lens, plate.depth_m, is_near), self.tolerance)
 
 
-def _reach_px(lens: Lens, depth_m: Plane, is_near: Mask) -> float:
-    """Return how far the lens looks past the edges of what is near: half of the difference of the circles of confusion there, at most.
-
-    Behind a near thing and before what is far, both continue as they are at the edge (see `continued`).
-    """
-    if not is_near.any() or is_near.all():
-        return 0.0
-    coc_px = np.asarray(lens.coc_px(depth_m, depth_m.shape[1]))
-    near_px, far_px = coc_px[is_near & _within(_NEAR_EDGE_PX, ~is_near)], coc_px[~is_near & _within(_FAR_EDGE_PX, is_near)]
-    return 0.5 * lens.aperture.unit_radius * float(max(far_px.max() - near_px.min(), 0.0))
-
-
-def _within(distance_px: int, mask: Mask) -> Mask:
-    """Return the pixels no farther from the mask than that, along rows and columns."""
-    from cv2 import dilate
-
-    return np.asarray(dilate(mask.astype(np.uint8), np.ones((2 * distance_px + 1, 2 * distance_px + 1), np.uint8)) > 0)
-
-
-def _without_sharp_picture(plate: Plate, white: Layer, renderer: Renderer) -> tuple[NearAndFar, Layer]:
-    """Cut the scene by the photograph and a matte alone: the lens blurs the matte, and the photograph is solved for both colours under
-    it.
-    """
-    if not white.alpha.any():
-        return NearAndFar(white, plate.rgb, None, NO_HIGHLIGHTS), clear(*white.alpha.shape)
-    alpha = np.clip(renderer.render([white], plate.lens).alpha, 0.0, 1.0)
-    front, behind = clean_colours(plate.rgb, alpha)
-    return NearAndFar(white, behind, None, NO_HIGHLIGHTS), Layer(front * alpha[..., None], alpha, white.depth_m)
-
-
 @dataclass(frozen=True)
 class Rerendered:
     """Insertion that blurs all anew: reached by virtual light, a pixel is taken from the new picture, else from the photograph.
@@ -205,3 +155,51 @@ class Rerendered:
         touched = (seen.alpha > LEAST_LIGHT) | (np.abs(seen.rgb).max(axis=2) > LEAST_LIGHT)
         left = np.where(touched[..., None], np.maximum(picture.rgb - seen.rgb, 0.0), plate.rgb)
         return Inserted(left, Layer(seen.rgb * touched[..., None], seen.alpha * touched, seen.depth_m))
+
+
+def clean_colours(picture: Picture, alpha: Plane) -> tuple[Picture, Picture]:
+    """Return (F, B): colours of what the matte (0 to 1) holds and of the rest, unpremultiplied, not below 0; both continue everywhere."""
+    front, behind = picture, picture
+    share = alpha[..., None]
+    for size_px in _ROUNDS_PX:
+        front, behind = _mean(front, alpha, size_px), _mean(behind, np.float32(1.0) - alpha, size_px)
+        left_over = picture - share * front - (1.0 - share) * behind
+        front, behind = np.maximum(front + share * left_over, 0.0), np.maximum(behind + (1.0 - share) * left_over, 0.0)
+    return front, behind
+
+
+def _mean(picture: Picture, weight: Plane, size_px: int) -> Picture:
+    from cv2 import blur
+
+    total = blur(weight, (size_px, size_px))
+    return blur(picture * weight[..., None], (size_px, size_px)) / (total + _LEAST)[..., None]
+
+
+def _reach_px(lens: Lens, depth_m: Plane, is_near: Mask) -> float:
+    """Return how far the lens looks past the edges of what is near: half of the difference of the circles of confusion there, at most.
+
+    Behind a near thing and before what is far, both continue as they are at the edge (see `continued`).
+    """
+    if not is_near.any() or is_near.all():
+        return 0.0
+    coc_px = np.asarray(lens.coc_px(depth_m, depth_m.shape[1]))
+    near_px, far_px = coc_px[is_near & _within(_NEAR_EDGE_PX, ~is_near)], coc_px[~is_near & _within(_FAR_EDGE_PX, is_near)]
+    return 0.5 * lens.aperture.unit_radius * float(max(far_px.max() - near_px.min(), 0.0))
+
+
+def _within(distance_px: int, mask: Mask) -> Mask:
+    """Return the pixels no farther from the mask than that, along rows and columns."""
+    from cv2 import dilate
+
+    return np.asarray(dilate(mask.astype(np.uint8), np.ones((2 * distance_px + 1, 2 * distance_px + 1), np.uint8)) > 0)
+
+
+def _without_sharp_picture(plate: Plate, white: Layer, renderer: Renderer) -> tuple[NearAndFar, Layer]:
+    """Cut the scene by the photograph and a matte alone: the lens blurs the matte, and the photograph is solved for both colours under
+    it.
+    """
+    if not white.alpha.any():
+        return NearAndFar(white, plate.rgb, None, NO_HIGHLIGHTS), clear(*white.alpha.shape)
+    alpha = np.clip(renderer.render([white], plate.lens).alpha, 0.0, 1.0)
+    front, behind = clean_colours(plate.rgb, alpha)
+    return NearAndFar(white, behind, None, NO_HIGHLIGHTS), Layer(front * alpha[..., None], alpha, white.depth_m)

@@ -22,6 +22,8 @@ Plane = Float32[np.ndarray, "height width"]
 
 _SPARE_PX = 4
 
+DEFAULT_MODE = "over"
+
 
 @dataclass(frozen=True)
 class InDirtyRectangle:
@@ -132,8 +134,6 @@ MODES: dict[str, Insertion] = {
 """front: over everything. over: the sharp layers lose what the depth of the photograph hides, then they are blurred. matte: the same
 with the paper's smoothed matte. between: behind the blurred near things of the photograph, before the rest. rerender: all-in-focus
 picture and layers blurred together."""
-
-DEFAULT_MODE = "over"
 
 
 def insertion_of(mode: str, near_m: float | None = None, *, exact_depth: bool = False) -> Insertion:

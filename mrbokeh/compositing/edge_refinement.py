@@ -33,6 +33,11 @@ Plane = Float32[np.ndarray, "height width"]
 Picture = Float32[np.ndarray, "height width 3"]
 Mask = Bool[np.ndarray, "height width"]
 
+_AROUND_PX = 4.0
+_LARGE_PX = 2_000_000
+"""Above it half as many rows and columns are compared: a pixel is little there, and time is short."""
+_FLOOR, _ROUND = np.float32(0.1), np.float32(1e-6)
+
 
 @dataclass(frozen=True)
 class EdgeColours:
@@ -98,12 +103,8 @@ def _nearness(rgb: Picture, sides: UInt8[np.ndarray, "height width"], places: In
     return np.where(found[:, 1] > _LEAST_APART, found[:, 0], np.float32(np.nan)).astype(np.float32)
 
 
-_AROUND_PX = 4.0
 _PROPOSED = ((EdgeColours.without_rim, np.float32(0.9)), (EdgeColours.by_colour, np.float32(1.0)))
 """One after the other. Each wins where it leaves less than this part of the error."""
-_LARGE_PX = 2_000_000
-"""Above it half as many rows and columns are compared: a pixel is little there, and time is short."""
-_FLOOR, _ROUND = np.float32(0.1), np.float32(1e-6)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,8 @@ from mrbokeh.system.errors import InputError
 
 Plane = Float32[np.ndarray, "height width"]
 
+_LEAST = np.float32(1e-6)
+
 
 def occlusion_matte(virtual_depth_m: Plane, photo_depth_m: Plane, tolerance: float = 0.03, softness: float = 0.02) -> Plane:
     """Return the share of the virtual surface that the photographed scene leaves visible: 1 in front of it, 0 behind it.
@@ -58,9 +60,6 @@ def behind(photo_rgb: Float32[np.ndarray, "height width 3"], layer: Layer) -> Fl
 
 def _nothing(plate: Plate, layers: Sequence[Layer]) -> Layer:
     return flatten(layers) if layers else clear(*plate.rgb.shape[:2])
-
-
-_LEAST = np.float32(1e-6)
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,10 @@ from mrbokeh.system.resources import in_bands, workers
 # The root of x^3 = x + 1: steps of 1/g and 1/g^2 fill the square evenly (Roberts 2018, the R2 sequence).
 _PLASTIC_NUMBER = 1.32471795724474602596
 
+_BAND_PLACES = 2048
+Plane = Float32[np.ndarray, "height width"]
+Places = Int64[np.ndarray, " places"]
+
 
 @lru_cache(maxsize=512)
 def pupil_points(aperture: Aperture, count: int) -> Float64[np.ndarray, "points 3"]:
@@ -53,12 +57,6 @@ def transmission(aperture: Aperture, points: Float64[np.ndarray, "points 2"]) ->
         crosses = spans & (x < x0 + (y - y0) * (x1 - x0) / rise)
         total += weight * (crosses.sum(axis=1) % 2)
     return total
-
-
-_BAND_PLACES = 2048
-
-Plane = Float32[np.ndarray, "height width"]
-Places = Int64[np.ndarray, " places"]
 
 
 @dataclass(frozen=True)

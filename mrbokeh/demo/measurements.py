@@ -18,6 +18,16 @@ from mrbokeh.system.atomic_files import read_json
 
 FIRST_PASS_FOLDER = "first_pass"
 
+TRUSTED = 0.3
+LEAST_ALL_IN_FOCUS_DB = 38.0
+MOST_LOST_DB = 0.5
+LARGEST_DEPTH_ERROR = 0.03
+LARGEST_CAMERA_ERROR = 0.01
+LEAST_GAIN_DB = 3.0
+OPAQUE = 0.9
+LARGEST_SIDESTEP = 0.02
+"""Of the width of the picture."""
+
 
 @dataclass(frozen=True)
 class Truth:
@@ -45,17 +55,6 @@ def has_second_pass(stack: FocalStack) -> bool:
 def first_pass(stack: FocalStack) -> FocalStack:
     """The stack with the all-in-focus picture and depth that it had before `mrbokeh capture depth`."""
     return replace(stack, folder=stack.folder / FIRST_PASS_FOLDER) if has_second_pass(stack) else stack
-
-
-TRUSTED = 0.3
-LEAST_ALL_IN_FOCUS_DB = 38.0
-MOST_LOST_DB = 0.5
-LARGEST_DEPTH_ERROR = 0.03
-LARGEST_CAMERA_ERROR = 0.01
-LEAST_GAIN_DB = 3.0
-OPAQUE = 0.9
-LARGEST_SIDESTEP = 0.02
-"""Of the width of the picture."""
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,20 @@ from mrbokeh.system.html_page import cell, section, table, write_page
 
 PACKAGES = ("numpy", "opencv-python-headless", "OpenEXR", "rawpy", "pycolmap", "torch", "onnxruntime", "embreex", "numba")
 
+Plane = Float[np.ndarray, "height width"]
+Rgb = Float32[np.ndarray, "height width 3"]
+WORST = 0.1
+"""Relative error of depth that is drawn brightest."""
+
+
+def write_story(out: Path, done: Sequence[Done]) -> list[Measurement]:
+    """Write report.html, numbers.json and previews into `out`; return the measurements."""
+    measurements = _measurements(out / "desk", out / "board")
+    sections = [*_desk_sections(out / "desk", out / "report.html"), _board_section(out / "board", out / "report.html")]
+    write_json(out / "numbers.json", [vars(each) for each in measurements])
+    write_report(out / "report.html", measurements, sections, done)
+    return measurements
+
 
 def write_report(path: Path, measurements: Sequence[Measurement], sections: Sequence[str], done: Sequence[Done]) -> None:
     """One page beside its pictures; sections are made by `section`."""
@@ -94,13 +108,6 @@ def _version(package: str) -> str:
         return "not installed"
 
 
-Plane = Float[np.ndarray, "height width"]
-Rgb = Float32[np.ndarray, "height width 3"]
-
-WORST = 0.1
-"""Relative error of depth that is drawn brightest."""
-
-
 def write_depth_pictures(stack: FocalStack, truth: Truth, out: Path) -> list[tuple[Path, str]]:
     """Return (file, caption) of pictures of depth before and after `mrbokeh capture depth`; [] if there was no second pass."""
     if not has_second_pass(stack):
@@ -134,15 +141,6 @@ def _grey(level: Plane) -> Rgb:
 def _colours(level: Plane) -> Rgb:
     steps = np.round(255.0 * np.clip(level, 0.0, 1.0)).astype(np.uint8)
     return srgb_to_linear(cv2.applyColorMap(steps, cv2.COLORMAP_INFERNO)[..., ::-1] / np.float32(255.0))
-
-
-def write_story(out: Path, done: Sequence[Done]) -> list[Measurement]:
-    """Write report.html, numbers.json and previews into `out`; return the measurements."""
-    measurements = _measurements(out / "desk", out / "board")
-    sections = [*_desk_sections(out / "desk", out / "report.html"), _board_section(out / "board", out / "report.html")]
-    write_json(out / "numbers.json", [vars(each) for each in measurements])
-    write_report(out / "report.html", measurements, sections, done)
-    return measurements
 
 
 def _measurements(desk: Path, board: Path) -> list[Measurement]:

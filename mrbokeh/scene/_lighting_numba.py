@@ -11,6 +11,9 @@ import numpy as np
 from mrbokeh.scene._surface_numba import Surfaces
 from mrbokeh.scene._vectors_numba import Vector, compiled, cross, dot, row, scaled, sub, unit3
 
+LOWEST_ROUGHNESS = 0.045
+"""A perfect mirror does not show a light without extent at all; this is the usual floor of real-time engines."""
+
 
 class PanoramaLevels(NamedTuple):
     """Panoramas of several sizes, one after the other; texel centres at half-integers, as in `Environment`."""
@@ -184,10 +187,6 @@ def brdf_integral(size: int, samples: int, out: np.ndarray) -> None:
                 fresnel = (1.0 - v_h) ** 5
                 first, second = first + (1.0 - fresnel) * share, second + fresnel * share
             out[line, column, 0], out[line, column, 1] = first / samples, second / samples
-
-
-LOWEST_ROUGHNESS = 0.045
-"""A perfect mirror does not show a light without extent at all; this is the usual floor of real-time engines."""
 
 
 @compiled

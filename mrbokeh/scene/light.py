@@ -13,6 +13,10 @@ from mrbokeh.system.errors import InputError
 
 LightKind = Literal["directional", "point", "spot"]
 
+NEUTRAL_RADIANCE = 1.0
+"""Radiance from every direction where a scene brings no light of its own: a white matte surface then shows 1."""
+_SUN_RADIUS_RAD, _SKY_PERCENTILE = 0.12, 99.0
+
 
 @dataclass(frozen=True)
 class Light:
@@ -93,10 +97,6 @@ def sun(direction: Triple, irradiance: float | Triple) -> Light:
     return Light("directional", rgb, direction=tuple((travel / length).tolist()))
 
 
-NEUTRAL_RADIANCE = 1.0
-"""Radiance from every direction where a scene brings no light of its own: a white matte surface then shows 1."""
-
-
 @dataclass(frozen=True, eq=False)
 class Environment:
     """Radiance arriving from infinitely far.
@@ -142,9 +142,6 @@ def solid_angles_sr(height_px: int, width_px: int) -> Float[np.ndarray, "height 
     """Exact solid angle of each pixel of a panorama; they sum to 4 pi."""
     border = np.cos(np.linspace(0, np.pi, height_px + 1))
     return np.repeat(((border[:-1] - border[1:]) * 2 * np.pi / width_px)[:, None], width_px, axis=1)
-
-
-_SUN_RADIUS_RAD, _SKY_PERCENTILE = 0.12, 99.0
 
 
 def split_sun(environment: Environment) -> tuple[Environment, Light]:

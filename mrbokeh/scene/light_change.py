@@ -35,6 +35,26 @@ _WIDEST_CONE_COSINE = 0.5
 """Wider cones around the objects are given up for the whole sky above the surface."""
 _NO_EFFECT = LEAST_CHANGE / 8
 
+__all__ = ["GREY", "LEAST_CHANGE", "LightChange", "light_change"]
+GREY = matte(0.5, 0.5, 0.5)
+
+
+def light_change(
+    renderer: SceneRenderer, scene: Scene, camera: Camera, catcher: Mesh, surface: Material = GREY, samples: int = 64
+) -> LightChange:
+    """Return the change that a scene's objects make on a real surface lit by the scene's lights and environment.
+
+    catcher: shape of the surface (also one that catches shadows). surface: its approximate material; only light that comes from the
+    objects depends on its albedo. A MitsubaTracer counts everything: shadows of lights and of the environment, mirror images, colour
+    bleeding, emissive objects; it uses its own number of samples. With any other renderer the surface is matte and only light that is
+    taken away counts: the renderer's shadow mask, and the hidden part of the environment.
+    """
+    if isinstance(renderer, MitsubaTracer):
+        from mrbokeh.scene.mitsuba.traced_light_change import traced_light_change
+
+        return traced_light_change(renderer, scene, camera, catcher, surface)
+    return cast_light_change(renderer, scene, camera, catcher, samples)
+
 
 def cast_light_change(renderer: SceneRenderer, scene: Scene, camera: Camera, catcher: Mesh, samples: int = 64) -> LightChange:
     """Return the light change by the ray caster. samples: rays per pixel towards the environment where objects may hide it."""
@@ -151,25 +171,3 @@ def _radiance(environment: Environment, towards: Float[np.ndarray, "rays 3"]) ->
     column = ((np.arctan2(x, z) / (2 * np.pi) + 0.5) * width).astype(int) % width
     row = np.minimum((np.arccos(np.clip(-y, -1.0, 1.0)) / np.pi * height).astype(int), height - 1)
     return environment.radiance[row, column]
-
-
-__all__ = ["GREY", "LEAST_CHANGE", "LightChange", "light_change"]
-
-GREY = matte(0.5, 0.5, 0.5)
-
-
-def light_change(
-    renderer: SceneRenderer, scene: Scene, camera: Camera, catcher: Mesh, surface: Material = GREY, samples: int = 64
-) -> LightChange:
-    """Return the change that a scene's objects make on a real surface lit by the scene's lights and environment.
-
-    catcher: shape of the surface (also one that catches shadows). surface: its approximate material; only light that comes from the
-    objects depends on its albedo. A MitsubaTracer counts everything: shadows of lights and of the environment, mirror images, colour
-    bleeding, emissive objects; it uses its own number of samples. With any other renderer the surface is matte and only light that is
-    taken away counts: the renderer's shadow mask, and the hidden part of the environment.
-    """
-    if isinstance(renderer, MitsubaTracer):
-        from mrbokeh.scene.mitsuba.traced_light_change import traced_light_change
-
-        return traced_light_change(renderer, scene, camera, catcher, surface)
-    return cast_light_change(renderer, scene, camera, catcher, samples)

@@ -9,6 +9,11 @@ from jaxtyping import Float, Float32, Float64, Int32
 from mrbokeh.scene.material import Material, Triple
 from mrbokeh.system.errors import InputError
 
+_SAMPLES = 256
+_PLACE_TOLERANCE = 2.0**-24
+"""Of the extent: half of what rounding to float32, the precision of the ray tracer, changes at most."""
+_NORMAL_TOLERANCE = 1e-5
+
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
@@ -153,12 +158,6 @@ def shadow_catcher(height_y_m: float, centre_xz_m: tuple[float, float], half_siz
     return rectangle(
         (x - half_size_m, height_y_m, z + half_size_m), (2 * half_size_m, 0, 0), (0, 0, -2 * half_size_m), Material(), catches_shadow=True
     )
-
-
-_SAMPLES = 256
-_PLACE_TOLERANCE = 2.0**-24
-"""Of the extent: half of what rounding to float32, the precision of the ray tracer, changes at most."""
-_NORMAL_TOLERANCE = 1e-5
 
 
 def rigid_motion(before: Sequence[Mesh], after: Sequence[Mesh]) -> Float64[np.ndarray, "4 4"] | None:

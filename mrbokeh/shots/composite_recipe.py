@@ -30,6 +30,9 @@ from mrbokeh.stacks.photograph import SensorOrientation, lens_for_orientation
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 
+_LOCAL = ("polygon", "scatter")
+"""Renderers that light leaves no farther than its circle of confusion."""
+
 
 @dataclass(frozen=True)
 class Part:
@@ -110,10 +113,6 @@ def _cut_layers(layers: Sequence[Layer], box: Box) -> list[Layer]:
 def _hidden_layers(layers: Sequence[Layer], photo_depth_m: Plane, box: Box) -> list[Layer]:
     cut_m = box.cut(photo_depth_m, "edge")
     return [covered_by(layer, occlusion_matte(layer.depth_m, cut_m)) for layer in layers]
-
-
-_LOCAL = ("polygon", "scatter")
-"""Renderers that light leaves no farther than its circle of confusion."""
 
 
 @dataclass(frozen=True)

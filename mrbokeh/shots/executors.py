@@ -20,6 +20,9 @@ from mrbokeh.system.resources import cores
 Progress = Callable[[int], None]
 """Told how many frames more are made; the number shrinks where a worker died and its segment begins anew."""
 
+_TRIES = 3
+_POLL_S = 0.25
+
 
 @runtime_checkable
 class Executor(Protocol):
@@ -42,10 +45,6 @@ class SerialExecutor:
     def run(self, tasks: Sequence[SegmentTask], progress: Progress) -> None:
         for task in tasks:
             render_segment(task, lambda: progress(1))
-
-
-_TRIES = 3
-_POLL_S = 0.25
 
 
 class ProcessExecutor:

@@ -26,44 +26,6 @@ from mrbokeh.video.clip import VideoInfo
 from mrbokeh.video.image_sequence import is_pattern, numbered
 from mrbokeh.video.picture_source import PictureSource, open_source
 
-
-def scene_track(path: Path, size_px: tuple[int, int], scene_up: str) -> CameraTrack:
-    """Read a camera track whose world points up as the scene's does.
-
-    size_px: (width, height) of the plate. scene_up: what points up in the world of the scene, in which its objects are placed.
-
-    A file of one camera does not say what is up, so it is the scene's. Any other track has an axis of its own; if that is another one,
-    places of objects and poses of the camera are not of one world, and no turn can tell which of them is meant: InputError. Pictures of
-    the track with another shape than the plate raise InputError too.
-    """
-    is_single = _is_single_camera(path)
-    track = read_track(path, TrackOptions(up=scene_up, size_px=size_px) if is_single else TrackOptions(size_px=size_px))
-    if not have_same_shape(track.size_px, size_px):
-        raise InputError(
-            f"{path}: expected a camera for pictures of the plate's shape ({size_px[0]}x{size_px[1]}), got one for "
-            f"{track.size_px[0]}x{track.size_px[1]}: was it made for another clip, or for one that is turned or cropped?"
-        )
-    if not is_single and track.up != scene_up:
-        raise InputError(
-            f"{path}: {track.up} points up in this track{_remark(path)}, but {scene_up} in the scene: where the scene's places are the "
-            f"track's, write up = {track.up!r} into the scene file, else turn the track: "
-            f"mrbokeh track convert {path.name} turned.json --out-up={scene_up}"
-        )
-    return track
-
-
-def _is_single_camera(path: Path) -> bool:
-    if not path.exists() or format_of_file(path) != "json":
-        return False
-    document = read_json(path, "a camera track")
-    return isinstance(document, dict) and "camera_from_world" in document
-
-
-def _remark(path: Path) -> str:
-    """Return a hint that COLMAP's usual axis may be stated otherwise."""
-    return " (as in most of COLMAP's maps; state another by --up in that conversion)" if format_of_file(path) == "colmap" else ""
-
-
 Plane = Float32[np.ndarray, "height width"]
 _WARM_UP = 48
 
@@ -273,3 +235,40 @@ class _ExposedLook:
         colour = self._finishing.colour or ColourMatch()
         gained = replace(colour, gain=triple_of(np.array(colour.gain) * self._change(number)))
         return finished(inserted, plate, replace(self._finishing, colour=gained), number)
+
+
+def scene_track(path: Path, size_px: tuple[int, int], scene_up: str) -> CameraTrack:
+    """Read a camera track whose world points up as the scene's does.
+
+    size_px: (width, height) of the plate. scene_up: what points up in the world of the scene, in which its objects are placed.
+
+    A file of one camera does not say what is up, so it is the scene's. Any other track has an axis of its own; if that is another one,
+    places of objects and poses of the camera are not of one world, and no turn can tell which of them is meant: InputError. Pictures of
+    the track with another shape than the plate raise InputError too.
+    """
+    is_single = _is_single_camera(path)
+    track = read_track(path, TrackOptions(up=scene_up, size_px=size_px) if is_single else TrackOptions(size_px=size_px))
+    if not have_same_shape(track.size_px, size_px):
+        raise InputError(
+            f"{path}: expected a camera for pictures of the plate's shape ({size_px[0]}x{size_px[1]}), got one for "
+            f"{track.size_px[0]}x{track.size_px[1]}: was it made for another clip, or for one that is turned or cropped?"
+        )
+    if not is_single and track.up != scene_up:
+        raise InputError(
+            f"{path}: {track.up} points up in this track{_remark(path)}, but {scene_up} in the scene: where the scene's places are the "
+            f"track's, write up = {track.up!r} into the scene file, else turn the track: "
+            f"mrbokeh track convert {path.name} turned.json --out-up={scene_up}"
+        )
+    return track
+
+
+def _is_single_camera(path: Path) -> bool:
+    if not path.exists() or format_of_file(path) != "json":
+        return False
+    document = read_json(path, "a camera track")
+    return isinstance(document, dict) and "camera_from_world" in document
+
+
+def _remark(path: Path) -> str:
+    """Return a hint that COLMAP's usual axis may be stated otherwise."""
+    return " (as in most of COLMAP's maps; state another by --up in that conversion)" if format_of_file(path) == "colmap" else ""

@@ -20,6 +20,8 @@ from mrbokeh.optics.camera import Camera
 _Given = ParamSpec("_Given")
 _Result = TypeVar("_Result")
 
+Opened = TypeVar("Opened", covariant=True)
+
 
 class Kept(Generic[_Given, _Result]):
     """Function with a cache of its last result. Arguments are the same if they are one object (numbers and texts: if they are equal)."""
@@ -45,9 +47,6 @@ def _flat(given: tuple[object, ...]) -> tuple[object, ...]:
 
 def _same(one: object, other: object) -> bool:
     return one is other or (isinstance(one, (int, float, str)) and type(one) is type(other) and one == other)
-
-
-Opened = TypeVar("Opened", covariant=True)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,22 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.video.image_sequence import NumberedFiles, is_pattern
 
 
+def render_shot(shot: Shot, executor: Executor, *, overwrite: bool = False, progress: Progress = lambda _: None) -> str:
+    """Render a shot; return what became of the sound.
+
+    Raises InputError if the result exists, or parts of another run do, unless overwrite. progress: is told of frames as they are made,
+    and at once of those that an interrupted run left finished.
+    """
+    shot.target.require_new(shot, overwrite or shot.was_begun)
+    folder = PartsFolder.opened(shot, overwrite)
+    missing = folder.missing
+    progress(sum(segment.frame_count for segment in shot.segments) - sum(segment.frame_count for segment in missing))
+    executor.run([SegmentTask(shot, segment, folder.path, executor.threads) for segment in missing], progress)
+    note = shot.target.join(shot, folder.path)
+    folder.remove()
+    return note
+
+
 @dataclass(frozen=True, eq=False)
 class PartsFolder:
     """OUT.parts, from the first segment until the result is whole."""
@@ -87,19 +103,3 @@ def _stamps(paths: Iterable[Path]) -> str:
                 raise InputError(f"expected a file at {file}, but there is none") from None
             digest.update(f"{file}|{status.st_size}|{status.st_mtime_ns}\n".encode())
     return f"{', '.join(path.name for path in paths)} {digest.hexdigest()[:16]}"
-
-
-def render_shot(shot: Shot, executor: Executor, *, overwrite: bool = False, progress: Progress = lambda _: None) -> str:
-    """Render a shot; return what became of the sound.
-
-    Raises InputError if the result exists, or parts of another run do, unless overwrite. progress: is told of frames as they are made,
-    and at once of those that an interrupted run left finished.
-    """
-    shot.target.require_new(shot, overwrite or shot.was_begun)
-    folder = PartsFolder.opened(shot, overwrite)
-    missing = folder.missing
-    progress(sum(segment.frame_count for segment in shot.segments) - sum(segment.frame_count for segment in missing))
-    executor.run([SegmentTask(shot, segment, folder.path, executor.threads) for segment in missing], progress)
-    note = shot.target.join(shot, folder.path)
-    folder.remove()
-    return note

@@ -19,30 +19,6 @@ Write = Callable[[int, Frame, Picture], None]
 AT_ONCE = 2
 """How many decoded frames wait to be made, and how many made ones to be written: more would take memory, not time."""
 
-
-def stream(frames: Iterator[Frame], first: int, make: Make, write: Write, *, overlap: bool = True) -> None:
-    """Decode, render and write frames in their order; the first has the number `first`.
-
-    Decoding and writing run beside the rendering, a few frames at a time. overlap: False does all in the calling thread, for a worker
-    that has one core.
-    """
-    numbered = enumerate(frames, first)
-    with _one_thread(overlap) as decoding, _one_thread(overlap) as encoding:
-        under_way: deque[Future[None]] = deque()
-        for each in ahead(decoding, lambda _: next(numbered, None), repeat(None), AT_ONCE if overlap else 1):
-            if each is None:
-                break
-            under_way.append(encoding.submit(write, *each, make(*each)))
-            if len(under_way) > AT_ONCE or not overlap:
-                under_way.popleft().result()
-        while under_way:
-            under_way.popleft().result()
-
-
-def _one_thread(overlap: bool) -> ThreadPoolExecutor | CallingThread:
-    return ThreadPoolExecutor(1) if overlap else CallingThread()
-
-
 _built = threading.local()
 
 
@@ -74,6 +50,29 @@ def render_segment(task: SegmentTask, made: Callable[[], None] = lambda: None) -
         frames = shot.source.frames(segment.start, segment.stop, task.threads)
         stream(frames, segment.start, make, write, overlap=task.threads != 1)
     return segment.number
+
+
+def stream(frames: Iterator[Frame], first: int, make: Make, write: Write, *, overlap: bool = True) -> None:
+    """Decode, render and write frames in their order; the first has the number `first`.
+
+    Decoding and writing run beside the rendering, a few frames at a time. overlap: False does all in the calling thread, for a worker
+    that has one core.
+    """
+    numbered = enumerate(frames, first)
+    with _one_thread(overlap) as decoding, _one_thread(overlap) as encoding:
+        under_way: deque[Future[None]] = deque()
+        for each in ahead(decoding, lambda _: next(numbered, None), repeat(None), AT_ONCE if overlap else 1):
+            if each is None:
+                break
+            under_way.append(encoding.submit(write, *each, make(*each)))
+            if len(under_way) > AT_ONCE or not overlap:
+                under_way.popleft().result()
+        while under_way:
+            under_way.popleft().result()
+
+
+def _one_thread(overlap: bool) -> ThreadPoolExecutor | CallingThread:
+    return ThreadPoolExecutor(1) if overlap else CallingThread()
 
 
 def _maker(recipe: MakerRecipe, threads: int) -> FrameMaker:

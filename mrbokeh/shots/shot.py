@@ -14,6 +14,9 @@ from mrbokeh.video.picture_source import PictureSource
 SEGMENT_S = 2.0
 """Long enough that decoding from the keyframe before and a keyframe more cost little, short enough that a kill loses little."""
 
+MANIFEST = "manifest.json"
+"""In the folder of the parts: what they were made with."""
+
 
 class Segment(NamedTuple):
     """Frames `start` to `stop` (excluded) of the clip; number: its place in the shot."""
@@ -73,10 +76,6 @@ class MakerRecipe(Protocol):
     def build(self, threads: int) -> FrameMaker:
         """Build the maker. threads: number of cores it may use, 0 for all."""
         ...
-
-
-MANIFEST = "manifest.json"
-"""In the folder of the parts: what they were made with."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -30,6 +30,9 @@ from mrbokeh.video.encodings import encoding_for, encoding_name, with_alpha
 from mrbokeh.video.image_sequence import numbered
 from mrbokeh.video.writer import PacketWriter, VideoWriter, packets_of
 
+_EXR = ".exr"
+_THREADS = 1
+
 
 def in_space(picture: Picture, space: NamedSpace | None) -> Picture:
     """Return the picture in a named colour space; None leaves linear Rec.709.
@@ -40,9 +43,6 @@ def in_space(picture: Picture, space: NamedSpace | None) -> Picture:
     if isinstance(picture, (Layer, Rgba)):
         return replace(picture, rgb=in_named_space(picture.rgb, picture.alpha, space))
     return in_named_space(picture, None, space)
-
-
-_EXR = ".exr"
 
 
 @dataclass(frozen=True)
@@ -112,9 +112,6 @@ class _SequenceSink:
         else:
             part = exr_part(in_named_space(picture.rgb, picture.alpha, space), picture.alpha, space)
             write_exr(path, replace(part, channels={**part.channels, "Z": picture.depth_m}))
-
-
-_THREADS = 1
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,8 @@ from mrbokeh.video.color import FULL, VideoColor
 _NUMBER = re.compile(r"%(?:0(\d+))?d|(#+)")
 _LAST_DIGITS = re.compile(r"\d+(?=\D*$)")
 
+_LINEAR, _SRGB = 8, 13
+
 
 def is_pattern(path: Path | str) -> bool:
     """Return whether a name stands for many files."""
@@ -100,9 +102,6 @@ def _width(place: "re.Match[str]") -> int:
 def read_numbers(path: Path) -> Float32[np.ndarray, "height width 3"]:
     """Read a picture's stored numbers, for a named colour space: integers as 0 to 1 without a curve; EXR without its stated primaries."""
     return read_exr(path)[0].stacked("RGB") if path.suffix.lower() == ".exr" else read_image(path, "linear")
-
-
-_LINEAR, _SRGB = 8, 13
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,11 @@ from mrbokeh.system.errors import InputError
 
 Triple = tuple[float, float, float]
 
+Picture = Float32[np.ndarray, "height width 3"]
+GREY_CARD = 0.18
+_MOST_CLIPPED, _NEARLY_WHITE = 0.1, 0.95
+_DARKEST_SHARE, _BLOCK_PX = 0.002, 4
+
 
 @dataclass(frozen=True)
 class ColourMatch:
@@ -61,11 +66,6 @@ def triple_of(values: np.ndarray) -> Triple:
     """Three numbers of an array as they stand in a ColourMatch."""
     red, green, blue = (float(each) for each in values)
     return red, green, blue
-
-
-Picture = Float32[np.ndarray, "height width 3"]
-GREY_CARD = 0.18
-_MOST_CLIPPED, _NEARLY_WHITE = 0.1, 0.95
 
 
 @dataclass(frozen=True)
@@ -144,9 +144,6 @@ def grey_card_match(
 def picked_black(plate_rgb: Picture, box: PixelBox) -> Triple:
     """The colour of a patch that the user knows to be black (a hole, a lens cap's edge)."""
     return patch_colour(plate_rgb, box)
-
-
-_DARKEST_SHARE, _BLOCK_PX = 0.002, 4
 
 
 def darkest_black(plate_rgb: Picture) -> Triple:

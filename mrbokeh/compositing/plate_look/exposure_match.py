@@ -22,6 +22,10 @@ SATURATION_CONSTANT = 1.2
 """78 / (0.65 * 100): the luminance that just fills a sensor is 1.2 * N^2 / t * 100 / ISO cd/m^2 (ISO 12232, saturation-based speed,
 with the usual 0.65 of lens transmission, vignetting and angle; Lagarde and de Rousiers 2014, "Moving Frostbite to PBR", Section 5.1)."""
 
+_OF_EXR = {"exposure_time_s": "expTime", "iso": "isoSpeed", "f_number": "aperture"}
+"""Names of OpenEXR's standard attributes (OpenEXR, "Standard Optional Attributes"); times in seconds."""
+COLDEST_K, WARMEST_K, BLACK_BODY_TO_K, DAYLIGHT_FROM_K = 25000.0, 2000.0, 4000.0, 5000.0
+
 
 @dataclass(frozen=True)
 class Exposure:
@@ -92,10 +96,6 @@ def exposure_of_metadata(metadata: Mapping[str, Any], where: str = "the slice") 
     )
 
 
-_OF_EXR = {"exposure_time_s": "expTime", "iso": "isoSpeed", "f_number": "aperture"}
-"""Names of OpenEXR's standard attributes (OpenEXR, "Standard Optional Attributes"); times in seconds."""
-
-
 def stated_exposure(path: Path) -> Exposure:
     """Read the exposure that a picture's file states. Raises InputError if something is missing."""
     if path.suffix.lower() != ".exr":
@@ -109,9 +109,6 @@ def stated_exposure(path: Path) -> Exposure:
     except (RuntimeError, OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read as EXR: {error}") from None
     return exposure_of_metadata({name: header.get(attribute) for name, attribute in _OF_EXR.items()}, str(path))
-
-
-COLDEST_K, WARMEST_K, BLACK_BODY_TO_K, DAYLIGHT_FROM_K = 25000.0, 2000.0, 4000.0, 5000.0
 
 
 def white_of_kelvin(kelvin: float) -> Triple:

@@ -34,6 +34,10 @@ from mrbokeh.system.errors import InputError
 
 _SIGMAS = 3
 
+Picture = Float32[np.ndarray, "height width 3"]
+AUTO, OFF = "auto", "off"
+NO_BLACK: Triple = (0.0, 0.0, 0.0)
+
 
 @dataclass(frozen=True)
 class LightWrap:
@@ -124,11 +128,6 @@ def _lit(layer: Layer, photo_rgb: np.ndarray, finishing: Finishing, box: Box) ->
         layer = darkened(layer, finishing.vignetting.gain(box, frame_px))
     layer = colour.lifted(layer)
     return layer if finishing.light_wrap is None else finishing.light_wrap.wrapped(layer, photo_rgb)
-
-
-Picture = Float32[np.ndarray, "height width 3"]
-AUTO, OFF = "auto", "off"
-NO_BLACK: Triple = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)

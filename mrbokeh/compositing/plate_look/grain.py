@@ -41,6 +41,9 @@ from mrbokeh.system.errors import InputError
 SIDE_PX = 1024
 _GRID_PX = 32
 
+Picture = Float32[np.ndarray, "height width 3"]
+FORMAT, VERSION = "mrbokeh-grain", 1
+
 
 def grain_texture(correlation: Correlation, seed: int) -> Float32[np.ndarray, "side side 3"]:
     """White noise, filtered by the root of the spectrum that belongs to the correlation (Wiener-Khinchin); mean 0, variance 1."""
@@ -74,9 +77,6 @@ def _placed(kernel: np.ndarray) -> np.ndarray:
     whole = np.zeros((SIDE_PX, SIDE_PX))
     whole[np.ix_(places, places)] = kernel[np.ix_(places, places)]
     return whole
-
-
-Picture = Float32[np.ndarray, "height width 3"]
 
 
 @dataclass(frozen=True)
@@ -123,9 +123,6 @@ def _grain_of(blocks: NoiseBlocks, seed: int) -> Grain:
     correlation, variance = measured_correlation(blocks.only(accepted), level)
     shot, read = (triple_of(np.array(each) * variance) for each in (level.shot, level.read))
     return Grain(NoiseLevel(shot, read), correlation, seed)
-
-
-FORMAT, VERSION = "mrbokeh-grain", 1
 
 
 def write_grain(path: Path | str, grain: Grain) -> None:

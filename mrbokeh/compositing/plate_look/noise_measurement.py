@@ -20,6 +20,18 @@ Picture = Float32[np.ndarray, "height width 3"]
 BLOCK_PX = 16
 _MOST_BLOCKS = 20000
 
+Blocks = Float64[np.ndarray, "blocks 3"]
+LEAST_BLOCKS = 12
+_START_QUANTILE, _BLOCKS_PER_BIN, _MOST_BINS, _ROUNDS = 0.15, 24, 24, 30
+_KURTOSIS = (1.8, 4.6)
+_DEVIATIONS = 3.0
+_LEAST_SPREAD, _MOST_SPREAD = (2.0 / BLOCK_PX**2) ** 0.5, 0.35  # of a block's variance: independent pixels; grain 3 px wide
+REACH_PX = 4
+LAGS = 2 * REACH_PX + 1
+_MOST_CORRELATED_BLOCKS = 4000  # a million pixels
+Correlation = Float64[np.ndarray, "lags lags 3 3"]
+"""[REACH_PX + dy, REACH_PX + dx, i, j]: mean of n_i(y, x) n_j(y + dy, x + dx) for noise of variance 1; beyond the reach it is 0."""
+
 
 @dataclass(frozen=True)
 class NoiseBlocks:
@@ -102,14 +114,6 @@ def smooth_basis() -> Float64[np.ndarray, "pixels 6"]:
     return np.linalg.qr(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1))[0]
 
 
-Blocks = Float64[np.ndarray, "blocks 3"]
-LEAST_BLOCKS = 12
-_START_QUANTILE, _BLOCKS_PER_BIN, _MOST_BINS, _ROUNDS = 0.15, 24, 24, 30
-_KURTOSIS = (1.8, 4.6)
-_DEVIATIONS = 3.0
-_LEAST_SPREAD, _MOST_SPREAD = (2.0 / BLOCK_PX**2) ** 0.5, 0.35  # of a block's variance: independent pixels; grain 3 px wide
-
-
 @dataclass(frozen=True)
 class NoiseLevel:
     """Per channel, of linear values: shot (variance per level) and read (variance in the dark), neither below 0."""
@@ -188,13 +192,6 @@ def _line(level: Float64[np.ndarray, " points"], variance: Float64[np.ndarray, "
 def _as_noise(lines: list[tuple[float, float]]) -> NoiseLevel:
     slopes, intercepts = zip(*lines, strict=True)
     return NoiseLevel(triple_of(np.array(slopes)), triple_of(np.array(intercepts)))
-
-
-REACH_PX = 4
-LAGS = 2 * REACH_PX + 1
-_MOST_CORRELATED_BLOCKS = 4000  # a million pixels
-Correlation = Float64[np.ndarray, "lags lags 3 3"]
-"""[REACH_PX + dy, REACH_PX + dx, i, j]: mean of n_i(y, x) n_j(y + dy, x + dx) for noise of variance 1; beyond the reach it is 0."""
 
 
 def white() -> Correlation:

@@ -25,6 +25,9 @@ Gain = Float32[np.ndarray, "height width channels"]
 _LEAST_GAIN = 1e-3
 _DEGREE, _CELLS = 6, 64
 
+FAR_M = 1000.0
+_EXIF_IFD, _MAKER, _MODEL, _LENS_MODEL = 0x8769, 0x010F, 0x0110, 0xA434
+
 
 @runtime_checkable
 class Vignetting(Protocol):
@@ -130,9 +133,6 @@ def falloff_at(vignetting: Vignetting, x_px: int, y_px: int, frame_px: tuple[int
 
 if TYPE_CHECKING:
     import lensfunpy
-
-FAR_M = 1000.0
-_EXIF_IFD, _MAKER, _MODEL, _LENS_MODEL = 0x8769, 0x010F, 0x0110, 0xA434
 
 
 @dataclass(frozen=True)

@@ -42,104 +42,6 @@ class NodePose:
         return result
 
 
-def rotation_matrix(quaternion: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
-    """A quaternion (x, y, z, w) as a matrix."""
-    x, y, z, w = unit(np.asarray(quaternion, np.float64))
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
-
-
-def animation_durations_s(file: GltfFile) -> dict[str, float]:
-    """Name and length of the file's animations; nameless ones are called by their number."""
-    return {
-        animation.name or str(number): max(float(file.floats(sampler.input)[-1, 0]) for sampler in animation.samplers)
-        for number, animation in enumerate(file.gltf.animations)
-    }
-
-
-def poses_at(file: GltfFile, time_s: float, animation: str | int | None) -> list[NodePose]:
-    """The pose of every node at a time, which is clamped to the animation's ends. None is the file's first animation."""
-    poses = [_rest_pose(file, node) for node in file.gltf.nodes]
-    chosen = _chosen_animation(file, animation)
-    if chosen is None:
-        return poses
-    for channel in chosen.channels:
-        if channel.target.node is None:
-            continue
-        sampler = chosen.samplers[channel.sampler]
-        path = channel.target.path
-        value = _sampled(file, sampler, time_s, is_rotation=path == "rotation")
-        poses[channel.target.node] = replace(poses[channel.target.node], matrix=None, **{path: value})
-    return poses
-
-
-def _chosen_animation(file: GltfFile, animation: str | int | None) -> Any:
-    animations = file.gltf.animations
-    if animation is None:
-        return animations[0] if animations else None
-    names = list(animation_durations_s(file))
-    number = names.index(animation) if animation in names else animation
-    if not isinstance(number, int) or not 0 <= number < len(animations):
-        raise InputError(f"{file.path} has the animations {names}, not {animation!r}: choose one of them")
-    return animations[number]
-
-
-def _rest_pose(file: GltfFile, node: Any) -> NodePose:
-    # pygltflib does not read the weights of nodes, only those of meshes.
-    weights = file.gltf.meshes[node.mesh].weights if node.mesh is not None else None
-    return NodePose(
-        translation=np.array(node.translation or (0, 0, 0), np.float64),
-        rotation=np.array(node.rotation or (0, 0, 0, 1), np.float64),
-        scale=np.array(node.scale or (1, 1, 1), np.float64),
-        weights=np.array(weights or (), np.float64),
-        matrix=np.array(node.matrix, np.float64).reshape(4, 4).T if node.matrix else None,
-    )
-
-
-def _sampled(file: GltfFile, sampler: Any, time_s: float, is_rotation: bool) -> Float[np.ndarray, " width"]:
-    """An animation sampler's output at a time (appendix C.2 to C.5)."""
-    times = file.floats(sampler.input)[:, 0].astype(np.float64)
-    is_cubic = sampler.interpolation == "CUBICSPLINE"
-    # A cubic sampler stores (in-tangent, value, out-tangent) per key; morph weights are stored one after the other.
-    keys = file.floats(sampler.output).astype(np.float64).reshape(len(times), 3 if is_cubic else 1, -1)
-    values = keys[:, 1 if is_cubic else 0]
-    last = int(np.searchsorted(times, time_s, side="right")) - 1
-    if last < 0 or last >= len(times) - 1 or sampler.interpolation == "STEP":
-        return values[np.clip(last, 0, len(times) - 1)]
-    step_s = times[last + 1] - times[last]
-    fraction = (time_s - times[last]) / step_s
-    if is_cubic:
-        value = _hermite(keys[last], keys[last + 1], fraction, step_s)
-        return unit(value) if is_rotation else value
-    if is_rotation:
-        return _slerp(values[last], values[last + 1], fraction)
-    return (1 - fraction) * values[last] + fraction * values[last + 1]
-
-
-def _hermite(
-    before: Float[np.ndarray, "3 width"], after: Float[np.ndarray, "3 width"], fraction: float, step_s: float
-) -> Float[np.ndarray, " width"]:
-    t, t2, t3 = fraction, fraction**2, fraction**3
-    start, end = before[1] * (2 * t3 - 3 * t2 + 1), after[1] * (3 * t2 - 2 * t3)
-    return start + end + step_s * (before[2] * (t3 - 2 * t2 + t) + after[0] * (t3 - t2))
-
-
-def _slerp(start: Float[np.ndarray, "4"], end: Float[np.ndarray, "4"], fraction: float) -> Float[np.ndarray, "4"]:
-    start, end = unit(start), unit(end)
-    cosine = float(start @ end)
-    if cosine < 0:  # the two signs of a quaternion are one rotation: take the shorter way
-        end, cosine = -end, -cosine
-    if cosine > 0.9995:
-        return unit((1 - fraction) * start + fraction * end)
-    angle = np.arccos(cosine)
-    return (np.sin((1 - fraction) * angle) * start + np.sin(fraction * angle) * end) / np.sin(angle)
-
-
 def load_glb(path: str | Path, time_s: float = 0.0, animation: str | int | None = None) -> Scene:
     """The scene of a .glb or .gltf at a moment of one of its animations, in our axes (x right, y down, z forward; metres).
 
@@ -240,3 +142,101 @@ def _lights(file: GltfFile, number: int, world_from_node: Float[np.ndarray, "4 4
         inner_cone_rad=float(spot.get("innerConeAngle", 0.0)),
         outer_cone_rad=float(spot.get("outerConeAngle", pi / 4)),
     )
+
+
+def rotation_matrix(quaternion: Float[np.ndarray, "4"]) -> Float[np.ndarray, "3 3"]:
+    """A quaternion (x, y, z, w) as a matrix."""
+    x, y, z, w = unit(np.asarray(quaternion, np.float64))
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def animation_durations_s(file: GltfFile) -> dict[str, float]:
+    """Name and length of the file's animations; nameless ones are called by their number."""
+    return {
+        animation.name or str(number): max(float(file.floats(sampler.input)[-1, 0]) for sampler in animation.samplers)
+        for number, animation in enumerate(file.gltf.animations)
+    }
+
+
+def poses_at(file: GltfFile, time_s: float, animation: str | int | None) -> list[NodePose]:
+    """The pose of every node at a time, which is clamped to the animation's ends. None is the file's first animation."""
+    poses = [_rest_pose(file, node) for node in file.gltf.nodes]
+    chosen = _chosen_animation(file, animation)
+    if chosen is None:
+        return poses
+    for channel in chosen.channels:
+        if channel.target.node is None:
+            continue
+        sampler = chosen.samplers[channel.sampler]
+        path = channel.target.path
+        value = _sampled(file, sampler, time_s, is_rotation=path == "rotation")
+        poses[channel.target.node] = replace(poses[channel.target.node], matrix=None, **{path: value})
+    return poses
+
+
+def _chosen_animation(file: GltfFile, animation: str | int | None) -> Any:
+    animations = file.gltf.animations
+    if animation is None:
+        return animations[0] if animations else None
+    names = list(animation_durations_s(file))
+    number = names.index(animation) if animation in names else animation
+    if not isinstance(number, int) or not 0 <= number < len(animations):
+        raise InputError(f"{file.path} has the animations {names}, not {animation!r}: choose one of them")
+    return animations[number]
+
+
+def _rest_pose(file: GltfFile, node: Any) -> NodePose:
+    # pygltflib does not read the weights of nodes, only those of meshes.
+    weights = file.gltf.meshes[node.mesh].weights if node.mesh is not None else None
+    return NodePose(
+        translation=np.array(node.translation or (0, 0, 0), np.float64),
+        rotation=np.array(node.rotation or (0, 0, 0, 1), np.float64),
+        scale=np.array(node.scale or (1, 1, 1), np.float64),
+        weights=np.array(weights or (), np.float64),
+        matrix=np.array(node.matrix, np.float64).reshape(4, 4).T if node.matrix else None,
+    )
+
+
+def _sampled(file: GltfFile, sampler: Any, time_s: float, is_rotation: bool) -> Float[np.ndarray, " width"]:
+    """An animation sampler's output at a time (appendix C.2 to C.5)."""
+    times = file.floats(sampler.input)[:, 0].astype(np.float64)
+    is_cubic = sampler.interpolation == "CUBICSPLINE"
+    # A cubic sampler stores (in-tangent, value, out-tangent) per key; morph weights are stored one after the other.
+    keys = file.floats(sampler.output).astype(np.float64).reshape(len(times), 3 if is_cubic else 1, -1)
+    values = keys[:, 1 if is_cubic else 0]
+    last = int(np.searchsorted(times, time_s, side="right")) - 1
+    if last < 0 or last >= len(times) - 1 or sampler.interpolation == "STEP":
+        return values[np.clip(last, 0, len(times) - 1)]
+    step_s = times[last + 1] - times[last]
+    fraction = (time_s - times[last]) / step_s
+    if is_cubic:
+        value = _hermite(keys[last], keys[last + 1], fraction, step_s)
+        return unit(value) if is_rotation else value
+    if is_rotation:
+        return _slerp(values[last], values[last + 1], fraction)
+    return (1 - fraction) * values[last] + fraction * values[last + 1]
+
+
+def _hermite(
+    before: Float[np.ndarray, "3 width"], after: Float[np.ndarray, "3 width"], fraction: float, step_s: float
+) -> Float[np.ndarray, " width"]:
+    t, t2, t3 = fraction, fraction**2, fraction**3
+    start, end = before[1] * (2 * t3 - 3 * t2 + 1), after[1] * (3 * t2 - 2 * t3)
+    return start + end + step_s * (before[2] * (t3 - 2 * t2 + t) + after[0] * (t3 - t2))
+
+
+def _slerp(start: Float[np.ndarray, "4"], end: Float[np.ndarray, "4"], fraction: float) -> Float[np.ndarray, "4"]:
+    start, end = unit(start), unit(end)
+    cosine = float(start @ end)
+    if cosine < 0:  # the two signs of a quaternion are one rotation: take the shorter way
+        end, cosine = -end, -cosine
+    if cosine > 0.9995:
+        return unit((1 - fraction) * start + fraction * end)
+    angle = np.arccos(cosine)
+    return (np.sin((1 - fraction) * angle) * start + np.sin(fraction * angle) * end) / np.sin(angle)

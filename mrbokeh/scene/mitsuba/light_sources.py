@@ -15,6 +15,9 @@ from mrbokeh.scene.light import Environment, Light, solid_angles_sr
 from mrbokeh.scene.material import Texture
 from mrbokeh.scene.mesh import Mesh
 
+_POINTS = np.array([[i + 1 / 3, j + 1 / 3] for i in range(6) for j in range(6 - i)]) / 6
+"""Places (b1, b2) in a triangle at which its light is read."""
+
 
 class EnvironmentTables:
     """A panorama on the device, read bilinearly as the ray caster reads it."""
@@ -77,10 +80,6 @@ class EnvironmentTables:
 
     def _entry(self, row: int, column: int) -> Any:
         return dr.gather(mi.Float, self._world_from_self[row], mi.UInt32(column))
-
-
-_POINTS = np.array([[i + 1 / 3, j + 1 / 3] for i in range(6) for j in range(6 - i)]) / 6
-"""Places (b1, b2) in a triangle at which its light is read."""
 
 
 class PointLights:

@@ -30,43 +30,6 @@ _TESTED = "19"
 _CRASHES = ("LLVM-15", "LLVM.so.15")
 
 
-def load(threads: int = 0) -> Any:
-    """Mitsuba with its LLVM variant chosen; threads: 0 leaves the number as it is, which is all cores at first.
-
-    Raises MissingExtraError where Mitsuba is not installed, InputError where there is no LLVM for it.
-    """
-    library = find_llvm()
-    if library is not None:
-        os.environ.setdefault("DRJIT_LIBLLVM_PATH", str(library))
-    try:
-        import drjit
-        import mitsuba
-    except ImportError:
-        raise MissingExtraError("mitsuba", "mitsuba") from None
-    try:
-        mitsuba.set_variant(LLVM)
-        drjit.eval(mitsuba.Float([0.0]) + 1.0)
-    except (ImportError, RuntimeError) as error:
-        raise InputError(
-            f"expected the LLVM library that Mitsuba's path tracer compiles with, but it does not load ({str(error).splitlines()[0]}): "
-            "install one (Debian: apt install libllvm19) or name it in DRJIT_LIBLLVM_PATH, or choose the renderer embree"
-        ) from None
-    if threads:
-        drjit.set_thread_count(threads)
-    return mitsuba
-
-
-def find_llvm() -> Path | None:
-    """LLVM's shared library: where DRJIT_LIBLLVM_PATH says, else version 19 or, without it, the last by name."""
-    named = os.environ.get("DRJIT_LIBLLVM_PATH")
-    if named:
-        return Path(named)
-    found = [path for place in _PLACES for pattern in _PATTERNS for path in Path(place).glob(pattern)]
-    libraries = [path for path in found if path.is_file() and (".so" in path.name or path.suffix == ".dylib")]
-    usable = [path for path in libraries if not any(name in path.name for name in _CRASHES)]
-    return max(usable, key=lambda path: (_TESTED in path.name, path.name), default=None)
-
-
 @dataclass(frozen=True, eq=False)
 class Guides:
     """Means over the paths of some pixels that met a surface. share: how many did.
@@ -78,28 +41,6 @@ class Guides:
     share: Float32[np.ndarray, " pixels"]
     albedo: Float32[np.ndarray, "pixels 3"]
     normal: Float32[np.ndarray, "pixels 3"]
-
-
-def require_denoiser() -> None:
-    """Raise MissingExtraError if pyoidn is not installed."""
-    try:
-        import pyoidn  # noqa: F401
-    except ImportError:
-        raise MissingExtraError("pyoidn", "denoise") from None
-
-
-def denoised(guides: Guides, pixels: Int64[np.ndarray, " pixels"], size: tuple[int, int]) -> Float32[np.ndarray, "pixels 3"]:
-    """The colour of pixels (row after row of a picture of height and width) without its noise."""
-    import pyoidn
-
-    def picture(values: Float32[np.ndarray, "pixels 3"]) -> Float32[np.ndarray, "height width 3"]:
-        whole = np.zeros((size[0] * size[1], 3), np.float32)
-        whole[pixels] = values
-        return whole.reshape(*size, 3)
-
-    albedo = np.clip(picture(guides.albedo), 0.0, 1.0)
-    clean = pyoidn.denoise(picture(guides.color), albedo=albedo, normal=picture(guides.normal), hdr=True, clean_aux=True)
-    return np.asarray(clean, np.float32).reshape(-1, 3)[pixels]
 
 
 class MitsubaTracer:
@@ -194,3 +135,62 @@ class MitsubaTracer:
         world = world_of(scene, surroundings, None if last is None else last[2])
         self._kept = scene, surroundings, world
         return world
+
+
+def load(threads: int = 0) -> Any:
+    """Mitsuba with its LLVM variant chosen; threads: 0 leaves the number as it is, which is all cores at first.
+
+    Raises MissingExtraError where Mitsuba is not installed, InputError where there is no LLVM for it.
+    """
+    library = find_llvm()
+    if library is not None:
+        os.environ.setdefault("DRJIT_LIBLLVM_PATH", str(library))
+    try:
+        import drjit
+        import mitsuba
+    except ImportError:
+        raise MissingExtraError("mitsuba", "mitsuba") from None
+    try:
+        mitsuba.set_variant(LLVM)
+        drjit.eval(mitsuba.Float([0.0]) + 1.0)
+    except (ImportError, RuntimeError) as error:
+        raise InputError(
+            f"expected the LLVM library that Mitsuba's path tracer compiles with, but it does not load ({str(error).splitlines()[0]}): "
+            "install one (Debian: apt install libllvm19) or name it in DRJIT_LIBLLVM_PATH, or choose the renderer embree"
+        ) from None
+    if threads:
+        drjit.set_thread_count(threads)
+    return mitsuba
+
+
+def find_llvm() -> Path | None:
+    """LLVM's shared library: where DRJIT_LIBLLVM_PATH says, else version 19 or, without it, the last by name."""
+    named = os.environ.get("DRJIT_LIBLLVM_PATH")
+    if named:
+        return Path(named)
+    found = [path for place in _PLACES for pattern in _PATTERNS for path in Path(place).glob(pattern)]
+    libraries = [path for path in found if path.is_file() and (".so" in path.name or path.suffix == ".dylib")]
+    usable = [path for path in libraries if not any(name in path.name for name in _CRASHES)]
+    return max(usable, key=lambda path: (_TESTED in path.name, path.name), default=None)
+
+
+def require_denoiser() -> None:
+    """Raise MissingExtraError if pyoidn is not installed."""
+    try:
+        import pyoidn  # noqa: F401
+    except ImportError:
+        raise MissingExtraError("pyoidn", "denoise") from None
+
+
+def denoised(guides: Guides, pixels: Int64[np.ndarray, " pixels"], size: tuple[int, int]) -> Float32[np.ndarray, "pixels 3"]:
+    """The colour of pixels (row after row of a picture of height and width) without its noise."""
+    import pyoidn
+
+    def picture(values: Float32[np.ndarray, "pixels 3"]) -> Float32[np.ndarray, "height width 3"]:
+        whole = np.zeros((size[0] * size[1], 3), np.float32)
+        whole[pixels] = values
+        return whole.reshape(*size, 3)
+
+    albedo = np.clip(picture(guides.albedo), 0.0, 1.0)
+    clean = pyoidn.denoise(picture(guides.color), albedo=albedo, normal=picture(guides.normal), hdr=True, clean_aux=True)
+    return np.asarray(clean, np.float32).reshape(-1, 3)[pixels]

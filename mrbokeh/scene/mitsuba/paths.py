@@ -18,6 +18,11 @@ from mrbokeh.scene.mitsuba.reflection import Reflection, reflection
 from mrbokeh.scene.mitsuba.world import World
 from mrbokeh.system.console import track
 
+_SURE_BOUNCES = 3
+"""From there on faint paths are ended by chance."""
+_NOTHING = 0xFFFFFFFF
+_RAYS_AT_ONCE = 1 << 20
+
 
 def drawn_lights(world: World, reflects: Reflection, sampler: Any, active: Any) -> Any:
     """Radiance reflected from one point drawn of the environment and one of the shining triangles."""
@@ -57,12 +62,6 @@ def shining_light(world: World, origin: Any, value_of: Any, sampler: Any, active
 def balance(density: Any, other: Any) -> Any:
     """The balance heuristic: what counts of light drawn with one density where another way draws it too."""
     return density / dr.maximum(density + other, 1e-20)
-
-
-_SURE_BOUNCES = 3
-"""From there on faint paths are ended by chance."""
-
-_NOTHING = 0xFFFFFFFF
 
 
 @dataclass(frozen=True)
@@ -242,9 +241,6 @@ def _gone_on(world: World, path: _Path, meets: _Meeting, reflects: Reflection, r
         density=dr.select(goes_on, density, path.density),
         passed=dr.select(through, path.passed + meets.distance, 0.0),
     )
-
-
-_RAYS_AT_ONCE = 1 << 20
 
 
 class CameraRays:

@@ -12,6 +12,9 @@ import numpy as np
 
 from mrbokeh.scene.packed_scene import MASK, MIRROR, OPAQUE, REPEAT, PackedMaterials, PackedTextures, PackedTriangles
 
+BASE_COLOR, METALLIC_ROUGHNESS, EMISSIVE, NORMAL = range(4)
+_Pair = tuple[Any, Any]
+
 
 class TextureTables:
     """`PackedTextures` on the device; the compiled twin is `_texture_numba`."""
@@ -61,10 +64,6 @@ def _neighbours(s: Any, size: Any, wrap: Any) -> tuple[Any, Any, Any]:
     before = dr.select(low < 0, dr.select(repeats, size - 1, 0), low)
     after = dr.select(low + 1 >= size, dr.select(repeats, 0, size - 1), low + 1)
     return before, after, x - dr.floor(x)
-
-
-BASE_COLOR, METALLIC_ROUGHNESS, EMISSIVE, NORMAL = range(4)
-_Pair = tuple[Any, Any]
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,8 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Scene
 from mrbokeh.system.errors import InputError
 
+_KEPT = 8
+
 
 @dataclass(frozen=True)
 class ShutterTiming:
@@ -55,9 +57,6 @@ class ShutterTiming:
         enlarged = overscan.focal_px[1] / plate.focal_px[1]
         top = overscan.principal_px[1] - plate.principal_px[1] * enlarged
         return replace(self, rows_px=(top, top + plate.height_px * enlarged))
-
-
-_KEPT = 8
 
 
 @dataclass(frozen=True)

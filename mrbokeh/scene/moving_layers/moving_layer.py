@@ -23,91 +23,10 @@ from mrbokeh.system.errors import InputError
 
 Rendering = Callable[[Scene, Camera], Layer]
 
-
-def accumulated(rendering: Rendering, filmed: FilmedScene, time_s: float, samples: int, band_px: int = 8) -> Layer:
-    """The mean of `samples` pictures over the shutter, premultiplied; depth is the one that is seen nearest to the middle of it.
-
-    rendering: such as `renderer.render`. band_px: with a rolling shutter, so many rows are exposed at one time, that of their
-    middle. Blurred already, the layer has no motion channels. It cannot tell light of different depths in one pixel apart.
-    """
-    if samples < 1 or band_px < 1:
-        raise InputError(f"an accumulation needs at least one picture and bands of one row, got {samples} and {band_px}")
-    height_px = filmed.camera_at(filmed.shutter.middle_s(time_s)).height_px
-    step = band_px if filmed.shutter.is_rolling else height_px
-    bands = [_band(rendering, filmed, time_s, samples, (top, min(top + step, height_px))) for top in range(0, height_px, step)]
-    names = bands[0].extra
-    return Layer(
-        np.concatenate([band.rgb for band in bands]),
-        np.concatenate([band.alpha for band in bands]),
-        np.concatenate([band.depth_m for band in bands]),
-        {name: np.concatenate([band.extra[name] for band in bands]) for name in names},
-    )
-
-
-def _band(rendering: Rendering, filmed: FilmedScene, time_s: float, samples: int, rows: tuple[int, int]) -> Layer:
-    shutter = filmed.shutter
-    height_px = filmed.camera_at(time_s).height_px
-    middle_s = time_s + shutter.row_delay_s(0.5 * (rows[0] + rows[1]), height_px)
-    offsets = (np.arange(samples) + 0.5) / samples - 0.5
-    order = np.argsort(np.abs(offsets), kind="stable")
-    total: Layer | None = None
-    for offset in offsets[order].tolist():
-        moment_s = middle_s + offset * shutter.exposure_s
-        shown = rendering(filmed.scene_at(moment_s), _rows_of(filmed.camera_at(moment_s), rows))
-        total = shown if total is None else _sum(total, shown)
-    assert total is not None
-    share = np.float32(1.0 / samples)
-    alpha = np.minimum(total.alpha * share, np.float32(1.0))
-    return Layer(total.rgb * share, alpha, total.depth_m, {name: values * share for name, values in total.extra.items()})
-
-
-def _sum(one: Layer, other: Layer) -> Layer:
-    return Layer(
-        one.rgb + other.rgb,
-        one.alpha + other.alpha,
-        np.where(np.isfinite(one.depth_m), one.depth_m, other.depth_m),
-        {name: values + other.extra[name] for name, values in one.extra.items()},
-    )
-
-
-def _rows_of(camera: Camera, rows: tuple[int, int]) -> Camera:
-    """The camera that sees only these rows."""
-    principal = (camera.principal_px[0], camera.principal_px[1] - rows[0])
-    return replace(camera, height_px=rows[1] - rows[0], principal_px=principal)
-
-
 _STEPS = 10
 _CLOSE_PX = 0.01
-
-
-def rolled(layer: Layer, paths: Paths, span_s: float, shutter: ShutterTiming) -> Layer:
-    """The layer of the middle row's moment, moved row by row along its paths to where each row sees it.
-
-    paths: over `span_s`, of what the layer shows. Motion channels become what the rows see of them: what runs with the readout
-    is drawn longer. Things that move differently side by side are told apart only where they are in the middle.
-    """
-    box = paths.box.grown(int(np.ceil(paths.length_px)) + 1).within(layer.alpha.shape)
-    x, y = np.meshgrid(np.arange(box.left - 1, box.right + 1) + 0.5, np.arange(box.top - 1, box.bottom + 1) + 0.5)
-    delay_s = np.array([shutter.row_delay_s(row, layer.height_px) for row in y[:, 0].tolist()]) - 0.5 * shutter.readout_s
-    positions_px = _sources_px(np.stack([x, y], axis=-1), paths, delay_s / span_s)
-    return box.placed(resampled(layer, positions_px, paths.box), layer.alpha.shape)
-
-
-def _sources_px(
-    xy_px: Float64[np.ndarray, "rows columns 2"], paths: Paths, delays: Float64[np.ndarray, " rows"]
-) -> Float64[np.ndarray, "rows columns 2"]:
-    """The places p with p + motion(p) delay = xy, by repeated substitution."""
-    found = xy_px
-    for _ in range(_STEPS):
-        at = (found - (paths.box.left + 0.5, paths.box.top + 0.5)).astype(np.float32)
-        motion_px = cv2.remap(paths.motion_px, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        last, found = found, xy_px - motion_px.astype(np.float64) * delays[:, None, None]
-        if np.abs(found - last).max() < _CLOSE_PX:
-            break
-    return found
-
-
 _LEAST_SAMPLES = 8
+_SAMPLES = 16
 
 
 @dataclass(frozen=True)
@@ -169,9 +88,6 @@ def _with_motion(layer: Layer, paths: Paths, share: float) -> Layer:
     return replace(layer, extra={**layer.extra, MOTION: motion_px})
 
 
-_SAMPLES = 16
-
-
 @dataclass(frozen=True)
 class ShadowCatcher:
     """A level catcher, and how dark its shadow is where no light arrives (0 to 1)."""
@@ -199,3 +115,82 @@ def moving_shadow_layer(
     # On the ground, whatever is seen keeps its place: nothing has to be followed but the camera.
     scene = filmed.scene_at(middle_s)
     return followed(rendering, replace(filmed, scene_at=lambda _: scene), time_s, MotionQuality(most_samples=samples))
+
+
+def accumulated(rendering: Rendering, filmed: FilmedScene, time_s: float, samples: int, band_px: int = 8) -> Layer:
+    """The mean of `samples` pictures over the shutter, premultiplied; depth is the one that is seen nearest to the middle of it.
+
+    rendering: such as `renderer.render`. band_px: with a rolling shutter, so many rows are exposed at one time, that of their
+    middle. Blurred already, the layer has no motion channels. It cannot tell light of different depths in one pixel apart.
+    """
+    if samples < 1 or band_px < 1:
+        raise InputError(f"an accumulation needs at least one picture and bands of one row, got {samples} and {band_px}")
+    height_px = filmed.camera_at(filmed.shutter.middle_s(time_s)).height_px
+    step = band_px if filmed.shutter.is_rolling else height_px
+    bands = [_band(rendering, filmed, time_s, samples, (top, min(top + step, height_px))) for top in range(0, height_px, step)]
+    names = bands[0].extra
+    return Layer(
+        np.concatenate([band.rgb for band in bands]),
+        np.concatenate([band.alpha for band in bands]),
+        np.concatenate([band.depth_m for band in bands]),
+        {name: np.concatenate([band.extra[name] for band in bands]) for name in names},
+    )
+
+
+def _band(rendering: Rendering, filmed: FilmedScene, time_s: float, samples: int, rows: tuple[int, int]) -> Layer:
+    shutter = filmed.shutter
+    height_px = filmed.camera_at(time_s).height_px
+    middle_s = time_s + shutter.row_delay_s(0.5 * (rows[0] + rows[1]), height_px)
+    offsets = (np.arange(samples) + 0.5) / samples - 0.5
+    order = np.argsort(np.abs(offsets), kind="stable")
+    total: Layer | None = None
+    for offset in offsets[order].tolist():
+        moment_s = middle_s + offset * shutter.exposure_s
+        shown = rendering(filmed.scene_at(moment_s), _rows_of(filmed.camera_at(moment_s), rows))
+        total = shown if total is None else _sum(total, shown)
+    assert total is not None
+    share = np.float32(1.0 / samples)
+    alpha = np.minimum(total.alpha * share, np.float32(1.0))
+    return Layer(total.rgb * share, alpha, total.depth_m, {name: values * share for name, values in total.extra.items()})
+
+
+def _sum(one: Layer, other: Layer) -> Layer:
+    return Layer(
+        one.rgb + other.rgb,
+        one.alpha + other.alpha,
+        np.where(np.isfinite(one.depth_m), one.depth_m, other.depth_m),
+        {name: values + other.extra[name] for name, values in one.extra.items()},
+    )
+
+
+def _rows_of(camera: Camera, rows: tuple[int, int]) -> Camera:
+    """The camera that sees only these rows."""
+    principal = (camera.principal_px[0], camera.principal_px[1] - rows[0])
+    return replace(camera, height_px=rows[1] - rows[0], principal_px=principal)
+
+
+def rolled(layer: Layer, paths: Paths, span_s: float, shutter: ShutterTiming) -> Layer:
+    """The layer of the middle row's moment, moved row by row along its paths to where each row sees it.
+
+    paths: over `span_s`, of what the layer shows. Motion channels become what the rows see of them: what runs with the readout
+    is drawn longer. Things that move differently side by side are told apart only where they are in the middle.
+    """
+    box = paths.box.grown(int(np.ceil(paths.length_px)) + 1).within(layer.alpha.shape)
+    x, y = np.meshgrid(np.arange(box.left - 1, box.right + 1) + 0.5, np.arange(box.top - 1, box.bottom + 1) + 0.5)
+    delay_s = np.array([shutter.row_delay_s(row, layer.height_px) for row in y[:, 0].tolist()]) - 0.5 * shutter.readout_s
+    positions_px = _sources_px(np.stack([x, y], axis=-1), paths, delay_s / span_s)
+    return box.placed(resampled(layer, positions_px, paths.box), layer.alpha.shape)
+
+
+def _sources_px(
+    xy_px: Float64[np.ndarray, "rows columns 2"], paths: Paths, delays: Float64[np.ndarray, " rows"]
+) -> Float64[np.ndarray, "rows columns 2"]:
+    """The places p with p + motion(p) delay = xy, by repeated substitution."""
+    found = xy_px
+    for _ in range(_STEPS):
+        at = (found - (paths.box.left + 0.5, paths.box.top + 0.5)).astype(np.float32)
+        motion_px = cv2.remap(paths.motion_px, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        last, found = found, xy_px - motion_px.astype(np.float64) * delays[:, None, None]
+        if np.abs(found - last).max() < _CLOSE_PX:
+            break
+    return found

@@ -25,6 +25,14 @@ _BEFORE = 2.0**-9
 _NEAR = 2.0**-6
 """A surface is taken for the one that is shown where it lies within this part of the stated depth."""
 
+FRACTIONS = (-0.5, -0.25, 0.0, 0.25, 0.5)
+"""Moments of the time span at which paths are looked at, from its middle."""
+_MOST = 99.9
+"""Per cent of the pixels that decide: surfaces are found again at nearly all, but at an edge one may belong to another."""
+_LOOKED_AT = 20000
+"""Pixels, evenly over what is visible, at which more than the ends of paths is looked at."""
+Places = Float64[np.ndarray, "points 2"]
+
 
 @dataclass(frozen=True, eq=False)
 class SurfacePoints:
@@ -88,16 +96,6 @@ def _met(
     determinant = np.where(determinant == 0.0, np.nan, determinant)
     w1, w2 = np.einsum("pk,pk->p", p, to_eye) / determinant, np.einsum("pk,pk->p", q, directions) / determinant
     return np.stack([1.0 - w1 - w2, w1, w2], axis=-1), np.einsum("pk,pk->p", q, side_2) / determinant
-
-
-FRACTIONS = (-0.5, -0.25, 0.0, 0.25, 0.5)
-"""Moments of the time span at which paths are looked at, from its middle."""
-_MOST = 99.9
-"""Per cent of the pixels that decide: surfaces are found again at nearly all, but at an edge one may belong to another."""
-_LOOKED_AT = 20000
-"""Pixels, evenly over what is visible, at which more than the ends of paths is looked at."""
-
-Places = Float64[np.ndarray, "points 2"]
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,9 @@ from mrbokeh.renderers.choose import DEFAULT
 
 Triple = tuple[float, float, float]
 
+_SHADOW_SIZE_M = 2.0
+"""Side of the part of the ground that catches the shadow of one object."""
+
 
 @dataclass(frozen=True)
 class PlacedObject:
@@ -77,10 +80,6 @@ class SceneDescription:
         of_occlusion = (self.occlusion.depth, self.occlusion.camera, self.occlusion.mask) if self.occlusion else ()
         named = (*(each.glb for each in self.objects), self.light.environment, *of_occlusion, self.lens)
         return (self.path, *(path for path in named if path is not None))
-
-
-_SHADOW_SIZE_M = 2.0
-"""Side of the part of the ground that catches the shadow of one object."""
 
 
 @dataclass(frozen=True)

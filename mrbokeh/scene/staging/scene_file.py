@@ -53,6 +53,8 @@ from mrbokeh.scene.staging.scene_description import Lighting, PlacedObject, Real
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import UPRIGHT_FROM_WORLD
 
+_TABLES = ("up", "object", "light", "sun", "shadow", "occlusion", "lens", "renderer")
+
 
 class SceneValues(Values):
     """Table of a TOML file; messages name the file, the table and the key."""
@@ -105,9 +107,6 @@ class SceneValues(Values):
 
     def optional_file(self, key: str, folder: Path) -> Path | None:
         return self.file(key, folder) if key in self.document else None
-
-
-_TABLES = ("up", "object", "light", "sun", "shadow", "occlusion", "lens", "renderer")
 
 
 def read_scene_file(path: Path) -> SceneDescription:

@@ -22,6 +22,10 @@ SUN_DIRECTION = (0.45, 1.0, 0.55)
 _GREY, _SUN = 0.45, 1.6
 """Where a scene file brings no light: as bright as `mrbokeh composite` lights an object."""
 
+MOMENT_S = 1 / 120
+"""Live, animations are posed at whole multiples of this, so that two frames of one moment share one scene."""
+_first_scenes: WeakKeyDictionary[GltfAsset, dict[str | None, Scene]] = WeakKeyDictionary()
+
 
 class Assets:
     """Opened GLB files and lighting, kept until their files change. Not thread-safe: use it in the thread that loads scenes."""
@@ -93,13 +97,6 @@ def _panorama_light(panorama: Panorama, light: Lighting, up: str) -> tuple[Envir
     turn = np.eye(4)
     turn[:3, :3] = turned_sky.world_from_environment
     return turned_sky, (brightest.transformed(turn).brighter(light.exposure),)
-
-
-MOMENT_S = 1 / 120
-"""Live, animations are posed at whole multiples of this, so that two frames of one moment share one scene."""
-
-
-_first_scenes: WeakKeyDictionary[GltfAsset, dict[str | None, Scene]] = WeakKeyDictionary()
 
 
 @dataclass(frozen=True, eq=False)

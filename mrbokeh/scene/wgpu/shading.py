@@ -21,6 +21,12 @@ _ROWS_BEFORE_MAPS, _ROWS_OF_MAPS = 4, 1 + 6 * 4
 _ROWS_OF_LIGHT = _ROWS_BEFORE_MAPS + 2 * _ROWS_OF_MAPS
 _ROWS_OF_PANORAMA = 5 + 16 + 3 * 16
 
+_STEP = 2.0**-18
+"""Relative step past a surface, as of the ray caster."""
+_SAMPLES = 17
+_HEADER = 16
+"""Words before the lists: LISTED of frame.wgsl."""
+
 
 @dataclass(frozen=True, eq=False)
 class GpuLights:
@@ -109,13 +115,6 @@ def panorama(gpu: Gpu, maps: LightingMaps) -> GpuPanorama:
     levels[:, 1:3] = maps.reflections.size
     rows[21 : 21 + 3 * len(maps.peaks), :3] = maps.peaks.reshape(-1, 3)
     return GpuPanorama(gpu.buffer(rows, "UNIFORM"), gpu.buffer(np.concatenate(parts)), True)
-
-
-_STEP = 2.0**-18
-"""Relative step past a surface, as of the ray caster."""
-_SAMPLES = 17
-_HEADER = 16
-"""Words before the lists: LISTED of frame.wgsl."""
 
 
 @dataclass(frozen=True, eq=False)
