@@ -26,7 +26,7 @@ from mrbokeh.optics.lens import MM_PER_M, Lens
 from mrbokeh.system.atomic_files import read_json, refuse_existing, write_json
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
-from mrbokeh.video.clip import VideoWriter
+from mrbokeh.video.writer import VideoWriter
 
 # Sines of unrelated periods: (Hz, share). Breathing and swaying below 1 Hz, tremor of the hand at 6 to 11 Hz.
 _SWAY = ((0.23, 1.0), (0.41, 0.5), (0.87, 0.25))

@@ -211,7 +211,7 @@ def write_blurred(
 
 
 def _write_film(out: Path, distances_m: Sequence[float], blurred: Blurred, frame_rate: float) -> None:
-    from mrbokeh.video.clip import VideoWriter
+    from mrbokeh.video.writer import VideoWriter
 
     rate = Fraction(frame_rate).limit_denominator(1001)
     first = blurred(distances_m[0])

@@ -61,7 +61,7 @@ def cast_light_change(renderer: SceneRenderer, scene: Scene, camera: Camera, cat
     seen = seen_surface(EmbreeRaycaster(), camera, catcher)
     surfaces, centre_m, pixels = _met_surfaces(camera, catcher)
     nothing = np.zeros((len(pixels), 3), np.float32)
-    drawn = [mesh for mesh in scene.meshes if len(mesh.triangles) and not mesh.catches_shadow]
+    drawn = scene.drawn_meshes
     if not drawn or not len(pixels):
         return changed(seen, pixels, (nothing, nothing, nothing))
     lights, environment = scene.lighting
@@ -106,7 +106,7 @@ def _lamp_light(lights: Sequence[Light], surfaces: Surfaces, centre_m: Float64[n
 class _Objects:
     """Objects that hide the sky, and the ball around them."""
 
-    def __init__(self, drawn: list[Mesh]) -> None:
+    def __init__(self, drawn: Sequence[Mesh]) -> None:
         self._rays = prepared(drawn)
         points_m = self._rays.triangles.corners_m.reshape(-1, 3)
         middle_m = (points_m.min(0) + points_m.max(0)) / 2

@@ -37,6 +37,11 @@ class Scene:
             return (), neutral_environment()
         return self.lights, self.environment
 
+    @property
+    def drawn_meshes(self) -> tuple[Mesh, ...]:
+        """Meshes with triangles, less those that only catch shadows."""
+        return tuple(mesh for mesh in self.meshes if len(mesh.triangles) and not mesh.catches_shadow)
+
     def transformed(self, world_from_scene: Float[np.ndarray, "4 4"]) -> "Scene":
         """Meshes and lights placed in the world; the environment stays where it is."""
         if world_from_scene.shape != (4, 4) or abs(np.linalg.det(world_from_scene[:3, :3])) < 1e-18:

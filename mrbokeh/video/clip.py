@@ -16,7 +16,6 @@ from jaxtyping import Float32, UInt8
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.color import VideoColor, color_of
 from mrbokeh.video.frames import display_bgr, has_alpha, linear_rgb, stored_alpha
-from mrbokeh.video.writer import VideoWriter as VideoWriter
 
 # Decoders that say where chroma lies, and JPEG, where it lies in the middle, which is what FFmpeg takes when nobody says.
 _PLACES_CHROMA = ("h264", "hevc", "av1", "mpeg1video", "mpeg2video", "mjpeg")

@@ -20,9 +20,7 @@ from mrbokeh.video.color import (
     linear_from_code,
     rec709_from_primaries,
 )
-from mrbokeh.video.encodings import ENCODINGS as ENCODINGS
 from mrbokeh.video.encodings import Encoding
-from mrbokeh.video.encodings import encoding_for as encoding_for
 
 
 def has_alpha(frame: Any) -> bool:

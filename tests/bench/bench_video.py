@@ -27,8 +27,9 @@ from mrbokeh.shots.frame_sources import FocusPulled
 from mrbokeh.shots.render_shot import render_shot
 from mrbokeh.shots.shot import SEGMENT_S, MakerRecipe, Shot
 from mrbokeh.shots.targets import VideoTarget
-from mrbokeh.video.clip import VideoWriter, probe
+from mrbokeh.video.clip import probe
 from mrbokeh.video.picture_source import open_source
+from mrbokeh.video.writer import VideoWriter
 from tests.bench.machine import machine_line
 from tests.scenes.shot_makers import Brighter, MovingDisc
 

@@ -23,7 +23,7 @@ from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack
 from mrbokeh.system.errors import InputError
-from mrbokeh.video.clip import VideoWriter
+from mrbokeh.video.writer import VideoWriter
 
 LENS = Lens(50.0, 2.0, 1.0, 2.2)
 SIZE = (48, 72)

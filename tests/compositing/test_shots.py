@@ -24,8 +24,9 @@ from mrbokeh.shots.segment_task import SegmentTask, render_segment
 from mrbokeh.shots.shot import FrameMaker, MakerRecipe, Shot, Target
 from mrbokeh.shots.targets import SequenceTarget, VideoTarget
 from mrbokeh.system.errors import InputError
-from mrbokeh.video.clip import VideoWriter, probe, read_frames
+from mrbokeh.video.clip import probe, read_frames
 from mrbokeh.video.picture_source import open_source
+from mrbokeh.video.writer import VideoWriter
 from tests.scenes.shot_makers import Brighter, wait_for
 
 INTRA = [
@@ -145,6 +146,7 @@ def test_sound_is_copied_where_segments_are_joined(tmp_path: Path, shared_data: 
     )
 
 
+@pytest.mark.slow
 def test_a_real_clip_of_uneven_times_keeps_them(tmp_path: Path, shared_data: Path) -> None:
     """The iPhone's HEVC with a variable rate, into H.265 in parts."""
     clip = shared_data / "video" / "iphone_xr_chart.mov"

@@ -11,7 +11,7 @@ import pytest
 from mrbokeh import cli
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
-from mrbokeh.video.clip import VideoWriter
+from mrbokeh.video.writer import VideoWriter
 
 WORK = {
     "ingest": ("capture.stacks.ingest.ingest", ["{0}", "--out", "{0}/scene"], "finished slices are kept in {0}/scene"),

@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 
 from mrbokeh.system.errors import InputError
-from mrbokeh.video.clip import VideoWriter
 from mrbokeh.video.color import linear_from_code
+from mrbokeh.video.writer import VideoWriter
 from viewfinder.frames import LensState
-from viewfinder.sources.frame_source import CameraAwayError, reconnecting
+from viewfinder.sources.frame_source import CameraAwayError, SizeLimit, reconnecting
 from viewfinder.sources.network_stream import newest_of
 from viewfinder.sources.webcam import WebcamSource
 
@@ -49,7 +49,7 @@ def test_a_webcam_is_pulled_out_and_plugged_in_again(clip: Path) -> None:
         opened.append(cv2.VideoCapture(str(clip)) if len(opened) not in (1, 2) else None)
         return opened[-1]
 
-    source, stopping = WebcamSource(3, max_width_px=80, open_camera=plug), Event()
+    source, stopping = WebcamSource(3, SizeLimit(80), open_camera=plug), Event()
     assert source.status is None
     frames = source.frames(stopping)
     before = [next(frames) for _ in range(3)]

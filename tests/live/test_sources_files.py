@@ -15,8 +15,9 @@ from PIL import Image
 
 from mrbokeh.lens_measuring.matching.photo_facts import read_facts
 from mrbokeh.system.errors import InputError, MissingExtraError
-from mrbokeh.video.clip import VideoWriter, probe
+from mrbokeh.video.clip import probe
 from mrbokeh.video.color import linear_from_code
+from mrbokeh.video.writer import VideoWriter
 from viewfinder.frames import CameraFrame, LensState
 from viewfinder.sources.choose import open_source
 from viewfinder.sources.frame_source import FrameSource, SizeLimit
@@ -196,7 +197,7 @@ def test_a_video_goes_round_in_its_own_size(clip: Path) -> None:
 def test_a_real_film_comes_upright_and_small(shared_data: Path) -> None:
     path = shared_data / "video" / "iphone_xr_chart.mov"
     info = probe(path)
-    frames = open_source(str(path), 200, 200).frames(Event())
+    frames = open_source(str(path), SizeLimit(200, 200)).frames(Event())
     height_px, width_px = next(frames).bgr.shape[:2]
     assert (width_px, height_px) == SizeLimit(200, 200).fit(info.width_px, info.height_px)
     frames.close()  # type: ignore[attr-defined]
@@ -250,7 +251,7 @@ def test_words_and_addresses_open_what_they_name(tmp_path: Path, clip: Path) -> 
         "whip": "browser camera",
     }
     for text, name in cases.items():
-        source = open_source(text, 80, 60)
+        source = open_source(text, SizeLimit(80, 60))
         assert isinstance(source, FrameSource) and source.name == name, text
     assert open_source("test").frames(Event()).__next__().bgr.shape == (360, 640, 3)
 

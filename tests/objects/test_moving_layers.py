@@ -17,7 +17,7 @@ from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.gltf.gltf_loader import GltfAsset, load_glb
 from mrbokeh.scene.moving_layers import FilmedScene, ShutterTiming, accumulated, moving_layer, moving_shadow_layer
 from mrbokeh.scene.moving_layers.moving_layer import MotionQuality, ShadowCatcher
-from mrbokeh.scene.moving_layers.paths import SurfacePoints, drawn_meshes, paths_of
+from mrbokeh.scene.moving_layers.paths import SurfacePoints, paths_of
 from mrbokeh.system.errors import InputError
 
 OBJECTS = Path(__file__).resolve().parents[2] / "mrbokeh" / "demo_data" / "objects"
@@ -205,14 +205,14 @@ def test_following_triangles_finds_what_moving_the_body_finds(alien: Scene) -> N
     inside = layer.alpha == 1.0
     points_m = CAMERA.unproject(CAMERA.pixel_centres_px()[inside], layer.depth_m[inside].astype(np.float64))
     points = SurfacePoints(alien, np.zeros(3), points_m)
-    as_body, by_triangles = points.at(moved), points.following_triangles(drawn_meshes(moved))
+    as_body, by_triangles = points.at(moved), points.following_triangles(moved.drawn_meshes)
     assert as_body is not None and by_triangles is not None
     found = np.isfinite(by_triangles).all(axis=1)
     assert found.mean() > 0.97
     assert np.percentile(np.linalg.norm(as_body - by_triangles, axis=1)[found], 99.0) < 1e-5
     np.testing.assert_array_equal(points.at(alien), points_m)
     np.testing.assert_array_equal(points.at(moved, 7), as_body[::7])
-    assert points.following_triangles(drawn_meshes(replace(alien, meshes=(*alien.meshes, *board().meshes)))) is None
+    assert points.following_triangles(replace(alien, meshes=(*alien.meshes, *board().meshes)).drawn_meshes) is None
 
 
 def test_a_wheel_is_averaged_once_its_paths_bend() -> None:

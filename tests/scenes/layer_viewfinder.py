@@ -17,8 +17,8 @@ import numpy as np
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.video.clip import VideoWriter
 from mrbokeh.video.color import linear_from_code
+from mrbokeh.video.writer import VideoWriter
 from viewfinder.app.lenses import LensBook
 from viewfinder.app.opening import Parts
 from viewfinder.app.running import Viewfinder

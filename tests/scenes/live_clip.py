@@ -12,7 +12,8 @@ import numpy as np
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
-from mrbokeh.video.clip import VideoWriter, read_display_frames
+from mrbokeh.video.clip import read_display_frames
+from mrbokeh.video.writer import VideoWriter
 from tests.scenes.stage_scenes import card
 from tests.scenes.traced_board_clip import BOARD, clip_of
 from viewfinder.frames import CameraFrame

@@ -24,7 +24,7 @@ from mrbokeh.tracking.camera_track.board_track import RollingCorners, TrackSetti
 from mrbokeh.tracking.camera_track.formats import read_track
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, write_board
 from mrbokeh.tracking.charuco.detector import Corners
-from mrbokeh.video.clip import VideoWriter
+from mrbokeh.video.writer import VideoWriter
 from tests.scenes.traced_board_clip import BOARD, MOTION, clip_of, pose_error
 from tests.scenes.video_files import turned_clip
 

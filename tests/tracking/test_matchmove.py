@@ -20,7 +20,8 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.formats import read_track
 from mrbokeh.tracking.camera_track.track import CameraTrack
-from mrbokeh.video.clip import VideoWriter, probe
+from mrbokeh.video.clip import probe
+from mrbokeh.video.writer import VideoWriter
 from tests.scenes.textured_room import picture, room_camera
 
 

@@ -12,7 +12,7 @@ from datasets_scripts.track_picture import axes_of, main, with_axes
 from mrbokeh.optics.camera import Camera
 from mrbokeh.tracking.camera_track.formats import write_track
 from mrbokeh.tracking.camera_track.track import fixed_track
-from mrbokeh.video.clip import VideoWriter
+from mrbokeh.video.writer import VideoWriter
 
 CAMERA = Camera(160, 112, (100.0, 100.0), (80.5, 56.5))
 

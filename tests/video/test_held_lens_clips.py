@@ -16,8 +16,8 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.errors import InputError
-from mrbokeh.video.clip import VideoWriter
 from mrbokeh.video.picture_source import open_source
+from mrbokeh.video.writer import VideoWriter
 from tests.scenes.video_files import turned_clip
 
 WIDTH, HEIGHT = 96, 64

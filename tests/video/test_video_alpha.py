@@ -24,10 +24,11 @@ from mrbokeh.shots.executors import ProcessExecutor, SerialExecutor
 from mrbokeh.shots.render_shot import render_shot
 from mrbokeh.shots.shot import Shot
 from mrbokeh.shots.targets import SequenceTarget, VideoTarget
-from mrbokeh.video.clip import VideoWriter, read_frames
+from mrbokeh.video.clip import read_frames
 from mrbokeh.video.color import color_of
 from mrbokeh.video.frames import has_alpha, linear_rgb, stored_alpha
 from mrbokeh.video.picture_source import PictureSource, open_source
+from mrbokeh.video.writer import VideoWriter
 from tests.scenes.shot_makers import Brighter
 from tests.scenes.video_files import turned_clip
 

@@ -24,7 +24,8 @@ from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.focus_pull import parse_focus_keys
-from mrbokeh.video.clip import VideoWriter, read_frames
+from mrbokeh.video.clip import read_frames
+from mrbokeh.video.writer import VideoWriter
 from tests.compositing.test_plate_look_options import photo_with_exif
 from tests.scenes.shot_makers import wait_for
 from tests.scenes.stage_scenes import HEIGHT, ONE_CARD, WIDTH, camera, scene_file

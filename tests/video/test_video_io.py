@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from mrbokeh.system.errors import InputError
-from mrbokeh.video.clip import VideoWriter, probe, read_display_frames, read_frames
+from mrbokeh.video.clip import probe, read_display_frames, read_frames
 from mrbokeh.video.color import code_from_linear, decode_table, encode_table, linear_from_code, rec709_from_primaries
+from mrbokeh.video.writer import VideoWriter
 
 LUMA = {"709": (0.2126, 0.0722), "601": (0.299, 0.114)}
 H273 = {"709": 1, "601": 6, "untagged": 2}

@@ -11,8 +11,9 @@ from mrbokeh.shots.executors import SerialExecutor
 from mrbokeh.shots.render_shot import render_shot
 from mrbokeh.shots.shot import Shot
 from mrbokeh.shots.targets import VideoTarget, held_pictures
-from mrbokeh.video.clip import VideoWriter, read_frames
+from mrbokeh.video.clip import read_frames
 from mrbokeh.video.picture_source import open_source
+from mrbokeh.video.writer import VideoWriter
 from tests.scenes.shot_makers import Brighter
 
 BEGINS_S = 0.5
@@ -105,6 +106,7 @@ def test_sound_that_begins_late_or_ends_early_is_filled_with_silence(tmp_path: P
     assert samples.shape[1] == 57600 and np.flatnonzero(samples[0])[-1] / 48000 == pytest.approx(0.5, abs=2e-3)
 
 
+@pytest.mark.slow
 def test_a_real_clip_of_uneven_times_goes_into_mxf_with_its_sound(tmp_path: Path, shared_data: Path) -> None:
     """The iPhone's HEVC: 6 pictures of about 27.6 a second, held and left out for 30; its mono sound lasts as long as they do."""
     clip = shared_data / "video" / "iphone_xr_chart.mov"

@@ -15,7 +15,8 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.errors import InputError
-from mrbokeh.video.clip import VideoWriter, read_frames
+from mrbokeh.video.clip import read_frames
+from mrbokeh.video.writer import VideoWriter
 
 pytest.importorskip("PyOpenColorIO")
 

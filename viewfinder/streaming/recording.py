@@ -15,8 +15,8 @@ from jaxtyping import UInt8
 from mrbokeh.compositing.overlay import CodeTables, code_tables
 from mrbokeh.system.atomic_files import refuse_existing
 from mrbokeh.system.errors import InputError
-from mrbokeh.video.clip import VideoWriter
-from mrbokeh.video.frames import encoding_for
+from mrbokeh.video.encodings import encoding_for
+from mrbokeh.video.writer import VideoWriter
 from viewfinder.frames import Bgr, OutputFrame
 from viewfinder.streaming.encoders import TIME_BASE, even_size
 
@@ -64,7 +64,9 @@ def write_recording(path: Path, frames: Iterator[OutputFrame], form: FileForm) -
 
 
 def _writer(path: Path, width_px: int, height_px: int, form: FileForm) -> VideoWriter:
-    writer = VideoWriter(path, width_px, height_px, form.frame_rate, TIME_BASE, encoding=form.encoding)
+    writer = VideoWriter(
+        path=path, width_px=width_px, height_px=height_px, frame_rate=form.frame_rate, time_base=TIME_BASE, encoding=form.encoding
+    )
     if writer.encoding.codec == "libx264":
         writer.encoding = writer.encoding._replace(options=_LIVE_H264)
     return writer
@@ -168,7 +170,9 @@ class Recorder:
         if self._failure is not None:
             raise self._failure
         written = self._written
-        return Recording(self._path, written.frame_count, self._dropped, written.duration_s, written.note)
+        return Recording(
+            path=self._path, frame_count=written.frame_count, dropped=self._dropped, duration_s=written.duration_s, note=written.note
+        )
 
     def close(self) -> None:
         """Stop if a recording is under way; what went wrong with it goes to the log."""

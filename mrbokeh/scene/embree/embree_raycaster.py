@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 
 from mrbokeh.images.layer import Layer, clear
+from mrbokeh.layering.pixel_box import NOWHERE, Box
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.embree.pixel_edges import SAMPLE_COUNTS, edge_pixels, sample_offsets_px, silhouette_pixels
 from mrbokeh.scene.embree.prepared_scenes import PlacedScene, PreparedScene, PreparedScenes
@@ -70,11 +71,11 @@ class EmbreeRaycaster:
         layer = clear(camera.height_px, camera.width_px)
         if placed is None:
             return layer
-        rows, columns = window(placed.ready, placed.camera(camera))
-        if rows.start >= rows.stop or columns.start >= columns.stop:
+        box = picture_box(placed.ready, placed.camera(camera))
+        if box.is_empty:
             return layer
-        part = self._rendered(placed, scene, cut(placed.camera(camera), rows, columns))
-        layer.rgb[rows, columns], layer.alpha[rows, columns], layer.depth_m[rows, columns] = part.rgb, part.alpha, part.depth_m
+        part = self._rendered(placed, scene, box.camera_of(placed.camera(camera)))
+        layer.rgb[box.where], layer.alpha[box.where], layer.depth_m[box.where] = part.rgb, part.alpha, part.depth_m
         return layer
 
     def _rendered(self, placed: PlacedScene, scene: Scene, camera: Camera) -> Layer:
@@ -156,32 +157,20 @@ class EmbreeRaycaster:
             return list(pool.map(work, parts))
 
 
-def window(ready: PreparedScene, camera: Camera) -> tuple[slice, slice]:
-    """Rows and columns outside which nothing of the scene is; the whole picture where the camera is within or before its box."""
+def picture_box(ready: PreparedScene, camera: Camera) -> Box:
+    """Return the box of pixels that may show the scene; the whole picture if the camera is within the scene's box or before it."""
     signs = np.array(np.meshgrid((-1.0, 1.0), (-1.0, 1.0), (-1.0, 1.0))).reshape(3, -1).T
     low, high, size = np.zeros(2), np.zeros(2), np.array([camera.width_px, camera.height_px])
     corners_m = ready.centre_m + signs * ready.half_size_m
     ahead_m = corners_m @ camera.camera_from_world[2, :3] + camera.camera_from_world[2, 3]
     if ahead_m.max() <= 0:
-        return slice(0, 0), slice(0, 0)
+        return NOWHERE
     if ahead_m.min() <= 1e-3 * ready.reach_m:
-        return slice(0, camera.height_px), slice(0, camera.width_px)
+        return Box(0, camera.height_px, 0, camera.width_px)
     xy_px, _ = camera.project(corners_m)
     low, high = (np.clip(each, -_ROOM_PX, size + _ROOM_PX) for each in (np.floor(xy_px.min(0)), np.ceil(xy_px.max(0))))
     (left, top), (right, bottom) = (np.clip(each, 0, size).astype(int).tolist() for each in (low - _ROOM_PX, high + _ROOM_PX))
-    return slice(top, bottom), slice(left, right)
-
-
-def cut(camera: Camera, rows: slice, columns: slice) -> Camera:
-    """The camera that sees only these pixels."""
-    principal = (camera.principal_px[0] - columns.start, camera.principal_px[1] - rows.start)
-    return Camera(
-        width_px=columns.stop - columns.start,
-        height_px=rows.stop - rows.start,
-        focal_px=camera.focal_px,
-        principal_px=principal,
-        camera_from_world=camera.camera_from_world,
-    )
+    return Box(top, bottom, left, right)
 
 
 def row_centres_px(camera: Camera, first: int) -> Float64[np.ndarray, "points 2"]:

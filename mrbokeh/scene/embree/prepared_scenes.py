@@ -140,13 +140,13 @@ class PreparedScenes:
     def placed(self, scene: Scene) -> PlacedScene | None:
         """Return the prepared scene and its place; None if there is nothing to draw."""
         if scene not in self._scenes:
-            drawn = [mesh for mesh in scene.meshes if len(mesh.triangles) and not mesh.catches_shadow]
+            drawn = scene.drawn_meshes
             if not drawn:
                 return None
             self._scenes[scene] = self._placed(drawn, scene.lighting[0])
         return self._scenes[scene]
 
-    def _placed(self, drawn: list[Mesh], lights: tuple[Light, ...]) -> PlacedScene:
+    def _placed(self, drawn: Sequence[Mesh], lights: tuple[Light, ...]) -> PlacedScene:
         last = self._last
         motion = None if last is None else rigid_motion(last.meshes, drawn)
         if last is None or motion is None:

@@ -20,7 +20,7 @@ from mrbokeh.scene.mesh import Mesh
 from mrbokeh.scene.mitsuba.mitsuba_tracer import MitsubaTracer
 from mrbokeh.scene.mitsuba.paths import CameraRays, Rays, followed, shining_light
 from mrbokeh.scene.mitsuba.reflection import Reflection, reflection
-from mrbokeh.scene.mitsuba.world import World, drawn_meshes, world_of
+from mrbokeh.scene.mitsuba.world import World, world_of
 from mrbokeh.scene.virtual_scene import Scene
 
 _SAME = 1e-5
@@ -32,7 +32,7 @@ def traced_light_change(tracer: MitsubaTracer, scene: Scene, camera: Camera, cat
     real = replace(catcher, catches_shadow=False, material=replace(surface, double_sided=True))
     pixels = np.flatnonzero(seen.alpha > 0)
     nothing = np.zeros((len(pixels), 3), np.float32)
-    if not drawn_meshes(scene) or not len(pixels):
+    if not scene.drawn_meshes or not len(pixels):
         return changed(seen, pixels, (nothing, nothing, nothing))
     tracer.prepare()
     table = _Table(scene, real)
@@ -80,7 +80,7 @@ class _Table:
         self.centre_m = self._both.centre_m
         lights, environment = scene.lighting
         self._real = World([real], lights, environment, self.centre_m)
-        self._object_triangles = sum(len(mesh.triangles) for mesh in drawn_meshes(scene))
+        self._object_triangles = sum(len(mesh.triangles) for mesh in scene.drawn_meshes)
         self._ball = _ball_around(scene, self.centre_m)
 
     def light(self, origin: Any, direction: Any, sampler: Any, most_bounces: int) -> list[tuple[Any, ...]]:
@@ -138,7 +138,7 @@ class _Table:
 
 
 def _ball_around(scene: Scene, centre_m: Float64[np.ndarray, "3"]) -> _Ball:
-    points_m = np.concatenate([mesh.positions_m[np.unique(mesh.triangles)] for mesh in drawn_meshes(scene)]) - centre_m
+    points_m = np.concatenate([mesh.positions_m[np.unique(mesh.triangles)] for mesh in scene.drawn_meshes]) - centre_m
     middle_m = (points_m.min(0) + points_m.max(0)) / 2
     radius_m = float(np.linalg.norm(points_m - middle_m, axis=1).max()) * 1.0001
     return _Ball(mi.Point3f(*(dr.opaque(mi.Float, float(each)) for each in middle_m)), dr.opaque(mi.Float, radius_m))

@@ -21,15 +21,11 @@ _STEP = 2.0**-18
 _MOST_SHADOW_LAYERS = 16
 
 
-def drawn_meshes(scene: Scene) -> list[Mesh]:
-    return [mesh for mesh in scene.meshes if len(mesh.triangles) and not mesh.catches_shadow]
-
-
 def world_of(scene: Scene, surroundings: Sequence[Mesh], like: "World | None" = None) -> "World":
     """Build the world of a scene's drawn meshes and, behind their triangles, real surfaces. like: a world whose equal textures are
     reused.
     """
-    drawn = drawn_meshes(scene)
+    drawn = scene.drawn_meshes
     # The middle of what is drawn: real surfaces may reach far, where nobody needs millimetres.
     points = np.concatenate([mesh.positions_m[mesh.triangles].reshape(-1, 3) for mesh in drawn or surroundings])
     centre_m = (points.min(0) + points.max(0)) / 2

@@ -14,6 +14,7 @@ from jaxtyping import Float64
 from mrbokeh.distortion.warping import resampled
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.motion import MOTION
+from mrbokeh.layering.pixel_box import Box
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Mesh, Scene, SceneRenderer
 from mrbokeh.scene.moving_layers.filmed_scene import FilmedScene, ShutterTiming
@@ -146,7 +147,8 @@ def _band(rendering: Rendering, filmed: FilmedScene, time_s: float, samples: int
     total: Layer | None = None
     for offset in offsets[order].tolist():
         moment_s = middle_s + offset * shutter.exposure_s
-        shown = rendering(filmed.scene_at(moment_s), _rows_of(filmed.camera_at(moment_s), rows))
+        camera = filmed.camera_at(moment_s)
+        shown = rendering(filmed.scene_at(moment_s), Box(*rows, 0, camera.width_px).camera_of(camera))
         total = shown if total is None else _sum(total, shown)
     assert total is not None
     share = np.float32(1.0 / samples)
@@ -161,12 +163,6 @@ def _sum(one: Layer, other: Layer) -> Layer:
         np.where(np.isfinite(one.depth_m), one.depth_m, other.depth_m),
         {name: values + other.extra[name] for name, values in one.extra.items()},
     )
-
-
-def _rows_of(camera: Camera, rows: tuple[int, int]) -> Camera:
-    """The camera that sees only these rows."""
-    principal = (camera.principal_px[0], camera.principal_px[1] - rows[0])
-    return replace(camera, height_px=rows[1] - rows[0], principal_px=principal)
 
 
 def rolled(layer: Layer, paths: Paths, span_s: float, shutter: ShutterTiming) -> Layer:

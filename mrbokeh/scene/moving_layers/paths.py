@@ -50,7 +50,7 @@ class SurfacePoints:
         """
         if scene is self.scene:
             return self.points_m[::every]
-        before, after = drawn_meshes(self.scene), drawn_meshes(scene)
+        before, after = self.scene.drawn_meshes, scene.drawn_meshes
         motion = rigid_motion(before, after)
         if motion is not None:
             return self.points_m[::every] @ motion[:3, :3].T + motion[:3, 3]
@@ -58,7 +58,7 @@ class SurfacePoints:
 
     def following_triangles(self, after: Sequence[Mesh], every: int = 1) -> Float64[np.ndarray, "some 3"] | None:
         """`at` for what does not move as one body."""
-        before = drawn_meshes(self.scene)
+        before = self.scene.drawn_meshes
         if len(before) != len(after) or any(not np.array_equal(a.triangles, b.triangles) for a, b in zip(before, after, strict=True)):
             return None
         triangle, weights = (values[::every] for values in self._held)
@@ -67,7 +67,7 @@ class SurfacePoints:
     @cached_property
     def _held(self) -> tuple[Int64[np.ndarray, " points"], Float64[np.ndarray, "points 3"]]:
         """The triangle of each point, -1 for none, and barycentric weights of its corners."""
-        corners_m = _corners_m(drawn_meshes(self.scene))
+        corners_m = _corners_m(self.scene.drawn_meshes)
         centre_m = corners_m.reshape(-1, 3).mean(axis=0)
         rays = EmbreeScene(robust=True)
         TriangleMesh(rays, (corners_m - centre_m).astype(np.float32))
@@ -76,10 +76,6 @@ class SurfacePoints:
         hits = rays.run(starts.astype(np.float32), np.ascontiguousarray(directions, np.float32), query="INTERSECT").astype(np.int64)
         weights, length = _met(corners_m[hits], self.eye_m, directions)
         return np.where((hits >= 0) & (np.abs(length - 1.0) < _NEAR), hits, -1), weights
-
-
-def drawn_meshes(scene: Scene) -> tuple[Mesh, ...]:
-    return tuple(mesh for mesh in scene.meshes if len(mesh.triangles) and not mesh.catches_shadow)
 
 
 def _corners_m(meshes: Sequence[Mesh]) -> Float64[np.ndarray, "triangles 3 3"]:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt32
 
 from mrbokeh.images.layer import Layer, clear
+from mrbokeh.layering.pixel_box import Box
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.environment_filter import lighting_maps
 from mrbokeh.scene.light import Environment
@@ -133,7 +134,7 @@ class WgpuRasterizer:
         """Return the data that depend on the scene only; None if there is nothing to draw."""
         if scene in self._scenes:
             return self._scenes[scene]
-        drawn = [mesh for mesh in scene.meshes if len(mesh.triangles) and not mesh.catches_shadow]
+        drawn = scene.drawn_meshes
         if not drawn:
             return None
         geometry = uploaded(self._gpu, drawn, self._pool)
@@ -183,9 +184,8 @@ def _parts(camera: Camera, geometry: GpuGeometry) -> Iterator[tuple[tuple[slice,
         (x, y), (end_x, end_y) = np.clip([low, high], (0, 0), end).astype(int).tolist()
         first, end = (x, y), (end_x, end_y)
     for x, y, width, height in tiles(first, end, _TILE_PX):
-        principal_px = (camera.principal_px[0] - x, camera.principal_px[1] - y)
-        part = replace(camera, width_px=width, height_px=height, principal_px=principal_px)
-        yield (slice(y, y + height), slice(x, x + width)), part
+        box = Box(y, y + height, x, x + width)
+        yield box.where, box.camera_of(camera)
 
 
 def _exact_depth_m(
