@@ -19,6 +19,7 @@ from tests.scenes.made_viewfinder import LENS_RGB, VIEW_RGB, Made, made_viewfind
 from tests.scenes.waiting import in_time
 from viewfinder.server.access import Access
 from viewfinder.server.sessions import Role, Sessions
+from viewfinder.sources.frame_source import SizeLimit
 from viewfinder.sources.playback import VideoFileSource
 
 pytest.importorskip("aiortc")
@@ -261,7 +262,7 @@ def test_the_page_shows_the_stream_in_a_browser(tmp_path: Path, plate: tuple[Pat
 
     async def work() -> None:
         async with (
-            running(VideoFileSource(plate[0], WIDTH, HEIGHT)) as url,
+            running(VideoFileSource(plate[0], SizeLimit(WIDTH, HEIGHT))) as url,
             chromium_page(f"{url}?transport={transport}", tmp_path / "profile") as page,
         ):
 

@@ -22,6 +22,7 @@ from tests.scenes.waiting import comes_true, in_time
 from viewfinder.frames import CameraFrame
 from viewfinder.sources.browser_camera import LONGEST_OFFER_BYTES, BrowserCameraSource
 from viewfinder.sources.camera_message import LONGEST_MESSAGE, CameraKnowledge
+from viewfinder.sources.frame_source import SizeLimit
 
 RED, GREEN = (40, 60, 200), (60, 190, 50)
 
@@ -108,7 +109,7 @@ def test_vp8_of_high_definition_has_the_matrix_of_bt601() -> None:
     """Untagged pictures of that size are taken for BT.709 elsewhere, which would leave green 20 codes off."""
 
     async def work() -> None:
-        async with serving(BrowserCameraSource(160, 160)) as (url, session, reader):
+        async with serving(BrowserCameraSource(SizeLimit(160, 160))) as (url, session, reader):
             sender = Sender(url, Canvas(GREEN))
             sender.track.size_px = (1280, 720)
             await sender.start(session)

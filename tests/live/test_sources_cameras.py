@@ -234,7 +234,7 @@ def test_live_view_brings_pictures_and_the_lens(preview_source: Callable[..., An
     """Property 5009 of PTP is in mm, 5008 in 1/100 mm; busy (-110) and an empty picture are passed over; the mirror goes down again."""
     settings = {"viewfinder": 0, "f-number": "f/5.6", "5008": "3500", "5009": "1250"}
     camera = LiveCamera([-110, b"", jpeg(40), jpeg(90)], settings)
-    source, stopping = preview_source(max_width_px=80, open_camera=lambda _port: camera), Event()
+    source, stopping = preview_source(limit=SizeLimit(80), open_camera=lambda _port: camera), Event()
     frames = source.frames(stopping)
     first, second = next(frames), next(frames)
     assert first.lens == second.lens == LensState(1.25, 5.6, 35.0)

@@ -21,6 +21,7 @@ from aiortc.rtp import RtpPacket
 
 from tests.scenes.waiting import wait_until
 from viewfinder.frames import CameraFrame
+from viewfinder.sources.frame_source import SizeLimit
 from viewfinder.sources.network_stream import NetworkStreamSource
 
 WIDTH, HEIGHT, FPS = 160, 112, 25
@@ -175,7 +176,7 @@ def test_udp_comes_goes_and_comes_again() -> None:
 
 def test_a_stream_that_is_restarted_goes_on() -> None:
     port = free_port(socket.SOCK_STREAM)
-    source = NetworkStreamSource(f"http://127.0.0.1:{port}/live", max_width_px=80)
+    source = NetworkStreamSource(f"http://127.0.0.1:{port}/live", SizeLimit(80))
     with opened(source) as (frames, _):
         with http_server(port, lambda handler, stop: respond_mpegts(handler, stop, RED)):
             before = first_like(frames, RED)
@@ -357,7 +358,7 @@ def test_an_iphone_film_as_a_stream_stands_upright(shared_data: Path) -> None:
         handler.end_headers()
         handler.wfile.write(data[start:])
 
-    with http_server(0, respond) as url, opened(NetworkStreamSource(url, 270, 270)) as (frames, _):
+    with http_server(0, respond) as url, opened(NetworkStreamSource(url, SizeLimit(270, 270))) as (frames, _):
         height_px, width_px = next(frames).bgr.shape[:2]
     assert max(width_px, height_px) == 270
     assert width_px / height_px == pytest.approx(info.width_px / info.height_px, rel=0.02)

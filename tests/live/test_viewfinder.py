@@ -31,14 +31,14 @@ from tests.scenes.waiting import in_time
 from viewfinder.app.pipeline import Pipeline
 from viewfinder.frames import CameraFrame, FrameStatus, Newest, OutputFrame
 from viewfinder.sources.choose import open_source
-from viewfinder.sources.frame_source import ExactSize
+from viewfinder.sources.frame_source import ExactSize, SizeLimit
 from viewfinder.sources.playback import PatternSource, VideoFileSource
 from viewfinder.stage.static_layer import StaticLayer
 
 
 def test_frames_are_pictures_of_the_right_size_and_grow_in_number(plate: tuple[Path, np.ndarray]) -> None:
     async def work() -> None:
-        async with running(VideoFileSource(plate[0], WIDTH, HEIGHT)) as url, watching(url) as viewer:
+        async with running(VideoFileSource(plate[0], SizeLimit(WIDTH, HEIGHT))) as url, watching(url) as viewer:
             shown = [await viewer.frame() for _ in range(40)]
         assert all(each.bgr.shape == (HEIGHT, WIDTH, 3) for each in shown)
         # 40 frames of a clip of 25: it goes round, and no frame comes twice.
@@ -55,7 +55,7 @@ def test_the_plate_stays_and_the_object_is_laid_over_in_linear_light(plate: tupl
     path, bgr = plate
 
     async def work() -> None:
-        async with running(VideoFileSource(path, WIDTH, HEIGHT)) as url, watching(url) as viewer:
+        async with running(VideoFileSource(path, SizeLimit(WIDTH, HEIGHT))) as url, watching(url) as viewer:
             picture = (await viewer.frame()).bgr
         jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
         same_through_jpeg = cv2.imdecode(jpeg, cv2.IMREAD_COLOR)
@@ -70,7 +70,7 @@ def test_the_plate_stays_and_the_object_is_laid_over_in_linear_light(plate: tupl
 
 def test_the_focus_changes_the_object_and_nothing_else(plate: tuple[Path, np.ndarray]) -> None:
     async def work() -> None:
-        async with running(VideoFileSource(plate[0], WIDTH, HEIGHT)) as url, watching(url) as viewer:
+        async with running(VideoFileSource(plate[0], SizeLimit(WIDTH, HEIGHT))) as url, watching(url) as viewer:
             sharp = await viewer.frame()
             assert sharp.header["focus_distance_m"] == 2.0
             assert (await set_focus(url, 1.0))[0] == 200
@@ -199,24 +199,24 @@ def test_a_file_plays_in_its_own_time(plate: tuple[Path, np.ndarray]) -> None:
     """30 frames at 50 per second last 0.58 s; at most 10 per second leave every fifth."""
     stopping = Event()
     for fps, every in ((None, 1), (10.0, 5)):
-        frames = VideoFileSource(plate[0], WIDTH, HEIGHT, fps).frames(stopping)
+        frames = VideoFileSource(plate[0], SizeLimit(WIDTH, HEIGHT), fps).frames(stopping)
         times_s = np.array([next(frames).captured_s for _ in range(30 // every)])
         assert times_s[-1] - times_s[0] == pytest.approx((30 // every - 1) * every / 50, abs=0.1)
         frames.close()
 
 
 def test_sources_are_named_or_refused(plate: tuple[Path, np.ndarray], tmp_path: Path) -> None:
-    assert open_source("test", WIDTH, HEIGHT, None).name == "test pattern"
-    assert open_source(str(plate[0]), 2 * WIDTH, 2 * HEIGHT, None).name == "plate.mkv"
+    assert open_source("test", SizeLimit(WIDTH, HEIGHT)).name == "test pattern"
+    assert open_source(str(plate[0]), SizeLimit(2 * WIDTH, 2 * HEIGHT)).name == "plate.mkv"
     with pytest.raises(InputError, match="aspect ratio"):
         next(ExactSize(open_source(str(plate[0])), 100, 100).frames(Event()))
     assert next(ExactSize(open_source(str(plate[0])), 320, 180).frames(Event())).bgr.shape == (180, 320, 3)
     with pytest.raises(InputError, match="none of them"):
-        open_source(str(tmp_path / "absent.mp4"), WIDTH, HEIGHT, None)
+        open_source(str(tmp_path / "absent.mp4"), SizeLimit(WIDTH, HEIGHT))
     with pytest.raises(InputError, match="--fps"):
-        open_source("test", WIDTH, HEIGHT, 0.0)
+        open_source("test", SizeLimit(WIDTH, HEIGHT), 0.0)
     with pytest.raises(InputError, match="cannot be opened"):
-        open_source("987", WIDTH, HEIGHT, None)
+        open_source("987", SizeLimit(WIDTH, HEIGHT))
 
 
 @contextmanager

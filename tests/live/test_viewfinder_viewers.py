@@ -24,12 +24,13 @@ from tests.scenes.live_clip import write_live_clip
 from tests.scenes.live_viewfinder import Live, live
 from tests.scenes.waiting import comes_true, in_time
 from viewfinder.server.endpoint import serving_site
+from viewfinder.sources.frame_source import SizeLimit
 from viewfinder.sources.playback import PatternSource, VideoFileSource
 
 
 def test_a_slow_viewer_skips_frames_and_sees_the_newest(plate: tuple[Path, np.ndarray]) -> None:
     async def work() -> None:
-        async with running(VideoFileSource(plate[0], WIDTH, HEIGHT)) as url, watching(url) as slow, watching(url) as quick:
+        async with running(VideoFileSource(plate[0], SizeLimit(WIDTH, HEIGHT))) as url, watching(url) as slow, watching(url) as quick:
             numbers, ages_ms = [], []
 
             async def be_quick() -> list[int]:
@@ -106,7 +107,7 @@ def test_the_port_is_free_again_and_a_taken_one_is_named(plate: tuple[Path, np.n
     ports = []
 
     async def work() -> None:
-        async with running(VideoFileSource(plate[0], WIDTH, HEIGHT)) as url, watching(url) as viewer:
+        async with running(VideoFileSource(plate[0], SizeLimit(WIDTH, HEIGHT))) as url, watching(url) as viewer:
             await viewer.frame()
             ports.append(int(url.rsplit(":", 1)[1].strip("/")))
             other = viewfinder(PatternSource(WIDTH, HEIGHT), plate[0].parent)

@@ -27,7 +27,7 @@ from viewfinder.app.opening import Parts, open_overlays, renderers_of
 from viewfinder.app.running import Viewfinder, running
 from viewfinder.options import ViewfinderOptions
 from viewfinder.server.endpoint import serving_site
-from viewfinder.sources.frame_source import FrameSource
+from viewfinder.sources.frame_source import FrameSource, SizeLimit
 from viewfinder.sources.playback import VideoFileSource
 
 WIDE = Lens(22.0, 2.0, 0.6, 24.0)
@@ -79,7 +79,7 @@ async def live(
     book = LensBook(lenses or {"clip": LENS, "wide": WIDE})
     options = ViewfinderOptions(str(clip.path), scene=clip.scene, backend="embree", captures=captures)
     overlays = open_overlays(options, book.lens, renderers)
-    source = source or VideoFileSource(clip.path, width, height)
+    source = source or VideoFileSource(clip.path, SizeLimit(width, height))
     parts = Parts(options, source, overlays, book, renderers, tracker=board_tracker(), intrinsics=clip.cameras[0])
     with running(parts) as viewfinder:
         async with serving_site(viewfinder.site, "127.0.0.1", 0) as url:

@@ -15,6 +15,7 @@ from aiortc import RTCConfiguration, RTCPeerConnection, RTCRtpSender, RTCSession
 from aiortc.mediastreams import MediaStreamTrack
 
 from viewfinder.frames import CameraFrame
+from viewfinder.sources.frame_source import SizeLimit
 from viewfinder.sources.playback import VideoFileSource
 
 _TICKS_PER_S = 90_000
@@ -24,7 +25,7 @@ class NewestFrames:
     """A file played in a thread; who waits is woken in the loop."""
 
     def __init__(self, path: Path, width_px: int, height_px: int) -> None:
-        self._source, self._stopping = VideoFileSource(path, width_px, height_px), Event()
+        self._source, self._stopping = VideoFileSource(path, SizeLimit(width_px, height_px)), Event()
         self._loop, self.frame = asyncio.get_running_loop(), asyncio.get_running_loop().create_future()
         self._thread = Thread(target=self._run, name="capture", daemon=True)
         self._thread.start()

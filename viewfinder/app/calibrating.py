@@ -21,6 +21,7 @@ from viewfinder.server.access import Access
 from viewfinder.server.endpoint import Endpoint, on_stop, open_endpoint, serving_site
 from viewfinder.server.site import Part, Site, page_routes
 from viewfinder.sources.choose import open_source
+from viewfinder.sources.frame_source import SizeLimit
 from viewfinder.tracking.charuco_tracker import CharucoTracker
 from viewfinder.tracking.phone_calibration import Calibration
 from viewfinder.tracking.phone_rig import PhoneRig, write_phone_rig
@@ -57,7 +58,7 @@ def opened(options: CalibrationOptions) -> Iterator[tuple[Calibration, dict[str,
         tracker, of_phone = CharucoTracker(board), CharucoTracker(board)
         for each in (tracker, of_phone):
             closing.callback(each.close)
-        source, phone_source = open_source(options.source, options.width_px), open_phone(options.phone)
+        source, phone_source = open_source(options.source, SizeLimit(options.width_px)), open_phone(options.phone)
         phone = PhoneTracker(phone_source, of_phone, phone_camera, None)
         closing.callback(phone.close)
         calibration = Calibration(

@@ -59,7 +59,7 @@ class LiveCompositor:
             bgr = self._picture(frame.bgr, overlay)
         camera = replace(intrinsics, camera_from_world=pose.camera_from_world) if pose else intrinsics
         output = OutputFrame(bgr, frame.captured_s, frame.sequence, self._status(lens, pose, watch, dropped))
-        self.last = CompositedFrame(frame, output, overlay, camera, lens, pose)
+        self.last = CompositedFrame(frame=frame, output=output, overlay=overlay, camera=camera, lens=lens, pose=pose)
         self.last_tracked = self.last if pose is not None and pose.is_certain else self.last_tracked
         return output
 

@@ -19,7 +19,7 @@ from viewfinder.server.access import Access
 from viewfinder.server.site import Part
 from viewfinder.sources.browser_camera import BrowserCameraSource
 from viewfinder.sources.choose import open_source
-from viewfinder.sources.frame_source import ExactSize, FrameSource
+from viewfinder.sources.frame_source import ExactSize, FrameSource, SizeLimit
 from viewfinder.stage.overlay_source import OverlaySource
 from viewfinder.stage.stage import Stage
 from viewfinder.stage.stage_setup import LIVE_LAYERING, live_renderer
@@ -66,7 +66,7 @@ def open_parts(options: ViewfinderOptions, access: Access, closing: ExitStack) -
     tracker = open_tracker(options.tracking, options.listening)
     if tracker is not None:
         closing.callback(tracker.close)
-    camera = open_source(options.source, options.width_px, None, options.fps)
+    camera = open_source(options.source, SizeLimit(options.width_px), options.fps)
     return Parts(
         options=options,
         source=ExactSize(camera, overlays.sharp.width_px, overlays.sharp.height_px) if isinstance(overlays, StaticLayer) else camera,

@@ -103,7 +103,7 @@ def running(parts: Parts) -> Iterator[Viewfinder]:
         if isinstance(parts.source, Part):
             of_site["whip"] = parts.source
         of_site |= parts.cameras
-        site = Site(controls, parts.access, jpeg.broadcaster, of_site, lambda: matte_of(compositor))
+        site = Site(controls=controls, access=parts.access, broadcaster=jpeg.broadcaster, parts=of_site, matte=lambda: matte_of(compositor))
         yield Viewfinder(pipeline, compositor, site, parts.webcam)
 
 

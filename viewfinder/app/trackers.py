@@ -6,7 +6,7 @@ from mrbokeh.tracking.charuco.board import read_board
 from viewfinder.options import ListeningOptions, TrackingOptions
 from viewfinder.server.endpoint import host_of
 from viewfinder.sources.choose import open_source
-from viewfinder.sources.frame_source import FrameSource
+from viewfinder.sources.frame_source import FrameSource, SizeLimit
 from viewfinder.tracking.charuco_tracker import CharucoTracker
 from viewfinder.tracking.freed import FreeDReading, read_encoder_table
 from viewfinder.tracking.phone_rig import read_phone_rig
@@ -38,10 +38,10 @@ def open_tracker(options: TrackingOptions, listening: ListeningOptions) -> Track
     return tracker
 
 
-def open_phone(source: str, max_width_px: int | None = _PHONE_WIDTH_PX) -> FrameSource:
+def open_phone(source: str) -> FrameSource:
     """Open the camera of the phone, in the words of --source."""
     try:
-        return open_source(source, max_width_px)
+        return open_source(source, SizeLimit(_PHONE_WIDTH_PX))
     except InputError as error:
         raise InputError(str(error).replace("--source", "--phone", 1)) from None
 
@@ -58,7 +58,7 @@ def _phone(options: TrackingOptions) -> Tracker:
     camera, rig = read_fixed_pose(phone.camera).camera, read_phone_rig(phone.rig)
     by_board = _board(options)
     try:
-        return PhoneTracker(open_phone(phone.source), by_board, camera, rig, _PHONE_HOLD_S)
+        return PhoneTracker(source=open_phone(phone.source), phone_tracker=by_board, phone_intrinsics=camera, rig=rig, hold_s=_PHONE_HOLD_S)
     except BaseException:
         by_board.close()
         raise

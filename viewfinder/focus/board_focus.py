@@ -93,13 +93,19 @@ class BlurOfBoardFocus:
             lens, intrinsics, before = self.lens, self._intrinsics, tuple(self._before)
             last = self.answer.dioptres if self.answer is not None and frame.captured_s - self._answered_s <= _REMEMBERED_S else None
         resized = intrinsics.resized(width_px, height_px)
-        camera = Camera(width_px, height_px, resized.focal_px, resized.principal_px, pose.camera_from_world)
+        camera = Camera(
+            width_px=width_px,
+            height_px=height_px,
+            focal_px=resized.focal_px,
+            principal_px=resized.principal_px,
+            camera_from_world=pose.camera_from_world,
+        )
         blurs = edge_blurs(_linear_green(frame.bgr), camera, self._edges, self._settings.sharpest_px)
         self.candidates = focus_candidates(blurs, lens, width_px)
         if not self.candidates:
             return None
         recent = [each for when_s, each in before if 0.0 <= frame.captured_s - when_s <= _REMEMBERED_S]
-        found = settled(self.candidates, FocusEvidence(blurs, recent, lens, width_px, last))
+        found = settled(self.candidates, FocusEvidence(now=blurs, before=recent, lens=lens, width_px=width_px, settled_dioptres=last))
         with self._changing:
             if self.lens is not lens:
                 return None

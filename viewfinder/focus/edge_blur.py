@@ -46,7 +46,13 @@ def board_edges(board: CharucoBoard) -> BoardEdges:
     cells = int(board.opencv_dictionary().markerSize) + 2
     rows = np.array([row for grid in board.grids for row in _edges_mm(grid, cells)], np.float64)
     flat = np.pad(rows[:, :6].reshape(-1, 3, 2), ((0, 0), (0, 0), (0, 1)))
-    return BoardEdges(flat[:, 0] / MM_PER_M, flat[:, 1] / MM_PER_M, flat[:, 2], rows[:, 6] / MM_PER_M, rows[:, 7] / MM_PER_M)
+    return BoardEdges(
+        starts_m=flat[:, 0] / MM_PER_M,
+        ends_m=flat[:, 1] / MM_PER_M,
+        to_white=flat[:, 2],
+        clear_m=rows[:, 6] / MM_PER_M,
+        border_m=rows[:, 7] / MM_PER_M,
+    )
 
 
 def _edges_mm(grid: CharucoGrid, cells: int) -> Iterator[tuple[float, ...]]:
@@ -110,7 +116,9 @@ def edge_profiles(luminance: Luminance, camera: Camera, edges: BoardEdges) -> Ed
     profiles, in_picture = _profiles(luminance, starts[usable], along[usable], across[usable])
     offsets, clear = offsets_px()[None, :], clear_px[usable, None]
     weights = in_picture & (offsets <= clear) & (offsets >= -2.0 * clear)
-    return EdgeProfiles(profiles, weights.astype(np.float64), depth_m[usable], clear_px[usable], border_px[usable])
+    return EdgeProfiles(
+        mean=profiles, weights=weights.astype(np.float64), depth_m=depth_m[usable], clear_px=clear_px[usable], border_px=border_px[usable]
+    )
 
 
 def _profiles(

@@ -19,7 +19,7 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.video.color import UNSPECIFIED, color_of
 from viewfinder.frames import CameraFrame, Newest
 from viewfinder.sources.camera_message import CameraKnowledge
-from viewfinder.sources.frame_source import SizeLimit, upright_bgr
+from viewfinder.sources.frame_source import UNLIMITED, SizeLimit, upright_bgr
 from viewfinder.streaming.session_description import with_address
 
 DATA_CHANNEL = "camera"
@@ -157,10 +157,10 @@ class BrowserCameraSource:
 
     name = "browser camera"
 
-    def __init__(self, max_width_px: int | None = None, max_height_px: int | None = None) -> None:
+    def __init__(self, limit: SizeLimit = UNLIMITED) -> None:
         self.transfer = "bt709"
         self.status: str | None = _WAITING
-        self._limit = SizeLimit(max_width_px, max_height_px)
+        self._limit = limit
         self._newest: Newest[tuple[int, Any, float, CameraKnowledge, bool]] = Newest()
         self._sequence = itertools.count()
         self._knowledge = CameraKnowledge()
@@ -195,8 +195,15 @@ class BrowserCameraSource:
             # RFC 6386, 9.2: VP8 knows BT.601 only, at every size.
             color = replace(color, matrix=_BT601)
         self.transfer, self.status = color.transfer_name, None
-        full = partial(upright_bgr, frame, color, SizeLimit())
-        return CameraFrame(upright_bgr(frame, color, self._limit), captured_s, sequence, known.lens, known.camera_from_world, full)
+        full = partial(upright_bgr, frame, color, UNLIMITED)
+        return CameraFrame(
+            bgr=upright_bgr(frame, color, self._limit),
+            captured_s=captured_s,
+            sequence=sequence,
+            lens=known.lens,
+            camera_from_world=known.camera_from_world,
+            full_picture=full,
+        )
 
     async def _offered(self, request: web.Request) -> web.Response:
         if request.content_type != _SDP:

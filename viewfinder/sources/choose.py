@@ -5,13 +5,13 @@ from pathlib import Path
 from urllib.parse import urlsplit
 
 from mrbokeh.system.errors import InputError, MissingExtraError
-from viewfinder.sources.frame_source import FrameSource, SizeLimit
+from viewfinder.sources.frame_source import UNLIMITED, FrameSource, SizeLimit
 
 _PATTERN_SIZE_PX = (640, 360)
 _THROUGH_MEDIAMTX = ("srt", "rtmp", "rtmps")
 
 
-def open_source(text: str, max_width_px: int | None = None, max_height_px: int | None = None, fps: float | None = None) -> FrameSource:
+def open_source(text: str, limit: SizeLimit = UNLIMITED, fps: float | None = None) -> FrameSource:
     """Open `test`, the number of a webcam, the path of a video, a URL, `folder:PATH`, `gphoto2`, `gphoto2:PORT` or `whip`.
 
     Frames come in the camera's own size, or scaled down with their aspect to the largest size that is given. fps: at most so
@@ -19,11 +19,10 @@ def open_source(text: str, max_width_px: int | None = None, max_height_px: int |
     """
     if fps is not None and fps <= 0:
         raise InputError(f"--fps: expected a positive number of frames per second, got {fps}")
-    limit = SizeLimit(max_width_px, max_height_px)
     if text.isdigit():
         from viewfinder.sources.webcam import WebcamSource
 
-        return WebcamSource(int(text), max_width_px, max_height_px, fps)
+        return WebcamSource(int(text), limit, fps)
     kind, colon, rest = text.partition(":")
     if text == "test" or kind in ("gphoto2", "whip", "folder"):
         return _named(kind, rest if colon else None, limit, fps)
@@ -36,7 +35,7 @@ def open_source(text: str, max_width_px: int | None = None, max_height_px: int |
         )
     from viewfinder.sources.playback import VideoFileSource
 
-    return VideoFileSource(Path(text), max_width_px, max_height_px, fps)
+    return VideoFileSource(Path(text), limit, fps)
 
 
 def _named(kind: str, rest: str | None, limit: SizeLimit, fps: float | None) -> FrameSource:
@@ -47,21 +46,21 @@ def _named(kind: str, rest: str | None, limit: SizeLimit, fps: float | None) -> 
     if kind == "gphoto2":
         from viewfinder.sources.gphoto2_preview import Gphoto2PreviewSource
 
-        return Gphoto2PreviewSource(rest or None, limit.width_px, limit.height_px)
+        return Gphoto2PreviewSource(rest or None, limit)
     if kind == "folder":
         from viewfinder.sources.watched_folder import DEFAULT_FPS as REPEATS
         from viewfinder.sources.watched_folder import WatchedFolderSource
 
         if not rest:
             raise InputError("--source folder: expected the folder after the colon, as in folder:/home/me/tethered")
-        return WatchedFolderSource(Path(rest), limit.width_px, limit.height_px, fps or REPEATS)
+        return WatchedFolderSource(Path(rest), limit, fps or REPEATS)
     if rest is not None:
         raise InputError(f"--source: expected the word whip alone, got whip:{rest}; the camera's address is shown when the server runs")
     if find_spec("aiortc") is None:
         raise MissingExtraError("aiortc", "viewfinder")
     from viewfinder.sources.browser_camera import BrowserCameraSource
 
-    return BrowserCameraSource(limit.width_px, limit.height_px)
+    return BrowserCameraSource(limit)
 
 
 def _stream(url: str, limit: SizeLimit) -> FrameSource:
@@ -74,4 +73,4 @@ def _stream(url: str, limit: SizeLimit) -> FrameSource:
         )
     if scheme not in SCHEMES:
         raise InputError(f"--source: expected a URL of {', '.join(SCHEMES)}, got {url!r}")
-    return NetworkStreamSource(url, limit.width_px, limit.height_px)
+    return NetworkStreamSource(url, limit)

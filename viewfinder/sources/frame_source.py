@@ -64,6 +64,9 @@ class SizeLimit:
 _ASPECT_TOLERANCE = 0.01
 
 
+UNLIMITED = SizeLimit()
+
+
 class ExactSize:
     """FrameSource over another. Its frames raise InputError where the camera's aspect ratio is another one."""
 

@@ -16,7 +16,7 @@ import numpy as np
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.gphoto2_library import NoCameraError, chosen_of, detected, explanation, library, opened
 from viewfinder.frames import UNKNOWN_LENS, Bgr, CameraFrame, LensState
-from viewfinder.sources.frame_source import CameraAwayError, SizeLimit, reconnecting
+from viewfinder.sources.frame_source import UNLIMITED, CameraAwayError, SizeLimit, reconnecting
 
 _F_NUMBER = ("f-number", "aperture")
 # Properties of PTP itself (PIMA 15740, 13.3.8 and 13.3.9), which libgphoto2 lists by number: 1/100 mm, and mm with all ones beyond.
@@ -58,7 +58,7 @@ _LIVE_VIEW_SWITCH = ("viewfinder", "eosviewfinder")
 class Gphoto2PreviewSource:
     """FrameSource. port: such as usb:001,005, or None for the only camera. A camera that is switched off is waited for.
 
-    max_width_px, max_height_px: larger pictures are scaled down with their aspect. open_camera: gives an initialised gphoto2.Camera.
+    limit: larger pictures are scaled down with their aspect. open_camera: gives an initialised gphoto2.Camera.
     Frames carry what the camera tells of its lens. Raises InputError where there is no camera at the start, or no live view.
     """
 
@@ -67,14 +67,13 @@ class Gphoto2PreviewSource:
     def __init__(
         self,
         port: str | None = None,
-        max_width_px: int | None = None,
-        max_height_px: int | None = None,
+        limit: SizeLimit = UNLIMITED,
         *,
         open_camera: Callable[[str | None], Any] | None = None,
     ) -> None:
         self.name = "gphoto2 camera" if port is None else f"gphoto2 camera at {port}"
         self.status: str | None = None
-        self._port, self._limit = port, SizeLimit(max_width_px, max_height_px)
+        self._port, self._limit = port, limit
         self._open_camera = open_camera or _open_camera
         try:
             self._opened: Any = self._open_camera(port)

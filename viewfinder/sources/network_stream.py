@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 from mrbokeh.video.color import color_of
 from viewfinder.frames import CameraFrame, Newest
-from viewfinder.sources.frame_source import CameraAwayError, SizeLimit, reconnecting, upright_bgr
+from viewfinder.sources.frame_source import UNLIMITED, CameraAwayError, SizeLimit, reconnecting, upright_bgr
 from viewfinder.sources.playback import Rhythm
 
 _POLL_S = 0.05
@@ -69,20 +69,20 @@ class NetworkStreamSource:
     """FrameSource. A thread decodes all that comes, the newest frame is taken; a stream that dies is opened again.
 
     url: of one of SCHEMES; `udp://@:5000` listens. A recording behind a URL is played in its own rhythm, again and again.
-    max_width_px, max_height_px: larger pictures are scaled down with their aspect.
+    limit: larger pictures are scaled down with their aspect.
     """
 
-    def __init__(self, url: str, max_width_px: int | None = None, max_height_px: int | None = None) -> None:
+    def __init__(self, url: str, limit: SizeLimit = UNLIMITED) -> None:
         self.name, self.transfer = _without_password(url), "bt709"
         self.status: str | None = f"{self.name}: connecting"
-        self._url, self._limit = url, SizeLimit(max_width_px, max_height_px)
+        self._url, self._limit = url, limit
 
     def frames(self, stopping: Event) -> Iterator[CameraFrame]:
         decoded = newest_of(self._decoded, stopping, name=f"decode {self.name}", leave_s=OPEN_TIMEOUT_S + READ_TIMEOUT_S)
         for sequence, frame, captured_s in decoded:
             color = color_of(frame, self.name)
             self.transfer = color.transfer_name
-            full = partial(upright_bgr, frame, color, SizeLimit())
+            full = partial(upright_bgr, frame, color, UNLIMITED)
             yield CameraFrame(upright_bgr(frame, color, self._limit), captured_s, sequence, full_picture=full)
 
     def _tell(self, sentence: str | None) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from mrbokeh.video.clip import probe, read_display_frames
 from viewfinder.frames import Bgr, CameraFrame
-from viewfinder.sources.frame_source import SizeLimit
+from viewfinder.sources.frame_source import UNLIMITED, SizeLimit
 
 
 class Rhythm:
@@ -79,16 +79,16 @@ class PatternSource:
 class VideoFileSource:
     """FrameSource of a video file, played in its own rhythm, from the start again when it ends.
 
-    max_width_px, max_height_px: larger pictures are scaled down with their aspect. fps: at most so many frames per second.
+    limit: larger pictures are scaled down with their aspect. fps: at most so many frames per second.
     """
 
     status: str | None = None
 
-    def __init__(self, path: Path, max_width_px: int | None = None, max_height_px: int | None = None, fps: float | None = None) -> None:
+    def __init__(self, path: Path, limit: SizeLimit = UNLIMITED, fps: float | None = None) -> None:
         info = probe(path)
         self.name, self.transfer = path.name, info.color.transfer_name
         self._path, self._fps, self._last_s = path, fps, float(1 / info.frame_rate)
-        self._size_px = SizeLimit(max_width_px, max_height_px).fit(info.width_px, info.height_px)
+        self._size_px = limit.fit(info.width_px, info.height_px)
 
     def frames(self, stopping: Event) -> Iterator[CameraFrame]:
         rhythm, sequence = Rhythm(stopping), itertools.count()

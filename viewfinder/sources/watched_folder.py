@@ -14,7 +14,7 @@ import numpy as np
 from mrbokeh.lens_measuring.matching.photo_facts import read_facts
 from mrbokeh.system.errors import InputError
 from viewfinder.frames import Bgr, CameraFrame, LensState
-from viewfinder.sources.frame_source import SizeLimit
+from viewfinder.sources.frame_source import UNLIMITED, SizeLimit
 
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 
@@ -52,7 +52,7 @@ def read_tethered(path: Path, limit: SizeLimit) -> TetheredPicture:
         raise NotWholeError(f"{path.name} cannot be read: {error}") from None
     facts = read_facts(path, size_px)
     lens = LensState(facts.focus_distance_m, facts.f_number, facts.focal_length_mm)
-    return TetheredPicture(bgr, lens, lambda: read_tethered(path, SizeLimit()).bgr)
+    return TetheredPicture(bgr, lens, lambda: read_tethered(path, UNLIMITED).bgr)
 
 
 def _upright_bgr(picture: Any) -> Bgr:
@@ -75,19 +75,19 @@ class WatchedFolderSource:
     """FrameSource of the newest whole JPEG, PNG or TIFF, `fps` times a second, so that the stream goes on between two photographs.
 
     captured_s of its frames is when they are shown again. Frames carry the Exif's focus distance, f-number and focal length. A file
-    counts once it has kept its size and date for one look and can be decoded to its end. max_width_px, max_height_px: larger
+    counts once it has kept its size and date for one look and can be decoded to its end. limit: larger
     pictures are scaled down with their aspect. Raises InputError where there is no such folder at the start.
     """
 
     transfer = "srgb"
 
-    def __init__(self, folder: Path, max_width_px: int | None = None, max_height_px: int | None = None, fps: float = DEFAULT_FPS) -> None:
+    def __init__(self, folder: Path, limit: SizeLimit = UNLIMITED, fps: float = DEFAULT_FPS) -> None:
         if not folder.is_dir():
             raise InputError(f"--source folder: expected the folder into which photographs come, but there is none at {folder}")
         self.name = f"folder {folder.name}"
         self._waiting = f"waiting for the first photograph in {folder}"
         self.status: str | None = self._waiting
-        self._folder, self._limit, self._pause_s = folder, SizeLimit(max_width_px, max_height_px), 1 / fps
+        self._folder, self._limit, self._pause_s = folder, limit, 1 / fps
         self._arrivals = itertools.count()
         self._seen: dict[Path, tuple[Stamp, int]] = {}
         self._unreadable: dict[Path, int] = {}

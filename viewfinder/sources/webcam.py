@@ -10,13 +10,13 @@ from typing import Any
 
 from mrbokeh.system.errors import InputError
 from viewfinder.frames import CameraFrame
-from viewfinder.sources.frame_source import CameraAwayError, SizeLimit, reconnecting
+from viewfinder.sources.frame_source import UNLIMITED, CameraAwayError, SizeLimit, reconnecting
 
 
 class WebcamSource:
     """FrameSource of a webcam (any camera that OpenCV opens by number); one that is pulled out is waited for.
 
-    max_width_px, max_height_px: asked of the camera; what it gives in place of that is scaled down with its aspect.
+    limit: asked of the camera; what it gives in place of that is scaled down with its aspect.
     open_camera: gives an open cv2.VideoCapture. Raises InputError where there is no such camera at the start.
     """
 
@@ -25,15 +25,14 @@ class WebcamSource:
     def __init__(
         self,
         index: int,
-        max_width_px: int | None = None,
-        max_height_px: int | None = None,
+        limit: SizeLimit = UNLIMITED,
         fps: float | None = None,
         *,
         open_camera: Callable[[int], Any] | None = None,
     ) -> None:
         self.name = f"camera {index}"
         self.status: str | None = None
-        self._index, self._fps, self._limit = index, fps, SizeLimit(max_width_px, max_height_px)
+        self._index, self._fps, self._limit = index, fps, limit
         self._open_camera = open_camera or _open_by_number
         self._opened: Any = self._open()
         if self._opened is None:

@@ -81,10 +81,17 @@ def draw(staged: StagedScene, request: DrawRequest, render_setup: RenderSetup) -
         layers = [covered_by(layer, render_setup.occlusion.matte(layer.depth_m, camera, frame)) for layer in layers]
     blurred, sharp = render_setup.renderer.render(layers, lens), flatten(layers)
     in_box = MovableLayer(
-        _rgba(sharp), render_setup.depth.seen_dioptres(_padded(layers), lens), camera, box.left_px, box.top_px, request.resolution
+        rgba=_rgba(sharp),
+        dioptres=render_setup.depth.seen_dioptres(_padded(layers), lens),
+        camera=camera,
+        left_px=box.left_px,
+        top_px=box.top_px,
+        resolution=request.resolution,
     )
     seen = _trimmed(replace(in_box, rgba=_rgba(blurred)))
-    return Drawing(request, seen, in_box, sharp.depth_m, lens, _depth_range_m(points_m, frame))
+    return Drawing(
+        request=request, layer=seen, sharp=in_box, depth_m=sharp.depth_m, lens=lens, depth_range_m=_depth_range_m(points_m, frame)
+    )
 
 
 def _depth_range_m(points_m: Float[np.ndarray, "points 3"], camera: Camera) -> tuple[float, float]:
@@ -130,12 +137,12 @@ def _trimmed(layer: MovableLayer) -> MovableLayer | None:
     bottom, right = -(-(rows[-1] + 1) // step) * step, -(-(columns[-1] + 1) // step) * step
     offset = PictureBox(int(left), int(top), min(int(right), touched.shape[1]) - int(left), min(int(bottom), touched.shape[0]) - int(top))
     return MovableLayer(
-        np.ascontiguousarray(layer.rgba[top:bottom, left:right]),
-        np.ascontiguousarray(layer.dioptres[top // GRID_PX : -(-bottom // GRID_PX), left // GRID_PX : -(-right // GRID_PX)]),
-        offset.cut(layer.camera),
-        layer.left_px + round(left / layer.resolution),
-        layer.top_px + round(top / layer.resolution),
-        layer.resolution,
+        rgba=np.ascontiguousarray(layer.rgba[top:bottom, left:right]),
+        dioptres=np.ascontiguousarray(layer.dioptres[top // GRID_PX : -(-bottom // GRID_PX), left // GRID_PX : -(-right // GRID_PX)]),
+        camera=offset.cut(layer.camera),
+        left_px=layer.left_px + round(left / layer.resolution),
+        top_px=layer.top_px + round(top / layer.resolution),
+        resolution=layer.resolution,
     )
 
 

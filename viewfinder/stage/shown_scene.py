@@ -164,7 +164,13 @@ def _table_depth_m(eye_m: Float[np.ndarray, "3"], ray: Float[np.ndarray, "3"]) -
 def _real_depth_m(occlusion: Occlusion | None, camera: Camera, x_px: float, y_px: float) -> float:
     """Return the depth measured at the pixel; inf where nothing was."""
     column, row = min(int(x_px), camera.width_px - 1), min(int(y_px), camera.height_px - 1)
-    one_pixel = Camera(1, 1, camera.focal_px, (camera.principal_px[0] - column, camera.principal_px[1] - row), camera.camera_from_world)
+    one_pixel = Camera(
+        width_px=1,
+        height_px=1,
+        focal_px=camera.focal_px,
+        principal_px=(camera.principal_px[0] - column, camera.principal_px[1] - row),
+        camera_from_world=camera.camera_from_world,
+    )
     depth_m = None if occlusion is None else occlusion.depth_m(one_pixel)
     return float("inf") if depth_m is None else float(depth_m[0, 0])
 

@@ -116,7 +116,9 @@ class Stage:
         camera = upright_camera(wanted.camera, drawn.setup.staged.description.up)
         layer = drawn.drawing.layer
         overlay = _nothing() if layer is None or opacity == 0.0 else layer.moved_to(camera, opacity)
-        self.seen = ShownScene(overlay, camera, drawn.drawing, drawn.setup.staged, drawn.setup.render_setup.occlusion)
+        self.seen = ShownScene(
+            overlay=overlay, camera=camera, drawing=drawn.drawing, staged=drawn.setup.staged, occlusion=drawn.setup.render_setup.occlusion
+        )
         return overlay
 
     @property

@@ -100,7 +100,12 @@ class SetupLoader:
         else:
             name, renderer = described.renderer, live_renderer(described.renderer)
         backend = self._own_backend()
-        return StageSetup(staged, RenderSetup(backend, renderer, self._depth, occlusion, live_backend(backend)), name, lens)
+        return StageSetup(
+            staged,
+            RenderSetup(backend=backend, renderer=renderer, depth=self._depth, occlusion=occlusion, live=live_backend(backend)),
+            name,
+            lens,
+        )
 
     def _own_backend(self) -> SceneRenderer:
         if self._backend is None:

@@ -60,7 +60,18 @@ class StaticLayer:
     def status(self) -> StageStatus:
         given = self._given
         age_ms = 1e3 * (time.monotonic() - given.at_s)
-        return StageStatus(age_ms, given.lens, self.pending, 0.0, self._busy.is_set(), 1.0, 1.0, 0, self._renderer_name, self._problem)
+        return StageStatus(
+            layer_age_ms=age_ms,
+            lens=given.lens,
+            focus_pending=self.pending,
+            draws_per_s=0.0,
+            busy=self._busy.is_set(),
+            resolution=1.0,
+            opacity=1.0,
+            triangles=0,
+            renderer=self._renderer_name,
+            problem=self._problem,
+        )
 
     def overlay(self, pose: TrackedPose | None, intrinsics: Camera, lens: Lens, time_s: float) -> Overlay:  # noqa: ARG002
         """Return the newest blur; InputError where the frames are not of the layer's size."""

@@ -123,7 +123,14 @@ class CharucoTracker:
         fit = self._branches.take(found, frame.captured_s)
         self.corners = corners.only(fit.inliers)
         quality = self._quality(fit, intrinsics)
-        self._last = TrackedPose(fit.camera_from_world, quality, frame.captured_s, fit.residual_px, int(fit.inliers.sum()), fit.is_certain)
+        self._last = TrackedPose(
+            camera_from_world=fit.camera_from_world,
+            quality=quality,
+            captured_s=frame.captured_s,
+            residual_px=fit.residual_px,
+            points=int(fit.inliers.sum()),
+            is_certain=fit.is_certain,
+        )
         return self._last
 
     def close(self) -> None:

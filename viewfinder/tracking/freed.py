@@ -159,7 +159,7 @@ def read_freed(datagram: bytes) -> FreeDMessage:
     pan, tilt, roll = (int.from_bytes(each, "big", signed=True) / _PER_DEGREE for each in numbers[:3])
     x, y, z = (int.from_bytes(each, "big", signed=True) / _PER_M for each in numbers[3:6])
     zoom, focus = (int.from_bytes(each, "big") for each in numbers[6:])
-    return FreeDMessage(datagram[1], (pan, tilt, roll), (x, y, z), zoom, focus)
+    return FreeDMessage(camera=datagram[1], pan_tilt_roll_deg=(pan, tilt, roll), xyz_m=(x, y, z), zoom=zoom, focus=focus)
 
 
 def freed_sample(message: FreeDMessage, reading: FreeDReading) -> TrackingSample:

@@ -59,7 +59,13 @@ class MapTracker:
             return self._held(frame.captured_s)
         self.points, self._pose_in_map = points.only(fit.inliers), fit.camera_from_world
         pose = fit.camera_from_world @ self._map_from_world
-        self._last = TrackedPose(pose, self._quality(fit), frame.captured_s, fit.residual_px, len(self.points))
+        self._last = TrackedPose(
+            camera_from_world=pose,
+            quality=self._quality(fit),
+            captured_s=frame.captured_s,
+            residual_px=fit.residual_px,
+            points=len(self.points),
+        )
         return self._last
 
     def close(self) -> None:

@@ -71,7 +71,7 @@ def read_packet(datagram: bytes) -> Segment:
     (stated,) = struct.unpack_from(">H", datagram, _HEADER.size)
     if stated != fletcher16(datagram[: _HEADER.size] + content):
         raise MalformedMessageError("the checksum of an OpenTrackIO packet is wrong")
-    return Segment(encoding, sequence_number, offset, bool(length & _LAST), content)
+    return Segment(encoding=encoding, sequence_number=sequence_number, offset=offset, last=bool(length & _LAST), content=content)
 
 
 @dataclass

@@ -58,7 +58,13 @@ class PhoneTracker:
             return None
         quality, residual_px, points = self._newest
         pose = rig.camera_from_phone @ found.camera_from_world
-        return TrackedPose(pose, quality * (1.0 - found.beyond_s / self._hold_s), frame.captured_s, residual_px, points)
+        return TrackedPose(
+            camera_from_world=pose,
+            quality=quality * (1.0 - found.beyond_s / self._hold_s),
+            captured_s=frame.captured_s,
+            residual_px=residual_px,
+            points=points,
+        )
 
     @property
     def remark(self) -> str | None:

@@ -189,9 +189,11 @@ def plan_board(view: BoardView, paper: str = "a4") -> BoardPlan:
         if board is not None:
             larger = "" if name == paper.lower() else f", which {paper} cannot hold"
             told = f"{needed}{larger}: print {_words(board)} on {name}{_calibrating(board)}"
-            return BoardPlan(max(markers_mm), blur_px, board, name, told)
+            return BoardPlan(marker_mm=max(markers_mm), blur_px=blur_px, board=board, paper=name, sentence=told)
     advice = "stop the lens down, stay nearer to its focus, or track with a phone on the camera, whose own lens is sharp at all distances"
-    return BoardPlan(max(markers_mm), blur_px, None, None, f"{needed}, which no paper up to a3 holds: {advice}")
+    return BoardPlan(
+        marker_mm=max(markers_mm), blur_px=blur_px, board=None, paper=None, sentence=f"{needed}, which no paper up to a3 holds: {advice}"
+    )
 
 
 def _calibrating(board: CharucoBoard) -> str:
@@ -251,7 +253,13 @@ def _below(coarse: CharucoGrid, room_mm: tuple[float, float], square_mm: float) 
     hardly_smaller = coarse.square_mm / square_mm < _WORTH_A_SECOND_SCALE
     if hardly_smaller or columns < _FEWEST_COLUMNS or rows < _FEWEST_ROWS:
         return None
-    return CharucoGrid((columns, rows), square_mm, MARKER_PER_SQUARE * square_mm, (0.0, top_mm), coarse.marker_ids.stop)
+    return CharucoGrid(
+        squares=(columns, rows),
+        square_mm=square_mm,
+        marker_mm=MARKER_PER_SQUARE * square_mm,
+        offset_mm=(0.0, top_mm),
+        first_marker=coarse.marker_ids.stop,
+    )
 
 
 def _grid(columns: int, rows: int, square_mm: float) -> CharucoGrid:
