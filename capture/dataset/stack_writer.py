@@ -7,7 +7,7 @@ precision keeps 11 bits: at 100 px of blur a step is 0.06 px.
 import hashlib
 import os
 import shutil
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -74,8 +74,8 @@ class RadianceHistogram:
         step = int(np.searchsorted(np.cumsum(self._counts), share * total)) + 1
         return min(2.0 ** (_LOWEST_STOP + step / _PER_STOP), self.largest)
 
-    def radiance_range(self, quantiles: Sequence[str] = QUANTILES) -> RadianceRange:
-        return RadianceRange(self.largest, {each: self.quantile(float(each)) for each in quantiles})
+    def radiance_range(self) -> RadianceRange:
+        return RadianceRange(self.largest, {each: self.quantile(float(each)) for each in QUANTILES})
 
 
 def require_usable(stack: FocalStack) -> None:

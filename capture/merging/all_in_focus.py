@@ -127,7 +127,8 @@ def sharp_all_in_focus(
         return blend.result()
 
     picture = blend.result()
-    pixels, blocks = _sharpest_pixels(volume), _sharpest_blocks(volume)
+    pixels = volume.enlarged(volume.energies.argmax(axis=0).astype(np.float32), 0.0)
+    blocks = _per_pixel(np.argmax(volume.details, axis=0).astype(np.float32), volume.shape)
     for choice, around_px in ((pixels, _AROUND_PX), (blocks, _AROUND_PX), (blocks, _CLOSE_PX)):
         lost, before = _lost_blocks(picture, volume), taken
         if not lost.any():
@@ -195,14 +196,6 @@ def _taken_from(choice: Plane, lost: BlockMask, focus_index: Plane, around_px: i
     around = cv2.dilate(chosen, np.ones((2 * around_px + 1,) * 2, np.uint8))
     chosen = np.where(chosen >= 0, chosen, around)
     return np.where(chosen >= 0, chosen, focus_index)
-
-
-def _sharpest_pixels(volume: FocusVolume) -> Plane:
-    return volume.enlarged(volume.energies.argmax(axis=0).astype(np.float32), 0.0)
-
-
-def _sharpest_blocks(volume: FocusVolume) -> Plane:
-    return _per_pixel(np.argmax(volume.details, axis=0).astype(np.float32), volume.shape)
 
 
 def _per_pixel(blocks: Blocks, shape: tuple[int, ...]) -> Plane:

@@ -55,7 +55,8 @@ def retouch_scene(scene: Path, slices: Sequence[int], masks: Sequence[Path]) -> 
     stack = _only_merged(scene)
     if len(slices) != len(masks):
         raise InputError(f"expected a --mask for each --from-slice, got {len(slices)} of --from-slice and {len(masks)} of --mask")
-    require_safe_outputs(_outputs(stack), masks, overwrite=True)
+    pictures = [stack.folder / name for name in (*readable_names(stack), SHEET_NAME)]
+    require_safe_outputs([stack.all_in_focus_path, stack.depth_path, *pictures], masks, overwrite=True)
     wanted = [_retouch(stack, index, mask) for index, mask in zip(slices, masks, strict=True)]
     picture, part = stack.all_in_focus_camera_rgb(), read_exr(stack.depth_path)[0]
     channels = dict(part.channels)
@@ -128,10 +129,6 @@ def read_mask(path: Path, shape: tuple[int, int], orientation: int) -> Plane:
         size, expected = (f"{each[1]} x {each[0]}" for each in (white.shape, upright_shape))
         raise InputError(f"{path} has {size} px, but the stack's pictures have {expected} px: paint the mask over all_in_focus.png")
     return white
-
-
-def _outputs(stack: FocalStack) -> list[Path]:
-    return [stack.all_in_focus_path, stack.depth_path, *(stack.folder / name for name in (*readable_names(stack), SHEET_NAME))]
 
 
 def _only_merged(scene: Path) -> FocalStack:

@@ -43,7 +43,7 @@ class Examination:
 
 
 Watch = Callable[[int, Rgb, Rgb], None]
-"""Is told the number of a slice, the slice and its prediction, while they are at hand."""
+"""Callback with the number of a slice, the slice and its prediction, while they are at hand."""
 
 
 def examine(view: StackView, reblur: Reblur, watch: Watch | None = None) -> Examination:
@@ -61,7 +61,9 @@ def examine(view: StackView, reblur: Reblur, watch: Watch | None = None) -> Exam
         if kept is not None:
             disagreements.append(kept)
     clipped = np.logical_or.reduce(saturated)
-    disagreements = [_unlit(each, clipped, view.coc_px(index)) for index, each in enumerate(disagreements)]
+    disagreements = [
+        replace(each, counted=each.counted & ~_lit_by(clipped, view.coc_px(index))) for index, each in enumerate(disagreements)
+    ]
     depth = evidence.check() if view.is_explained else None
     judged = float(np.mean([each.counted.mean() for each in disagreements])) if disagreements else 0.0
     moved = None if depth is None or judged < _LEAST_JUDGED else moving(disagreements, depth.off_px)
@@ -118,11 +120,6 @@ def predict(view: StackView, index: int, reblur: Reblur) -> Prediction:
     coc_px = view.coc_px(index)
     rgb, less, more = (reblur(view.all_in_focus, coc_px + np.float32(step_px), view.aperture) for step_px in (0.0, -STEP_PX, STEP_PX))
     return Prediction(rgb=rgb, less=less, more=more, coc_px=coc_px, step_px=STEP_PX)
-
-
-def _unlit(disagreement: Disagreement, clipped: Mask, coc_px: Plane) -> Disagreement:
-    """Leave pixels out of what is judged that get light of clipped ones. clipped: in any slice."""
-    return replace(disagreement, counted=disagreement.counted & ~_lit_by(clipped, coc_px))
 
 
 def _lit_by(clipped: Mask, coc_px: Plane) -> Mask:

@@ -169,7 +169,9 @@ def _median(values: Sequence[float] | np.ndarray) -> float:
 
 
 def slice_document(found: SliceFindings, number: Number) -> dict[str, Any]:
-    changes = None if found.fit is None else {name: _change_document(change, number) for name, change in found.fit.changes.items()}
+    changes = None
+    if found.fit is not None:
+        changes = {name: {"value": number(change.value), "error": number(change.error)} for name, change in found.fit.changes.items()}
     return {
         "index": found.index,
         "gain": number(found.gain),
@@ -244,10 +246,6 @@ def _pair_from(document: dict[str, Any]) -> NeighbourDisplacement:
     return NeighbourDisplacement(int(document["first"]), _number(document["off_px"]), float(document["error_px"]), (int(x), int(y)))
 
 
-def _change_document(change: Change, number: Number) -> dict[str, Any]:
-    return {"value": number(change.value), "error": number(change.error)}
-
-
 def _slice_from(document: dict[str, Any]) -> SliceFindings:
     changes = document["changes"]
     return SliceFindings(
@@ -258,12 +256,10 @@ def _slice_from(document: dict[str, Any]) -> SliceFindings:
         largest_coc_px=document["largest_coc_px"],
         psnr_db=_number(document["psnr_db"]),
         unblurred_db=_number(document["unblurred_psnr_db"]),
-        fit=None if changes is None else SliceFit(**{name: _change_from(changes[name]) for name in NAMES}),
+        fit=None
+        if changes is None
+        else SliceFit(**{name: Change(float(changes[name]["value"]), float(changes[name]["error"])) for name in NAMES}),
     )
-
-
-def _change_from(document: dict[str, Any]) -> Change:
-    return Change(float(document["value"]), float(document["error"]))
 
 
 def _number(value: float | str | None) -> float | None:

@@ -104,9 +104,6 @@ def _scales(reconstruction: Reconstruction) -> Gate:
     if disagreement is None:
         known = "none" if not reconstruction.scales else f"only {', '.join(reconstruction.scales)}"
         return SCALES.absent(WHERE, f"two scales are needed, there is {known}: `mrbokeh capture scale` with a board or a distance")
-    measured = f"{disagreement:.2%} apart ({', '.join(_scale_text(reconstruction.scales or {}))})"
+    listed = ", ".join(f"{method} {metres:.6g} m per unit" for method, metres in (reconstruction.scales or {}).items())
+    measured = f"{disagreement:.2%} apart ({listed})"
     return SCALES.judge(WHERE, disagreement, measured, disagreement <= LARGEST_DISAGREEMENT)
-
-
-def _scale_text(scales: dict[str, float]) -> Sequence[str]:
-    return [f"{method} {metres:.6g} m per unit" for method, metres in scales.items()]

@@ -5,50 +5,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from capture.merging.merge import HIGHLIGHTS
+from capture.report import gates as rules
 from capture.report.findings import SliceFindings, StackFindings
-from capture.report.gates import (
-    BLUR,
-    DEPTH,
-    EXPOSURE,
-    FOCUS,
-    LARGEST_APART,
-    LARGEST_APART_PX,
-    LARGEST_BEYOND,
-    LARGEST_BLUR_GAIN,
-    LARGEST_DEPTH_SHARE,
-    LARGEST_EXPOSURE,
-    LARGEST_FLAT,
-    LARGEST_FOCUS_PX,
-    LARGEST_GAIN_DRIFT,
-    LARGEST_JUMP,
-    LARGEST_LOST,
-    LARGEST_MOVING,
-    LARGEST_PAIR_RESIDUAL,
-    LARGEST_SATURATED,
-    LARGEST_SHIFT_PX,
-    LARGEST_TOP,
-    LEAST_CORRELATION,
-    LEAST_DB,
-    LEAST_TRUSTED,
-    LIGHT,
-    MOTION,
-    NO_BLOCKS,
-    NO_PREDICTION,
-    PLACE,
-    PLACES,
-    RANGE,
-    REGISTRATION,
-    RESIDUAL,
-    SATURATION,
-    SEAMS,
-    SHARP,
-    SOLVED_BLUR,
-    SOLVED_FOCUS,
-    SPACING,
-    TEXTURE,
-    Gate,
-    Rule,
-)
+from capture.report.gates import Gate, Rule
 from capture.report.registration_check import NeighbourDisplacement
 from capture.report.slice_fit import Change
 from mrbokeh.stacks.guessed_metres import metres_facts
@@ -80,15 +39,17 @@ def picture_gates(findings: StackFindings) -> list[Gate]:
 def _sharp(findings: StackFindings) -> Gate:
     lost = findings.picture.lost
     if lost is None:
-        return SHARP.absent(findings.name, NO_BLOCKS)
-    return SHARP.judge(findings.name, lost, f"{lost:.2%} of the textured blocks are lost", lost <= LARGEST_LOST)
+        return rules.SHARP.absent(findings.name, rules.NO_BLOCKS)
+    return rules.SHARP.judge(findings.name, lost, f"{lost:.2%} of the textured blocks are lost", lost <= rules.LARGEST_LOST)
 
 
 def _seams(findings: StackFindings) -> Gate:
     flat = findings.picture.flat
     if flat is None:
-        return SEAMS.absent(findings.name, NO_BLOCKS)
-    return SEAMS.judge(findings.name, flat, f"{flat:.3f} times the detail of the sharpest slice in flat zones", flat <= LARGEST_FLAT)
+        return rules.SEAMS.absent(findings.name, rules.NO_BLOCKS)
+    return rules.SEAMS.judge(
+        findings.name, flat, f"{flat:.3f} times the detail of the sharpest slice in flat zones", flat <= rules.LARGEST_FLAT
+    )
 
 
 def _light(findings: StackFindings) -> Gate:
@@ -96,8 +57,8 @@ def _light(findings: StackFindings) -> Gate:
     measured = f"largest value {picture.top:.3g}, {picture.top_ratio:.2f} times that of the slices"
     if supported > 0.0:
         measured += f"; measured flux supports {supported:.3g}"
-    allowed = max(LARGEST_TOP * picture.slices_top, supported)
-    return LIGHT.judge(findings.name, picture.top_ratio, measured, picture.top <= allowed)
+    allowed = max(rules.LARGEST_TOP * picture.slices_top, supported)
+    return rules.LIGHT.judge(findings.name, picture.top_ratio, measured, picture.top <= allowed)
 
 
 def largest_supported(findings: StackFindings) -> float:
@@ -110,9 +71,9 @@ def largest_supported(findings: StackFindings) -> float:
 def _places(findings: StackFindings) -> Gate:
     """Judge pairs of neighbours as they lie, else as the registration left them; those that nobody measured are named."""
     if not findings.pairs:
-        return PLACES.absent(findings.name, "there are no neighbouring slices to compare: photograph more than one")
+        return rules.PLACES.absent(findings.name, "there are no neighbouring slices to compare: photograph more than one")
     width_px = findings.full_size_px[0]
-    limit_px = max(LARGEST_APART_PX, LARGEST_APART * width_px)
+    limit_px = max(rules.LARGEST_APART_PX, rules.LARGEST_APART * width_px)
     # A pair that may lie too far apart, and may as well not, was not measured.
     measured = [each for each in findings.pairs if each.off_px is not None and (each.off_px <= limit_px or each.exceeds(limit_px))]
     residuals = _pair_residuals_px(findings, measured)
@@ -130,11 +91,11 @@ def _places(findings: StackFindings) -> Gate:
             f"slices {', '.join(unknown)} cannot be placed surely, as little is sharp in two, and no pair of the registration held"
         )
     if not measured and worst_residual is None:
-        return PLACES.absent(findings.name, f"{'; '.join(parts)}: use smaller focus steps")
+        return rules.PLACES.absent(findings.name, f"{'; '.join(parts)}: use smaller focus steps")
     wrong = any(each.exceeds(limit_px) for each in measured)
-    disagree = worst_residual is not None and worst_residual[1] > LARGEST_PAIR_RESIDUAL * width_px
+    disagree = worst_residual is not None and worst_residual[1] > rules.LARGEST_PAIR_RESIDUAL * width_px
     value = max([each.off_px or 0.0 for each in measured] + list(residuals.values()))
-    return PLACES.judge(findings.name, value, "; ".join(parts), not (wrong or disagree))
+    return rules.PLACES.judge(findings.name, value, "; ".join(parts), not (wrong or disagree))
 
 
 def _pair_residuals_px(findings: StackFindings, measured: Sequence[NeighbourDisplacement]) -> dict[int, float]:
@@ -153,84 +114,84 @@ def _pair_residuals_px(findings: StackFindings, measured: Sequence[NeighbourDisp
 def _spacing(findings: StackFindings) -> Gate:
     spacing = findings.spacing
     if spacing is None:
-        return SPACING.absent(findings.name, "focus distances are unknown: add focus_distances_m to lens.toml and ingest again")
+        return rules.SPACING.absent(findings.name, "focus distances are unknown: add focus_distances_m to lens.toml and ingest again")
     troubles = [f"gap after slice {i}" for i in spacing.gaps] + [f"slice {i} goes back" for i in spacing.out_of_order]
     troubles += [f"slice {i} is where the one before is" for i in spacing.doubled]
     measured = (
         "; ".join(troubles)
         or f"usual step {spacing.usual_step:.3f} dioptres, the largest {spacing.largest_step:.2f} times that of its neighbours"
     )
-    return SPACING.judge(findings.name, spacing.largest_step, measured, spacing.is_even)
+    return rules.SPACING.judge(findings.name, spacing.largest_step, measured, spacing.is_even)
 
 
 def _range(findings: StackFindings) -> Gate:
     curve = findings.curve
     if curve.trusted == 0.0:
-        return RANGE.absent(findings.name, "no focus can be trusted anywhere")
+        return rules.RANGE.absent(findings.name, "no focus can be trusted anywhere")
     beyond = max(curve.beyond_near, curve.beyond_far)
     measured = f"{curve.beyond_near:.0%} at the first slice, {curve.beyond_far:.0%} at the last"
-    return RANGE.judge(findings.name, beyond, measured, beyond <= LARGEST_BEYOND)
+    return rules.RANGE.judge(findings.name, beyond, measured, beyond <= rules.LARGEST_BEYOND)
 
 
 def _texture(findings: StackFindings) -> Gate:
     trusted = findings.curve.trusted
-    return TEXTURE.judge(findings.name, trusted, f"{trusted:.0%} of the picture", trusted >= LEAST_TRUSTED)
+    return rules.TEXTURE.judge(findings.name, trusted, f"{trusted:.0%} of the picture", trusted >= rules.LEAST_TRUSTED)
 
 
 def _registration(findings: StackFindings) -> Gate:
     if findings.drift is None:
-        return REGISTRATION.absent(findings.name, "the stack does not say how it was registered: run `mrbokeh capture merge`")
+        return rules.REGISTRATION.absent(findings.name, "the stack does not say how it was registered: run `mrbokeh capture merge`")
     drift, least = findings.drift, findings.drift.least_correlation
     jump = drift.largest_jump_px / drift.width_px
     matched = "correlations are not known"
     if least is not None:
         pair = drift.correlations.index(least)
         matched = f"correlation {least:.3f} between slices {pair} and {pair + 1}"
-    passed = jump <= LARGEST_JUMP and (least is None or least >= LEAST_CORRELATION)
-    return REGISTRATION.judge(findings.name, jump, f"{matched}; largest jump {drift.largest_jump_px:.1f} px", passed)
+    passed = jump <= rules.LARGEST_JUMP and (least is None or least >= rules.LEAST_CORRELATION)
+    return rules.REGISTRATION.judge(findings.name, jump, f"{matched}; largest jump {drift.largest_jump_px:.1f} px", passed)
 
 
 def _saturation(findings: StackFindings) -> Gate:
     worst = max(findings.slices, key=lambda each: each.saturated)
     measured = f"{worst.saturated:.2%} of slice {worst.index}"
-    return SATURATION.judge(findings.name, worst.saturated, measured, worst.saturated <= LARGEST_SATURATED)
+    return rules.SATURATION.judge(findings.name, worst.saturated, measured, worst.saturated <= rules.LARGEST_SATURATED)
 
 
 def _exposure(findings: StackFindings) -> Gate:
     if all(each.fit is not None for each in findings.slices):
-        return _worst(EXPOSURE, findings, lambda fit: fit.exposure, LARGEST_EXPOSURE, lambda value: f"{value:+.2%}")
+        return _worst(rules.EXPOSURE, findings, lambda fit: fit.exposure, rules.LARGEST_EXPOSURE, lambda value: f"{value:+.2%}")
     gains = np.array([each.gain for each in findings.slices])
     if not np.isfinite(gains).any():
-        return EXPOSURE.absent(findings.name, "no part of the picture is valid and unsaturated in the slices")
+        return rules.EXPOSURE.absent(findings.name, "no part of the picture is valid and unsaturated in the slices")
     drifts = gains / np.nanmedian(gains) - 1.0
     worst = int(np.nanargmax(np.abs(drifts)))
     drift = float(drifts[worst])
     measured = f"{drift:+.1%} in slice {worst} (low frequencies)"
-    return EXPOSURE.judge(findings.name, abs(drift), measured, abs(drift) <= LARGEST_GAIN_DRIFT)
+    return rules.EXPOSURE.judge(findings.name, abs(drift), measured, abs(drift) <= rules.LARGEST_GAIN_DRIFT)
 
 
 def _residual(findings: StackFindings) -> Gate:
     known = [each for each in findings.slices if each.psnr_db is not None]
     if not known:
-        return RESIDUAL.absent(findings.name, NO_PREDICTION)
+        return rules.RESIDUAL.absent(findings.name, rules.NO_PREDICTION)
     worst = min(known, key=lambda each: each.psnr_db or 0.0)
     decibel, unblurred = worst.psnr_db or 0.0, worst.unblurred_db or 0.0
     measured = f"{decibel:.1f} dB in slice {worst.index} ({unblurred:.1f} dB without blur)"
-    return RESIDUAL.judge(findings.name, decibel, measured, decibel >= LEAST_DB)
+    return rules.RESIDUAL.judge(findings.name, decibel, measured, decibel >= rules.LEAST_DB)
 
 
 def _focus(findings: StackFindings) -> Gate:
-    rule = _solved_or_stated(findings, SOLVED_FOCUS, FOCUS)
-    return _worst(rule, findings, lambda fit: fit.focus_px, LARGEST_FOCUS_PX, lambda value: f"{value:+.2f} px")
+    rule = _solved_or_stated(findings, rules.SOLVED_FOCUS, rules.FOCUS)
+    return _worst(rule, findings, lambda fit: fit.focus_px, rules.LARGEST_FOCUS_PX, lambda value: f"{value:+.2f} px")
 
 
 def _blur(findings: StackFindings) -> Gate:
-    rule, gains = _solved_or_stated(findings, SOLVED_BLUR, BLUR), _known(findings, lambda fit: fit.blur_gain)
+    rule, gains = _solved_or_stated(findings, rules.SOLVED_BLUR, rules.BLUR), _known(findings, lambda fit: fit.blur_gain)
     if not gains:
-        return rule.absent(findings.name, NO_PREDICTION)
+        return rule.absent(findings.name, rules.NO_PREDICTION)
     gain = mean_change([change for _, change in gains])
     measured = f"{gain.value:+.1%} (standard error {gain.error:.1%})"
-    return rule.judge(findings.name, gain.value, measured, not gain.exceeds(LARGEST_BLUR_GAIN))
+    return rule.judge(findings.name, gain.value, measured, not gain.exceeds(rules.LARGEST_BLUR_GAIN))
 
 
 def mean_change(changes: list[Change], floor: float = 0.02) -> Change:
@@ -252,32 +213,32 @@ def _place(findings: StackFindings) -> Gate:
 
     known = [(each, farthest_px(each)) for each in findings.slices if each.fit is not None]
     if not known:
-        return PLACE.absent(findings.name, NO_PREDICTION)
-    worst, change = max(known, key=lambda pair: (pair[1].exceeds(LARGEST_SHIFT_PX), pair[1].value))
+        return rules.PLACE.absent(findings.name, rules.NO_PREDICTION)
+    worst, change = max(known, key=lambda pair: (pair[1].exceeds(rules.LARGEST_SHIFT_PX), pair[1].value))
     measured = f"{change.value:.2f} px in slice {worst.index}"
-    return PLACE.judge(findings.name, change.value, measured, not change.exceeds(LARGEST_SHIFT_PX))
+    return rules.PLACE.judge(findings.name, change.value, measured, not change.exceeds(rules.LARGEST_SHIFT_PX))
 
 
 def _depth(findings: StackFindings) -> Gate:
     share = findings.depth_off_share
     if share is None:
-        return DEPTH.absent(findings.name, NO_PREDICTION)
-    return DEPTH.judge(findings.name, share, f"{share:.1%} of the picture", share <= LARGEST_DEPTH_SHARE)
+        return rules.DEPTH.absent(findings.name, rules.NO_PREDICTION)
+    return rules.DEPTH.judge(findings.name, share, f"{share:.1%} of the picture", share <= rules.LARGEST_DEPTH_SHARE)
 
 
 def _motion(findings: StackFindings) -> Gate:
     share = findings.moving_share
     if share is None:
         clipped = "clipped highlights light nearly all of the picture: photograph with less exposure"
-        return MOTION.absent(findings.name, NO_PREDICTION if findings.depth_off_share is None else clipped)
-    return MOTION.judge(findings.name, share, f"{share:.2%} of the picture", share <= LARGEST_MOVING)
+        return rules.MOTION.absent(findings.name, rules.NO_PREDICTION if findings.depth_off_share is None else clipped)
+    return rules.MOTION.judge(findings.name, share, f"{share:.2%} of the picture", share <= rules.LARGEST_MOVING)
 
 
 def _worst(rule: Rule, findings: StackFindings, change_of: Callable[..., Change], limit: float, text: Callable[[float], str]) -> Gate:
     """Judge the slice that exceeds a limit farthest; else the one with the largest number that is known."""
     known = _known(findings, change_of)
     if not known:
-        return rule.absent(findings.name, NO_PREDICTION)
+        return rule.absent(findings.name, rules.NO_PREDICTION)
     index, change = max(known, key=lambda pair: (pair[1].exceeds(limit), abs(pair[1].value)))
     return rule.judge(findings.name, change.value, f"{text(change.value)} in slice {index}", not change.exceeds(limit))
 

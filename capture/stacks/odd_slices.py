@@ -92,7 +92,7 @@ def other_scenes(candidates: Sequence[Candidate]) -> Odd:
 def _scenes(looks: Sequence[SliceLook]) -> list[list[int]]:
     """Return indices that hang together: first each with the one before it, then what that leaves apart with some of every other scene.
 
-    Many scenes are not compared: that is a folder of stacks, not a stack with one or two other_scenes.
+    Many scenes are not compared: that is a folder of stacks, not a stack with one or two strange photographs.
     """
     scenes: list[list[int]] = []
     for index, look in enumerate(looks):

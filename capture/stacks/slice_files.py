@@ -12,7 +12,7 @@ import json
 import math
 import os
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -100,7 +100,9 @@ def arrange_slices(stack_folder: Path, chosen: Sequence[Path]) -> list[Path]:
 
     First out of the way, then to their places: interrupted halfway, every slice still exists under some name.
     """
-    _delete(path for path, _ in find_slices(stack_folder) if path not in set(chosen))
+    for path, _ in find_slices(stack_folder):
+        if path not in set(chosen):
+            path.unlink(missing_ok=True)
     digits = max(2, len(str(len(chosen) - 1)))
     final = [stack_folder / FOLDER / f"{index:0{digits}d}.exr" for index in range(len(chosen))]
     if list(chosen) == final:
@@ -189,11 +191,6 @@ def _message(path: Path) -> str:
         f"the disk of {path.parent} is full ({free_mib:.0f} MiB left): make room or give another --out, then run the same command again; "
         f"finished slices are kept"
     )
-
-
-def _delete(paths: Iterable[Path]) -> None:
-    for path in list(paths):
-        path.unlink(missing_ok=True)
 
 
 def _by_sentinel(metadata: PhotoMetadata) -> bool:

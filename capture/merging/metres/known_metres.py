@@ -1,6 +1,5 @@
 """Lengths and distances in a stack that its user knows (options of `mrbokeh capture scale`), and the files of stacks with other metres."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -73,7 +72,7 @@ def parse_known_distance(text: str) -> KnownDistance:
 
 def stored_facts(stack: FocalStack) -> list[Fact]:
     """Return the lengths and distances that were told of a stack."""
-    return [_fact(each) for each in metres_facts(stack).get(TOLD, ())]
+    return [KnownLength(**each) if "x1" in each else KnownDistance(**each) for each in metres_facts(stack).get(TOLD, ())]
 
 
 def scale_options(stack: FocalStack) -> str:
@@ -118,10 +117,6 @@ def _numbers(text: str, count: int, option: str, expected: str) -> list[float]:
 
 def _numbers_text(*numbers: float) -> str:
     return ",".join(f"{each:.10g}" for each in numbers)
-
-
-def _fact(document: Mapping[str, float]) -> Fact:
-    return KnownLength(**document) if "x1" in document else KnownDistance(**document)
 
 
 def _known_side(record: dict[str, Any], turned: bool) -> dict[str, Any]:

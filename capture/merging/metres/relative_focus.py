@@ -29,11 +29,11 @@ _NOISE_PERCENTILE = 10.0
 _TEXTURED_FLOORS = 5.0
 _SURFACE_STEP = 0.7
 _MODEL_SHARE = 0.01
-"""Of a cell's texture: what a disc does not reproduce of real blur, whatever its size."""
+"""Share of a cell's texture that a disc of any size does not reproduce of real blur."""
 _ROUNDS = 3
 _ENOUGH_CELLS = 5000
 _SPENT = 4.0
-"""What the misfit of an outlier costs at most, in variances."""
+"""Highest cost of the misfit of an outlier, in variances."""
 _REACH = 5
 _WIDEST_OFFSET_STEPS = 0.8
 _WINDOW_SAMPLES = 12.0

@@ -124,7 +124,7 @@ def with_guessed_metres(
             focus_distance_m=distance_m,
             metadata=each.metadata
             | {
-                STATED_DISTANCE: _json_number(each.focus_distance_m),
+                STATED_DISTANCE: "inf" if each.focus_distance_m == float("inf") else each.focus_distance_m,
                 SLICE_POSITION: float(position),
                 SLICE_POSITION_ERROR: float(error),
                 # Blur grows alike in all registered slices, so less in those that registration enlarged.
@@ -283,7 +283,3 @@ def _gauge_json(gauge: Gauge, direction: Direction) -> dict[str, Any]:
         "near_first_sure": direction.sure,
         "near_first_z": direction.z,
     }
-
-
-def _json_number(value: float | None) -> float | str | None:
-    return "inf" if value == float("inf") else value

@@ -43,8 +43,6 @@ _LEAST_SPREAD_PX = 3.0
 """Facts whose surfaces differ in blur by less lie at one depth: they cannot tell how deep the scene is."""
 _CONTRADICTS = 0.1
 _LEAST_DIOPTRES = 1e-6
-_GUESSED_END = "; that the "
-"""Begins what merges of former versions add to why their metres are guessed: that one end was taken for near."""
 _Unknowns = Callable[[Float[np.ndarray, " numbers"]], tuple[float, float]]
 
 
@@ -134,8 +132,7 @@ def apply_known_nearest(stack: FocalStack, first: bool) -> FocalStack:
     changed = with_known_nearest(_rescaled(stack, p, q), turned)
     facts = changed.metadata[METRES]
     known = {"near_first_from": NEAREST_OPTION, "near_first_sure": True}
-    facts = facts | {"why": facts["why"].partition(_GUESSED_END)[0], "gauge": facts["gauge"] | known}
-    changed = replace(changed, metadata=changed.metadata | {METRES: facts})
+    changed = replace(changed, metadata=changed.metadata | {METRES: facts | {"gauge": facts["gauge"] | known}})
     _write(changed, p, q)
     return changed
 
@@ -264,11 +261,7 @@ def _rescaled_slice(stack: FocalStack, each: Slice, p: float, q: float) -> Slice
     if dioptres < 0.0:
         raise InputError(f"{stack.folder}: by what was told {each.path} is focused beyond infinity: check what you told and tell it again")
     growth = {GROWTH: each.metadata[GROWTH] / abs(q)} if GROWTH in each.metadata else {}
-    return replace(each, focus_distance_m=_distance(dioptres), metadata=each.metadata | growth)
-
-
-def _distance(dioptres: float) -> float:
-    return 1.0 / dioptres if dioptres else float("inf")
+    return replace(each, focus_distance_m=1.0 / dioptres if dioptres else float("inf"), metadata=each.metadata | growth)
 
 
 def _lens_at(stack: FocalStack, distances_m: list[float]) -> Lens | None:

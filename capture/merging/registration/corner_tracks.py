@@ -96,7 +96,8 @@ def structure_of(rgb: Float32[np.ndarray, "height width 3"], valid: Bool[np.ndar
     luminance = cv2.transform(rgb, np.array([[0.2126, 0.7152, 0.0722]], np.float32))
     finest = max(0, int(np.ceil(0.5 * np.log2(luminance.size / _MOST_PIXELS))))
     coarsest = max(finest, int(np.log2(max(1.0, min(luminance.shape) / _SMALLEST_SIDE_PX))))
-    logarithm = _logarithm(shrunk(luminance, finest))
+    # Of the logarithm a change of exposure is an offset, and bright lights do not dominate it.
+    logarithm = cv2.log(np.maximum(shrunk(luminance, finest), 0.0) + np.float32(0.02))
     usable = np.full(logarithm.shape, 255, np.uint8) if valid is None else shrunk_mask(np.where(valid, np.uint8(255), np.uint8(0)), finest)
     pictures = [
         (level, shrunk(logarithm, level - finest), shrunk_mask(usable, level - finest)) for level in range(coarsest, finest - 1, -1)
@@ -156,11 +157,6 @@ def shrunk_mask(mask: Grey, level: int) -> UInt8[np.ndarray, "small_height small
     if level == 0:
         return mask
     return np.where(shrunk(mask.astype(np.float32), level) > 254.5, np.uint8(255), np.uint8(0))
-
-
-def _logarithm(luminance: Plane) -> Plane:
-    """Return log luminance, in which a change of exposure is an offset and bright lights do not dominate."""
-    return cv2.log(np.maximum(luminance, 0.0) + np.float32(0.02))
 
 
 def _detail_level(level: int, logarithm: Plane, usable: Grey) -> DetailLevel:
