@@ -153,7 +153,7 @@ def no_lights(shape: tuple[int, ...]) -> Lights:
 
 
 def _between_slices(areas_px: np.ndarray, seen: np.ndarray, sharpest: Int[np.ndarray, " lights"]) -> PerLight:
-    """Where each light is in focus: the diameter grows evenly with the distance from there, so the area is a parabola of the index.
+    """Return the index at which each light is in focus: the diameter grows evenly with the distance from there, so the area is a parabola of the index.
 
     Fitted to the slices within two of the sharpest one; kept within half a step of it.
     """

@@ -60,7 +60,7 @@ PIXEL_VARIANCE_PX2 = 1.0 / 12.0
 
 @dataclass(frozen=True)
 class RestoredLight:
-    """What replaces a part of the all-in-focus picture: picture (h, w, 3) where mask (h, w), at box (rows, columns).
+    """A replacement for a part of the all-in-focus picture: picture (h, w, 3) where mask (h, w), at box (rows, columns).
 
     supported: the largest value that the light can have, all of the flux that its discs show in one pixel above what is around it.
     """

@@ -1,4 +1,4 @@
-"""What `mrbokeh check` opens: one picture, numbered pictures in a folder, the slices of a focal stack, or a film.
+"""Inputs of `mrbokeh check`: one picture, numbered pictures in a folder, the slices of a focal stack, or a film.
 
 Each picture comes with its alpha, the layers that a layered EXR keeps, and how finely its file can store light.
 """

@@ -1,4 +1,4 @@
-"""What TIFF and EXIF tags say about a picture: which way up it is stored, and whether it was cropped since."""
+"""TIFF and EXIF tags of a picture: which way up it is stored, and whether it was cropped since."""
 
 import struct
 import warnings

@@ -115,7 +115,7 @@ Channels = Float32[np.ndarray, "height width _"]
 
 @dataclass(frozen=True)
 class Slicing:
-    """What is the same for all slices: the PSF, their largest number, the frame, threads and memory.
+    """Facts shared by all slices: the PSF, their largest number, the frame, threads and memory.
 
     frame: placement of arrays with their margin. pool: threads for slices and components.
     """

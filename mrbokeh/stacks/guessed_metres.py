@@ -1,4 +1,4 @@
-"""What is known of the metres of a focal stack, in one line for people.
+"""Knowledge of the metres of a focal stack, in one line for people.
 
 Where no focus distance is known, merging measures blur from the slices alone and guesses the metres (`metadata["metres"]`: known, why,
 guessed, told, gauge): circles of confusion are right in pixels, lengths and distances are not, until one known length or distance is told.

@@ -1,4 +1,4 @@
-"""What a command says on the terminal: progress with the time left, the line after Ctrl-C, and the names of its options.
+"""Words and bars of a command on the terminal: progress with the time left, the line after Ctrl-C, and the names of its options.
 
 On a terminal progress is drawn as bars, in a log as a plain line now and then.
 """

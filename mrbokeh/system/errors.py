@@ -3,6 +3,9 @@
 INTERRUPTED = 130
 """Exit code of a command that Ctrl-C stopped, as shells have it."""
 
+FAULT = 1
+"""Exit code of a command that ended by a fault of ours."""
+
 
 class InputError(ValueError):
     """Bad input. The message says what was expected, what came, and what to do next."""

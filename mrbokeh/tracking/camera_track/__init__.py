@@ -1,4 +1,4 @@
-"""Where a moving camera was in every frame, how it was focused, and files that tell it.
+"""Tracks: poses of a moving camera in every frame, how it was focused, and files that tell it.
 
     track = read_track("shot.chan", TrackOptions(size_px=(1920, 1080)))
     camera = upright_camera(track.at(12).camera, track.up)        # in the world in which scenes stand

@@ -1,0 +1,93 @@
+"""The house's English and the shape of its calls, read from the syntax tree."""
+
+import ast
+import re
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("mrbokeh", "capture", "training", "viewfinder", "datasets_scripts")
+FILES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+FIRST_WORDS_THAT_SAY_NOTHING = {"Of", "Where", "As", "By", "Those", "That", "What"}
+MOST_POSITIONAL, MOST_PARAMETERS = 4, 12
+COMMANDS = re.compile(r"(command|callback|main)")
+
+
+@cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+def nodes() -> Iterator[tuple[Path, ast.AST]]:
+    yield from ((path, node) for path in FILES for node in ast.walk(tree_of(path)))
+
+
+def functions() -> Iterator[tuple[Path, ast.FunctionDef]]:
+    yield from ((path, node) for path, node in nodes() if isinstance(node, ast.FunctionDef))
+
+
+def place(path: Path, node: ast.AST, what: str) -> str:
+    return f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 1)} {what}"
+
+
+def test_docstrings_begin_with_a_verb_or_a_noun() -> None:
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    firsts = ((path, node, (ast.get_docstring(node) or "").split()[:1]) for path, node in nodes() if isinstance(node, documented))
+    assert not [place(path, node, first[0]) for path, node, first in firsts if set(first) & FIRST_WORDS_THAT_SAY_NOTHING]
+
+
+def test_constructors_with_many_arguments_are_called_by_keyword() -> None:
+    """Compiled kernels are left out: numba's named tuples are built in place there."""
+    classes = {node.name for _, node in nodes() if isinstance(node, ast.ClassDef)}
+    calls = ((path, node) for path, node in nodes() if isinstance(node, ast.Call) and not path.stem.endswith("_numba"))
+    named = ((path, node, node.func.id) for path, node in calls if isinstance(node.func, ast.Name))
+    assert not [place(path, node, name) for path, node, name in named if name in classes and len(node.args) > MOST_POSITIONAL]
+
+
+def test_functions_take_few_parameters() -> None:
+    """Commands declare their options as parameters, and kernels of numba and Triton take arrays one by one."""
+    many = ((path, node) for path, node in functions() if len(node.args.args) + len(node.args.kwonlyargs) > MOST_PARAMETERS)
+    decorators = ((path, node, " ".join(ast.unparse(each) for each in node.decorator_list)) for path, node in many)
+    assert not [
+        place(path, node, node.name)
+        for path, node, decorated in decorators
+        if "jit" not in decorated and not COMMANDS.search(decorated + node.name)
+    ]
+
+
+def messages() -> list[tuple[str, str]]:
+    """Return (place, text) of every InputError raised with a literal; parts that are filled in are `{}`."""
+    raised = ((path, node.exc) for path, node in nodes() if isinstance(node, ast.Raise) and isinstance(node.exc, ast.Call))
+    ours = ((path, call) for path, call in raised if isinstance(call.func, ast.Name) and call.func.id == "InputError" and call.args)
+    return [(place(path, call, ""), literal(call.args[0])) for path, call in ours]
+
+
+def literal(node: ast.expr) -> str:
+    if isinstance(node, ast.JoinedStr):
+        return "".join(str(part.value) if isinstance(part, ast.Constant) else "{}" for part in node.values)
+    return str(node.value) if isinstance(node, ast.Constant) else ""
+
+
+def test_messages_to_people_are_sentences_of_the_house() -> None:
+    """One sentence: no full stop at its end, no shouting, no bare refusal, and enough words to say what was expected and what came.
+
+    Messages that are put together of others ({}) are judged where their parts are written.
+    """
+    texts = [(where, text) for where, text in messages() if text]
+    assert len(texts) > 500, "messages are found"
+    bare = re.compile(r"\b(invalid|illegal|bad input|failed to)\b", re.IGNORECASE)
+    ended = re.compile(r"[^.]\.$|!$")
+    assert not [f"{where}{text}" for where, text in texts if ended.search(text) or bare.search(text)]
+    assert not [f"{where}{text}" for where, text in texts if len(text.split()) < 5 and "{}" not in text]
+
+
+@pytest.mark.parametrize("name", ["README.md", "ARCHITECTURE.md", "CONVENTIONS.md"])
+def test_pages_name_files_that_exist(name: str) -> None:
+    """Paths of modules in backquotes, such as `mrbokeh/images/color.py`."""
+    found = re.findall(
+        r"`((?:mrbokeh|capture|training|viewfinder|datasets_scripts|tests)/[\w/.]+)`", (ROOT / name).read_text(encoding="utf-8")
+    )
+    assert not [each for each in found if not (ROOT / each).exists()]
