@@ -1,1 +1,1 @@
-"""From FocalStack folders to an ONNX network that blurs like one lens."""
+"""Training: FocalStack folders in, an ONNX network that blurs like one lens out."""

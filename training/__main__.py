@@ -1,4 +1,4 @@
-"""`python -m training fit ...` is `mrbokeh train fit ...`: torchrun starts modules more easily than console scripts."""
+"""Entry point for torchrun, which starts modules more easily than scripts: `python -m training fit ...` is `mrbokeh train fit ...`."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""`mrbokeh train`: fit, export, evaluate, ablate."""
+"""The commands of `mrbokeh train`: fit, export, evaluate, ablate."""
 
 import typer
 

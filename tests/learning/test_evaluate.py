@@ -41,7 +41,7 @@ from training.evaluation.methods import (
 )
 from training.evaluation.report import HEADINGS, table_rows
 from training.evaluation.scores import MEASURES, OnnxPerceptualDistance, Score, SliceScorer, mean_known
-from training.evaluation.unseen_slice import UnseenSlice, edge_band, light_discs, sharp_side, unseen_slice
+from training.evaluation.unseen_slice import UnseenSlice, edge_band, highlight_discs, sharp_side, unseen_slice
 from training.fitting import train
 from training.fitting.settings import demo_settings
 
@@ -90,11 +90,11 @@ def test_discs_of_lights_have_their_size(scene: Path) -> None:
     rgb, coc_px = np.zeros((*SIZE, 3), np.float32), np.full(SIZE, 12.0, np.float32)
     rgb[24, 36] = 20.0
     lit = dataclasses.replace(seen, pair=dataclasses.replace(seen.pair, all_in_focus=rgb, coc_px=coc_px))
-    rows, columns = np.nonzero(light_discs(lit))
+    rows, columns = np.nonzero(highlight_discs(lit))
     assert np.hypot(rows - 24, columns - 36).max() <= 7.0
     assert len(rows) == pytest.approx(np.pi * 36.0, rel=0.1)
-    assert not light_discs(dataclasses.replace(lit, pair=dataclasses.replace(lit.pair, coc_px=coc_px * 0))).any()
-    assert not light_discs(dataclasses.replace(lit, pair=dataclasses.replace(lit.pair, all_in_focus=np.minimum(rgb, 1.0)))).any()
+    assert not highlight_discs(dataclasses.replace(lit, pair=dataclasses.replace(lit.pair, coc_px=coc_px * 0))).any()
+    assert not highlight_discs(dataclasses.replace(lit, pair=dataclasses.replace(lit.pair, all_in_focus=np.minimum(rgb, 1.0)))).any()
 
 
 def test_the_truth_itself_has_no_errors(scene: Path) -> None:

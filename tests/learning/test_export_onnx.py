@@ -58,7 +58,14 @@ def _network(settings: NetworkSettings, seed: int = 0) -> BlurNetwork:
     return network.eval()
 
 
-@pytest.fixture(scope="module", params=FORMS.values(), ids=FORMS)
+FAST_FORMS = ("gated, tiles, unsigned", "published, 3x3, place and lens")
+"""Between them both networks, tiles, both mixings, and all inputs; the others take as long each and add no operator."""
+
+
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(form, id=name, marks=() if name in FAST_FORMS else pytest.mark.slow) for name, form in FORMS.items()],
+)
 def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[BlurNetwork, NetworkSettings, Path]:
     path = tmp_path_factory.mktemp("onnx") / "lens.onnx"
     network = _network(request.param)

@@ -15,7 +15,7 @@ from mrbokeh.renderers.onnx_network import OnnxNetwork
 from mrbokeh.system.errors import InputError
 from tests.scenes.made_networks import GATED, PARITY, PUBLISHED, SIZE, TOP, blurred, pictures, session_of, twin, untrained
 from training.commands.export import export_command
-from training.export.fast_onnx import ASSUMED_PSNR_DB, export_fast_network, loss_db, made_up_look
+from training.export.fast_onnx import ASSUMED_PSNR_DB, export_fast_network, loss_db, made_up_sample
 from training.export.graph_builder import coarse_kernel, seen_kernel, tent
 from training.export.onnx_export import network_facts_of, record_path
 from training.export.plans import model_of, plans
@@ -68,7 +68,7 @@ def test_the_budget_holds_for_pictures_it_was_not_chosen_on() -> None:
     largest_px = 21.0
     network = untrained(GATED, largest_px)
     facts = network_facts_of(network, GATED, _facts(largest_px))
-    look = made_up_look(network, facts, (96, 160))
+    look = made_up_sample(network, facts, (96, 160))
     plan = next(each for each in plans(network) if loss_db(session_of(model_of(network, each)), [look]) <= 0.2)
     assert plan.factors[0] == 1
     assert max(plan.factors) > 1

@@ -1,1 +1,1 @@
-"""Tables of trained variants: which choice of the network brings how much."""
+"""Ablation tables: trained variants that show what each choice of the network is worth."""

@@ -1,8 +1,7 @@
-"""Which runs a table needs: every row on every data set with every seed, each with its settings and its folder.
+"""The rows of the tables as data, and the runs that a table needs: every row on every data set with every seed.
 
-The rows of the tables as data: what each one changes, and the numbers that the paper has for it (Mandl et al. 2024, Tables 1 and 3).
-
-Every row changes the first row of its table, the network as published; rows of the same name are one run, whatever table they are in.
+A row states what it changes and the numbers that the paper has for it (Mandl et al. 2024, Tables 1 and 3). Every row changes the first
+row of its table, the network as published; rows of the same name are one run, whatever table they are in.
 """
 
 from collections.abc import Mapping, Sequence
@@ -40,8 +39,10 @@ class PaperNumbers:
 
 @dataclass(frozen=True)
 class Row:
-    """name: of its runs. start: the preset that it changes. network, training: settings (training.networks.network_settings, training.fitting.settings)
-    that differ from it. paper: of Table 1. note: what one must know to read the number."""
+    """One row. name: of its runs. start: the preset that it changes. network, training: settings that differ from it.
+
+    paper: of Table 1. note: what one must know to read the number.
+    """
 
     name: str
     title: str
@@ -129,12 +130,12 @@ PAPER_TABLE_3: dict[str, dict[str, PaperNumbers]] = {
 
 
 def rows_of(tables: tuple[TableName, ...]) -> list[Row]:
-    """Every row once, in the order of the tables."""
+    """Return every row once, in the order of the tables."""
     return list({row.name: row for table in tables for row in TABLES[table]}.values())
 
 
 def paper_numbers(row: Row, table: TableName, set_names: tuple[str, ...]) -> PaperNumbers | None:
-    """What the paper has for a row: of Table 3 where the data set is called after one of its bokeh."""
+    """Return the paper's numbers for a row: those of Table 3 if the data set is named after one of its bokeh."""
     if table == "3":
         names = {name: name for name in PAPER_TABLE_3} | _OUR_NAMES
         bokeh = next((names[name] for name in names if len(set_names) == 1 and name in set_names[0].lower()), None)
@@ -144,9 +145,12 @@ def paper_numbers(row: Row, table: TableName, set_names: tuple[str, ...]) -> Pap
 
 @dataclass(frozen=True)
 class Ablation:
-    """What all runs share. minutes or epochs: the budget of each. tile_px, overlap_px: of rows with tiles, None scales those of the
-    settings, which belong to pictures of 1920 px, with the width of the pictures, so that there are as many tiles as in the paper.
-    base: what the rows of the published form start from."""
+    """Options shared by all runs.
+
+    minutes or epochs: the budget of each. tile_px, overlap_px: of rows with tiles, None scales those of the settings, which belong to
+    pictures of 1920 px, with the width of the pictures, so that there are as many tiles as in the paper.
+    base: what the rows of the published form start from.
+    """
 
     minutes: float | None = 10.0
     epochs: int | None = None
@@ -160,7 +164,7 @@ class Ablation:
 
 @dataclass(frozen=True)
 class DataSet:
-    """A data set or scene folder by the name that tables show; held_out: names of the stacks that no run trains on."""
+    """A data set or scene folder by its name in tables; held_out: names of the stacks that no run trains on."""
 
     name: str
     folder: Path
@@ -179,7 +183,7 @@ class PlannedRun:
 
 
 def read_data_sets(folders: Sequence[Path]) -> list[DataSet]:
-    """Raises InputError where two have one name, or where nothing is held out."""
+    """Read the data sets. Raises InputError if two have one name, or if nothing is held out."""
     sets = [_data_set(folder) for folder in folders]
     names = [each.name for each in sets]
     if len(set(names)) < len(names):
@@ -188,7 +192,7 @@ def read_data_sets(folders: Sequence[Path]) -> list[DataSet]:
 
 
 def planned_runs(rows: Sequence[Row], data_sets: Sequence[DataSet], out: Path, ablation: Ablation) -> list[PlannedRun]:
-    """Seed by seed and row by row, so that an unfinished table has as many whole rounds as possible."""
+    """Plan seed by seed and row by row, so that an unfinished table has as many whole rounds as possible."""
     return [
         PlannedRun(
             row=row,
@@ -208,7 +212,7 @@ def run_folder(out: Path, set_name: str, row: Row, seed: int) -> Path:
 
 
 def settings_of(row: Row, width_px: int, seed: int, ablation: Ablation) -> TrainSettings:
-    """The settings of a row for pictures of that width."""
+    """Return the settings of a row for pictures of that width."""
     base = ablation.base if ablation.base is not None and row.start == "paper" else PRESETS[row.start]()
     tiles = scaled_tiles(base, width_px, ablation) if base.network.tile_px else {}
     network = replace(base.network, **tiles | dict(row.network))
@@ -218,7 +222,7 @@ def settings_of(row: Row, width_px: int, seed: int, ablation: Ablation) -> Train
 
 
 def scaled_tiles(base: TrainSettings, width_px: int, ablation: Ablation) -> dict[str, Any]:
-    """tile_px and overlap_px: those asked for, else in proportion to the width of the picture."""
+    """Return tile_px and overlap_px: those requested, else in proportion to the width of the picture."""
     scale = width_px / PAPER_WIDTH_PX
     tile_px = ablation.tile_px if ablation.tile_px is not None else max(2, round(base.network.tile_px * scale))
     overlap_px = ablation.overlap_px if ablation.overlap_px is not None else round(base.network.overlap_px * scale)
@@ -226,7 +230,7 @@ def scaled_tiles(base: TrainSettings, width_px: int, ablation: Ablation) -> dict
 
 
 def _data_set(folder: Path) -> DataSet:
-    """The split is the manifest's, or for scene folders drawn once for all rows and seeds."""
+    """Read a data set; the split is the manifest's, or for scene folders drawn once for all rows and seeds."""
     data = training_data([folder])
     split = data.split((), TEST_FRACTION, SPLIT_SEED)
     if not split.test or split.held_out_slices:

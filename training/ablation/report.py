@@ -1,8 +1,6 @@
-"""Everything that is written beside the runs, from the results that lie in their folders.
+"""Reports of an ablation from the results in the folders of its runs: results.md, results.html, and a picture for each table.
 
-results.md and results.html: all tables that have results, their pictures, and the commands that made them.
-
-The picture of a table: crops of a few held-out slices, truth first, then every row, as in the paper's Figures 4 and 5.
+A picture shows crops of a few held-out slices, truth first, then every row, as in the paper's Figures 4 and 5.
 """
 
 import html
@@ -24,7 +22,7 @@ from training.data.dataset import PairSet
 from training.data.pairs import WHERE_TRUTH_IS_KNOWN
 from training.data.stacks import stack_name
 from training.evaluation.methods import Blur, blur_of
-from training.evaluation.report import enlarged, telling_windows
+from training.evaluation.report import enlarged, informative_crops
 from training.evaluation.unseen_slice import UnseenSlice, unseen_slice
 from training.fitting.run_folder import NETWORK_NAME
 from training.fitting.settings import FILE_NAME as SETTINGS_NAME
@@ -36,7 +34,7 @@ _WHERE = ("device", "threads", "seed", "minutes", "epochs")
 
 
 def write_results(out: Path, tables: Lines, commands: Sequence[str]) -> None:
-    """commands: lines for a shell. Tables without a finished row are left out."""
+    """Write the pages. commands: lines for a shell. Tables without a finished row are left out."""
     tables = {name: lines for name, lines in tables.items() if lines}
     _write_markdown(out, tables, commands)
     blocks = [_table_section(out, name, lines) for name, lines in tables.items()]
@@ -72,7 +70,7 @@ def _sheet(out: Path, name: TableName) -> Path:
 
 
 def write_sheet(out: Path, table: TableName, rows: Sequence[Row], data_sets: Sequence[DataSet], device: str = "cpu") -> Path:
-    """rows: those that are finished on all of the sets, with seed 0."""
+    """Write a table's picture. rows: those that are finished on all of the sets, with seed 0."""
     path = out / f"{FILE_NAMES[table]}.png"
     sheet = []
     for each in data_sets:
@@ -83,7 +81,7 @@ def write_sheet(out: Path, table: TableName, rows: Sequence[Row], data_sets: Seq
 
 
 def _slices(data_set: DataSet) -> list[UnseenSlice]:
-    """The first and the last slice of the first held-out stack: the nearest and the farthest focus, where blur is largest."""
+    """Return the first and the last slice of the first held-out stack: the nearest and the farthest focus, with the largest blur."""
     stacks = [stack for stack in data_set.data.stacks if stack_name(stack) in data_set.held_out][:1]
     pairs = PairSet(stacks, WHERE_TRUTH_IS_KNOWN, cache_mib=0)
     chosen = np.unique(np.linspace(0, len(pairs) - 1, SLICES_OF_A_SET).round().astype(int))
@@ -95,7 +93,7 @@ def _sheet_rows(label: str, seen: UnseenSlice, blurs: dict[str, Blur]) -> list[S
     truth = seen.pair.target
     captions = {title: f"{title} {psnr(picture, truth, mask=seen.counted):.1f} dB" for title, picture in results.items()}
     shown = {"input": seen.pair.all_in_focus, "truth": truth} | {captions[title]: picture for title, picture in results.items()}
-    windows = telling_windows(seen, next(iter(results.values())))
+    windows = informative_crops(seen, next(iter(results.values())))
     return [
         SheetRow(f"{label}, {what}", {caption: enlarged(picture[window]) for caption, picture in shown.items()})
         for what, window in windows.items()
@@ -103,25 +101,25 @@ def _sheet_rows(label: str, seen: UnseenSlice, blurs: dict[str, Blur]) -> list[S
 
 
 class Report:
-    """Tables, pictures and pages of an ablation. tables: those asked for; command: the line that started it."""
+    """Tables, pictures and pages of an ablation. tables: those requested; command: the line that started it."""
 
     def __init__(self, out: Path, tables: Sequence[TableName], planned: Sequence[PlannedRun], command: str) -> None:
         self._out, self._tables, self._planned, self._command = out, tables, planned, command
         self._sets: list[DataSet] = list({each.data_set.name: each.data_set for each in planned}.values())
 
     def write(self) -> None:
-        """Tables and pages of what is finished so far."""
+        """Write tables and pages of what is finished so far."""
         lines = self._lines()
-        for table, mine in lines.items():
-            write_table(self._out, table, mine)
+        for name, mine in lines.items():
+            write_table(self._out, name, mine)
         write_results(self._out, lines, self._commands())
 
     def write_sheets(self, device: str = "cpu") -> None:
-        """The picture of every table, and the pages once more with them."""
-        for table in self._lines():
-            rows = [row for row in TABLES[table] if self._is_trained(row)]
+        """Write the picture of every table, and the pages once more with them."""
+        for name in self._lines():
+            rows = [row for row in TABLES[name] if self._is_trained(row)]
             if rows:
-                write_sheet(self._out, table, rows, self._sets, device)
+                write_sheet(self._out, name, rows, self._sets, device)
         self.write()
 
     def table_files(self) -> list[str]:
@@ -141,21 +139,21 @@ class Report:
         )
 
     def _commands(self) -> list[str]:
-        """The whole, and the finished rows one by one, on the first data with the first seed; the others are alike."""
+        """Return the command of the whole, and of the finished rows one by one, on the first data with the first seed."""
         first = [each for each in self._planned if each.seed == 0 and each.data_set is self._sets[0]]
         finished = [each for each in first if read_result(each.folder) is not None]
         return [self._command, *(fit_command_line(each) for each in finished)]
 
 
 def fit_command_line(planned: PlannedRun) -> str:
-    """`mrbokeh train fit` with the settings and the split of a run."""
+    """Return `mrbokeh train fit` with the settings and the split of a run."""
     apart = "".join(f" --held-out {quote(name)}" for name in planned.data_set.held_out)
     settings = quote(str(planned.folder / SETTINGS_NAME))
     return f"mrbokeh train fit {quote(str(planned.data_set.folder))} --settings {settings}{apart} --out {quote(str(planned.folder))}"
 
 
 def changed_settings(settings: TrainSettings) -> list[str]:
-    """name=value of what differs from the defaults, which are the published network's."""
+    """Return name=value for each setting that differs from the defaults, which are the published network's."""
     plain, now = TrainSettings(), asdict(settings)
     own = {name: value for name, value in now.items() if name not in ("network", *_WHERE) and value != getattr(plain, name)}
     network = {f"network.{name}": value for name, value in now["network"].items() if value != getattr(plain.network, name)}

@@ -1,8 +1,6 @@
-"""Train what a plan asks for, one run after the other, and measure each on the stacks that it has not seen.
+"""Training of the planned runs, one after the other, their evaluation on held-out stacks, and an estimate of the time it takes.
 
-What a number was measured on, in one line.
-
-How long a plan will take: minutes where the budget says so, else one timed step of each run.
+The estimate is the budget in minutes, or else from one timed step of each run.
 """
 
 import os
@@ -35,7 +33,7 @@ FLICKER = "flicker"
 
 
 def machine_line() -> str:
-    """Processor, cores, the GPU where torch sees one, and versions."""
+    """Describe the machine in one line: processor, cores, the GPU if torch sees one, and versions."""
     import torch
 
     gpu = [torch.cuda.get_device_name(0)] if torch.cuda.is_available() else []
@@ -52,7 +50,10 @@ def _processor() -> str:
 
 
 def result_of(planned: PlannedRun, lpips: Perceptual | None = None) -> RunResult:
-    """Raises InputError where the folder holds a run with other settings. Finished ones are measured again only to add LPIPS."""
+    """Train and evaluate a run; a finished one is evaluated again only to add LPIPS.
+
+    Raises InputError if its folder holds other settings.
+    """
     require_same_settings(planned.folder, planned.settings)
     before = read_result(planned.folder)
     if before is not None and (lpips is None or before.measures["lpips"] == before.measures["lpips"]):
@@ -77,7 +78,7 @@ def result_of(planned: PlannedRun, lpips: Perceptual | None = None) -> RunResult
 
 
 def _measured(planned: PlannedRun, lpips: Perceptual | None) -> tuple[dict[str, float], int]:
-    """(means over the held-out slices, their number); each slice is in scores.csv of the run."""
+    """Return (means over the held-out slices, their number); each slice is in scores.csv of the run."""
     method = network_method(planned.row.name, blur_of(planned.folder, device_of(planned.settings.device))[0])
     stacks = tuple(stack for stack in planned.data_set.data.stacks if stack_name(stack) in planned.data_set.held_out)
     result = scored([method], Unseen(stacks), Extras(lpips, memory=False))
@@ -95,7 +96,7 @@ def is_finished(planned: PlannedRun) -> bool:
 
 
 def estimated_minutes(planned: Sequence[PlannedRun]) -> list[float]:
-    """Estimate the minutes of training of each run; 0 for those that are finished. Measuring comes on top."""
+    """Estimate the minutes of training of each run; 0 for those that are finished. Evaluation comes on top."""
     seconds_of_step: dict[tuple[str, str], float] = {}
     minutes = []
     for each in planned:
@@ -110,7 +111,7 @@ def estimated_minutes(planned: Sequence[PlannedRun]) -> list[float]:
 
 
 def step_seconds(planned: PlannedRun) -> float:
-    """The second of two steps, without the optimizer's part, which is small."""
+    """Time the second of two steps, without the optimizer's part, which is small."""
     settings, pairs = planned.settings, _pairs(planned)
     facts = planned.data_set.data.facts(pairs, settings.network.lens_inputs)
     device = torch.device(device_of(settings.device))
@@ -136,5 +137,5 @@ def _steps(planned: PlannedRun) -> float:
 
 
 def _run_facts(facts: DataFacts) -> RunFacts:
-    """What a network is built from; what a run remembers beside that is left empty."""
+    """Return the facts from which a network is built; provenance is left empty."""
     return RunFacts(**vars(facts), trained_on=(), held_out=(), commit=None)

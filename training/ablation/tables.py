@@ -1,6 +1,6 @@
-"""A table of trained rows as Markdown and CSV, with the paper's numbers beside ours and the gaps to the first row.
+"""Tables of trained rows as Markdown and CSV, with the paper's numbers beside ours and the gaps to the first row.
 
-The result of one run of a table, kept beside its network, and what several runs say together.
+The result of each run is kept beside its network; results of several seeds are summed up.
 """
 
 import csv
@@ -33,8 +33,9 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class RunResult:
-    """measures: means over the held-out slices by name (training.evaluation.scores.MEASURES, and flicker); nan where not measured.
+    """The result of one run.
 
+    measures: means over the held-out slices by name (training.evaluation.scores.MEASURES, and flicker); nan if not measured.
     seconds: of training; commit: of the code that trained, or None; machine: that it ended on.
     """
 
@@ -56,7 +57,7 @@ def write_result(folder: Path, result: RunResult) -> None:
 
 
 def read_result(folder: Path) -> RunResult | None:
-    """None where the run is not finished and measured yet."""
+    """Read a run's result; None if it is not finished and evaluated yet."""
     if not (folder / FILE_NAME).is_file():
         return None
     document = read_json(folder / FILE_NAME, "the result of a run of a table")
@@ -82,7 +83,7 @@ class Summary:
 
 
 def summary(row: Row, results: Sequence[RunResult], sets: Sequence[str]) -> Summary | None:
-    """Sum up the seeds that are finished on all of the sets; None where there are none."""
+    """Sum up the seeds that are finished on all of the sets; None if there are none."""
     mine = [each for each in results if each.row == row.name and each.data_set in sets]
     seeds = [seed for seed in sorted({each.seed for each in mine}) if {each.data_set for each in mine if each.seed == seed} == set(sets)]
     counted = [each for each in mine if each.seed in seeds]
@@ -106,7 +107,7 @@ def summary(row: Row, results: Sequence[RunResult], sets: Sequence[str]) -> Summ
 
 @dataclass(frozen=True)
 class Line:
-    """A finished row; sets: the data it is the mean of. gap_db, paper_gap_db: to the first row of the table, negative is worse."""
+    """A finished row; sets: the data it averages. gap_db, paper_gap_db: to the first row of the table, negative is worse."""
 
     sets: tuple[str, ...]
     summary: Summary
@@ -116,7 +117,7 @@ class Line:
 
 
 def lines_of(table: TableName, results: Sequence[RunResult], sets: Sequence[str]) -> list[Line]:
-    """Finished rows in the order of the table; Table 3 set by set, the others as the mean over all sets, as in the paper."""
+    """Return finished rows in the order of the table; Table 3 set by set, the others as the mean over all sets, as in the paper."""
     groups = [(each,) for each in sets] if table == "3" else [tuple(sets)]
     return [line for group in groups for line in _group(table, results, group)]
 
@@ -136,7 +137,7 @@ def _group(table: TableName, results: Sequence[RunResult], sets: tuple[str, ...]
 
 
 def table_cells(lines: Sequence[Line]) -> tuple[list[str], list[list[str]]]:
-    """(headings, rows of text)."""
+    """Return (headings, rows of text)."""
     headings = ["row", "data"]
     for name, (title, _) in _MEASURES.items():
         headings += [title, "paper"] if name in PAPER_MEASURES else [title]
@@ -155,7 +156,7 @@ def _cells(line: Line) -> list[str]:
 
 
 def with_spread(mine: Summary, measure: str, digits: int) -> str:
-    """The mean, and with several seeds their standard deviation."""
+    """Format the mean, and with several seeds their standard deviation."""
     mean, spread = mine.means[measure], mine.spreads[measure]
     return number(mean, digits) + ("" if np.isnan(spread) else f" ± {number(spread, digits)}")
 
@@ -169,7 +170,7 @@ def _signed(value: float) -> str:
 
 
 def markdown_of(table: TableName, lines: Sequence[Line]) -> list[str]:
-    """Title, table, what it was measured on, notes."""
+    """Return title, table, its provenance and notes."""
     notes = [f"- {line.summary.row.title}: {line.summary.row.note}." for line in lines if line.summary.row.note]
     return [
         f"## {TITLES[table]}",
@@ -186,7 +187,7 @@ def markdown_of(table: TableName, lines: Sequence[Line]) -> list[str]:
 
 
 def provenance(lines: Sequence[Line]) -> list[str]:
-    """One sentence each: what the numbers are of, and where they were made."""
+    """Return one sentence each on what the numbers are of, and where they were made."""
     commits = sorted({commit for line in lines for commit in line.summary.commits})
     machines = sorted({machine for line in lines for machine in line.summary.machines})
     slices = sorted({line.summary.slices for line in lines})
@@ -217,7 +218,7 @@ def _with_paper(line: Line | None, measure: str, digits: int) -> str:
 
 
 def write_table(out: Path, table: TableName, lines: Sequence[Line]) -> None:
-    """table_1.md and .csv and so on."""
+    """Write table_1.md and .csv and so on."""
     with atomic_path(out / f"{FILE_NAMES[table]}.md") as temporary:
         temporary.write_text("\n".join(markdown_of(table, lines)), encoding="utf-8")
     numbers = [_numbers(line) for line in lines]

@@ -1,4 +1,4 @@
-"""`mrbokeh train ablate`."""
+"""The command `mrbokeh train ablate`."""
 
 import os
 import shlex

@@ -1,4 +1,4 @@
-"""`mrbokeh train evaluate`."""
+"""The command `mrbokeh train evaluate`."""
 
 from pathlib import Path
 from typing import Annotated

@@ -1,4 +1,4 @@
-"""`mrbokeh train export`."""
+"""The command `mrbokeh train export`."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated

@@ -1,7 +1,4 @@
-"""`mrbokeh train fit`.
-
-Arguments that several commands take.
-"""
+"""The command `mrbokeh train fit`."""
 
 import math
 import os
@@ -145,7 +142,7 @@ def _begun_with(preset: Preset, settings_file: Path | None) -> "TrainSettings":
 
 
 def _require_run(out: Path) -> None:
-    """A run is written into a folder of its own: new, empty, or that of a run."""
+    """Refuse a folder that is neither new, nor empty, nor that of a run."""
     if out.exists() and not out.is_dir():
         raise InputError(f"--out: expected a folder, but {out} is a file")
     if out.is_dir() and not (out / "settings.json").exists() and any(out.iterdir()):

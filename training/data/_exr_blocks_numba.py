@@ -1,4 +1,4 @@
-"""The loop of training.data.exr_rows, compiled."""
+"""The compiled loop of `exr_rows`."""
 
 import numpy as np
 
@@ -7,7 +7,7 @@ from mrbokeh.system.kernels import njit
 
 @njit(cache=True, nogil=True)
 def without_prediction(packed: np.ndarray) -> np.ndarray:
-    """Bytes of a ZIP block of OpenEXR: each is kept as its difference from the last, plus 128, and even ones before odd ones."""
+    """Undo the prediction of OpenEXR's ZIP blocks: bytes are stored as differences from the last, plus 128, even ones before odd ones."""
     result = np.empty(packed.size, np.uint8)
     half, value = (packed.size + 1) // 2, 128
     for i in range(half):

@@ -1,11 +1,10 @@
-"""Smooth random fields, for errors that vary slowly over a picture.
+"""Depth made worse while training, so that a network does not trust it more than it should.
 
-Depth made worse while training, so that a network does not trust it more than it will deserve.
-
-Training pairs have the depth of many photographs taken for the purpose; what the network is used on has a depth of its own, with other
-mistakes. The strength 1 is what focus and multi-view stereo together got wrong on traced stacks with known truth (docs/measured.md, "Capture";
-`python -m tests.bench.bench_capture`): a median relative error of 0.13 to 0.19 %, 2.1 to 6.3 % of the pixels off by more than 0.05 dioptres, and
-silhouettes off by about a pixel. Pictures stay as they are; only circles of confusion change.
+Training pairs have the depth of many photographs taken for the purpose; the network is later used on a depth of another origin, with
+other errors. Strength 1 reproduces the errors of focus and multi-view stereo together on traced stacks with known truth
+(docs/measured.md, "Capture"; `python -m tests.bench.bench_capture`): a median relative error of 0.13 to 0.19 %, 2.1 to 6.3 % of the
+pixels off by more than 0.05 dioptres, and silhouettes off by about a pixel. Pictures stay as they are; only circles of confusion
+change. The errors are smooth random fields, which vary slowly over a picture.
 """
 
 import functools
@@ -30,7 +29,7 @@ _ERROR_CELL_PX, _REGION_CELL_PX, _EDGE_CELL_PX = 64.0, 16.0, 12.0
 
 
 def smooth_noise(size_px: tuple[int, int], cell_px: float, rng: np.random.Generator) -> Float32[np.ndarray, "height width"]:
-    """(height, width), normally distributed with mean 0 and variance 1 at every pixel; values a cell apart have little to do with another.
+    """Return (height, width) normal noise with mean 0 and variance 1 at every pixel; values a cell apart are nearly independent.
 
     White noise on a grid, spread by Gaussians; each row of weights has a sum of squares of 1, so that the variance is exact.
     """
@@ -40,7 +39,7 @@ def smooth_noise(size_px: tuple[int, int], cell_px: float, rng: np.random.Genera
 
 
 def octaves(size_px: tuple[int, int], cell_px: float, count: int, rng: np.random.Generator) -> Float32[np.ndarray, "height width"]:
-    """Add up octaves as Perlin's noise does: each with half the cell and half the amplitude of the last; mean 0, variance 1."""
+    """Sum octaves of noise as Perlin does: each with half the cell and half the amplitude of the last; mean 0, variance 1."""
     amplitudes = 0.5 ** np.arange(count)
     fields = [amplitude * smooth_noise(size_px, cell_px * amplitude, rng) for amplitude in amplitudes.tolist()]
     return np.asarray(sum(fields) / np.float32(np.linalg.norm(amplitudes)), np.float32)
@@ -55,9 +54,9 @@ def _weights(length_px: int, cell_px: float) -> Float32[np.ndarray, "pixels node
 
 
 def augmented(pair: Pair, depth_noise: float, rng: np.random.Generator, largest_coc_px: float = math.inf) -> Pair:
-    """The pair with worse circles of confusion. depth_noise: strength, 0 returns the pair itself.
+    """Return the pair with worse circles of confusion. depth_noise: strength, 0 returns the pair itself.
 
-    largest_coc_px: what the network was made for; no diameter becomes larger.
+    largest_coc_px: the limit of the network; no diameter becomes larger.
     """
     if depth_noise == 0.0:
         return pair
@@ -69,16 +68,18 @@ def augmented(pair: Pair, depth_noise: float, rng: np.random.Generator, largest_
 
 @dataclass(frozen=True)
 class _Noise:
+    """Errors of depth at one strength."""
+
     strength: float
     rng: np.random.Generator
 
     def on(self, dioptres: Dioptres) -> Dioptres:
-        """Nothing lands beyond infinity that was not there."""
+        """Apply all errors; nothing is moved beyond infinity that was not there."""
         shape = self._pushed(self._grown(dioptres))
         return np.maximum(shape + self._smooth_error(shape) + self._mistakes(shape), np.minimum(dioptres, 0.0))
 
     def _grown(self, dioptres: Dioptres) -> Dioptres:
-        """Silhouettes of what is near are larger in some regions (dilation) and smaller in others (erosion)."""
+        """Enlarge silhouettes of near things in some regions (dilation) and shrink them in others (erosion)."""
         import cv2
 
         radius = math.ceil(self.strength)
@@ -88,7 +89,7 @@ class _Noise:
         return np.where(field < -limit, cv2.erode(dioptres, kernel), grown)
 
     def _pushed(self, dioptres: Dioptres) -> Dioptres:
-        """Elastic: each pixel has the depth of one nearby. None is between two depths, as edges in depth stay sharp."""
+        """Displace elastically: each pixel takes the depth of one nearby, never one between two, so that edges in depth stay sharp."""
         import cv2
 
         rows, columns = np.indices(dioptres.shape, np.float32)
@@ -101,7 +102,7 @@ class _Noise:
         return np.float32(sigma) * dioptres * octaves(_size(dioptres), _ERROR_CELL_PX, 3, self.rng)
 
     def _mistakes(self, dioptres: Dioptres) -> Dioptres:
-        """Regions where another depth matched as well: off by 0.06 to some 0.15 dioptres, nearer or farther."""
+        """Shift regions as if another depth had matched: by 0.06 to some 0.15 dioptres, nearer or farther."""
         field, limit = self._field(dioptres, _REGION_CELL_PX), _deviations(min(MISTAKEN_SHARE * self.strength, _LARGEST_SHARE))
         size = MISTAKEN_BY_DIOPTRES * (1.2 + 2.0 * np.maximum(field - limit, 0.0))
         side = np.sign(self._field(dioptres, _ERROR_CELL_PX))
@@ -116,5 +117,5 @@ def _size(dioptres: Dioptres) -> tuple[int, int]:
 
 
 def _deviations(share: float) -> float:
-    """How many standard deviations a normal variable exceeds in this share of cases."""
+    """Return how many standard deviations a normal variable exceeds in this fraction of cases."""
     return NormalDist().inv_cdf(1.0 - share)

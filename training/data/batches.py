@@ -1,6 +1,6 @@
-"""Which crops of which pictures come next: drawn before any picture is opened, so that they can be read ahead.
+"""Random batches of crops from training pairs, as tensors.
 
-Random batches of crops from training pairs, as tensors.
+Crops are drawn before any picture is opened, so that their rows can be read ahead.
 """
 
 import copy
@@ -21,9 +21,9 @@ _DRAWN_AHEAD = 8
 
 @dataclass(frozen=True)
 class Crop:
-    """Where to cut. window: what must be read for it; rows, columns: in the picture; their weights: 0 where light is missing.
+    """One crop. window: the rows that must be read; rows, columns: in the picture; their weights: 0 where light is missing.
 
-    noise_seed: of what is random inside the crop.
+    noise_seed: of everything random inside the crop.
     """
 
     window: Window
@@ -36,10 +36,10 @@ class Crop:
 
 @dataclass(frozen=True)
 class Drawing:
-    """How crops are drawn.
+    """Settings of drawing crops.
 
     crop_px: side, 0 for whole pictures. halo_px: pixels this close to a side of a crop that is not a border of the picture get no
-    weight, for their light comes partly from outside the crop. crops_per_picture: so many share a picture and its rows.
+    weight, since their light comes partly from outside the crop. crops_per_picture: that many share a picture and its rows.
     noisy: each crop gets a seed of its own.
     """
 
@@ -51,18 +51,18 @@ class Drawing:
     noisy: bool = False
 
     def draw(self, rng: np.random.Generator) -> list[Crop]:
-        """`size` crops; takes from rng the same numbers whatever the pictures show. Two draws are one of twice the size."""
+        """Draw `size` crops, independently of the pictures' content. Two draws equal one of twice the size."""
         crops: list[Crop] = []
         while len(crops) < self.size:
             crops += self._of_one_picture(rng)
         return crops[: self.size]
 
     def draw_share(self, rng: np.random.Generator, number: int = 0, count: int = 1) -> list[Crop]:
-        """What process `number` of `count` takes of a draw for all; each of them has rng in the same state, before and after."""
+        """Return the part of process `number` of `count` in a common draw; all processes have rng in the same state, before and after."""
         return [self.draw(rng) for _ in range(count)][number]
 
     def next_windows(self, rng: np.random.Generator, number: int = 0, count: int = 1) -> Iterator[Window]:
-        """What the next calls of `draw_share` will need; rng itself stays as it is."""
+        """Yield the windows that the next calls of `draw_share` will need; rng itself is not advanced."""
         coming = copy.deepcopy(rng)
         for _ in range(max(1, _DRAWN_AHEAD // self.size)):
             yield from (crop.window for crop in self.draw_share(coming, number, count))
@@ -84,7 +84,7 @@ class Drawing:
             )
 
     def _interval(self, length_px: int, rng: np.random.Generator) -> tuple[slice, Float32[np.ndarray, " length"]]:
-        """A random interval along one side and the weight of its pixels.
+        """Return a random interval along one side and the weight of its pixels.
 
         Starts are drawn from beyond both borders and clamped, so that borders are seen as often as the rest.
         """
@@ -102,10 +102,11 @@ class Drawing:
 
 @dataclass(frozen=True)
 class Batch:
-    """rgb, target (B, 3, h, w) linear radiance; coc_px (B, 1, h, w) signed diameters; weight (B, 1, h, w); place (B, 2, h, w) field
-    positions in the whole frame; lens (B, 2): f-number and focal length in mm.
+    """Pairs as tensors.
 
-    saturated: (B, 1, h, w) where the target is only known to be at least so bright; None: nowhere.
+    rgb, target: (B, 3, h, w) linear radiance. coc_px: (B, 1, h, w) signed diameters. weight: (B, 1, h, w).
+    place: (B, 2, h, w) field positions in the whole frame. lens: (B, 2) f-number and focal length in mm.
+    saturated: (B, 1, h, w) where the target is only a lower bound; None: nowhere.
     """
 
     rgb: Tensor
@@ -120,7 +121,7 @@ class Batch:
         return Batch(**{name: part.to(device) for name, part in self.parts().items()})
 
     def parts(self) -> dict[str, Tensor]:
-        """All that is there, by name."""
+        """Return all tensors that are present, by name."""
         return {name: part for name, part in vars(self).items() if part is not None}
 
 
@@ -134,7 +135,7 @@ def draw_batch(
     depth_noise: float = 0.0,
     largest_coc_px: float = float("inf"),
 ) -> Batch:
-    """Pairs and crop positions drawn at random, in one batch; see `draw_share`."""
+    """Draw pairs and crop positions at random and join them in one batch; see `draw_share`."""
     drawing = Drawing(pairs, size, crop_px, halo_px, noisy=depth_noise > 0.0)
     return _joined(list(draw_share(drawing, rng, depth_noise=depth_noise, largest_coc_px=largest_coc_px)))
 
@@ -148,10 +149,10 @@ def draw_share(
     depth_noise: float = 0.0,
     largest_coc_px: float = float("inf"),
 ) -> Iterator[Batch]:
-    """The pictures of a step, one by one, for process `number` of `count`: `drawing.size` for each of them, all from one sequence.
+    """Yield the pictures of a step, one by one, for process `number` of `count`: `drawing.size` for each process, from one sequence.
 
-    rng has moved on when this returns. While the caller computes, what the next calls will draw is read in the background, provided that
-    they draw alike with this rng; if not, they only wait longer.
+    rng is advanced when this returns. While the caller computes, the pictures of the next calls are read in the background, provided
+    that they draw alike with this rng; otherwise they only wait longer.
     depth_noise: how badly depth is made worse (`training.data.augmentation`; the drawing must be noisy), up to diameters of largest_coc_px.
     """
     crops = drawing.draw_share(rng, number, count)
@@ -160,12 +161,12 @@ def draw_share(
 
 
 def stack_pairs(pairs: Sequence[Pair]) -> Batch:
-    """Pairs of one size, whole or cropped, as one batch of copies."""
+    """Copy pairs of one size, whole or cropped, into one batch."""
     return _joined([_single(pair) for pair in pairs])
 
 
 def network_inputs(pair: Pair) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """rgb, coc_px, place and lens of a pair as tensors with B = 1."""
+    """Return rgb, coc_px, place and lens of a pair as tensors with B = 1."""
     return (
         _channel_first(pair.all_in_focus),
         torch.from_numpy(pair.coc_px.copy())[None, None],
@@ -201,5 +202,5 @@ def _joined(batches: Sequence[Batch]) -> Batch:
 
 
 def _channel_first(picture: np.ndarray) -> Tensor:
-    """A copy, (1, C, h, w), in memory as it was: the channels of a pixel side by side, which convolutions on the CPU like."""
+    """Copy to (1, C, h, w) with the channels of a pixel side by side in memory, which is fast for convolutions on the CPU."""
     return torch.from_numpy(np.stack([picture.transpose(2, 0, 1)]))

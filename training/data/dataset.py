@@ -1,6 +1,6 @@
-"""Parts of pictures, read by a thread in the background before they are asked for, in bounded memory.
+"""All pairs of some stacks as one sequence, read on demand and in bounded memory, whole or a few rows at a time.
 
-All pairs of some stacks as one sequence, read when asked for and in bounded memory, whole or a few rows at a time.
+Parts of pictures are read ahead by a thread in the background.
 """
 
 import functools
@@ -24,7 +24,7 @@ _PIECES_AHEAD = 4
 
 @dataclass(frozen=True)
 class Window:
-    """Some rows of a pair, over the whole width. bytes: what it takes in memory, known before it is read."""
+    """Some rows of a pair, over the whole width. bytes: its size in memory, known before it is read."""
 
     index: int
     top: int
@@ -33,11 +33,11 @@ class Window:
 
 
 class ReadAhead:
-    """Windows that were used or are expected; the longest unused go first when `limit_bytes` is full.
+    """A cache of windows that were used or are expected; the least recently used go first when `limit_bytes` is full.
 
-    What is read does not depend on what was expected; only when does. Used from one thread, which all windows are handed to.
-    Beyond the limit there are only what reading takes in passing (about one window more for each reader) and, where a single
-    window is larger than the limit, that one window. A mistake in a reader is raised where its window is asked for.
+    The result of reading does not depend on the expectation; only its time does. All calls come from one thread.
+    Beyond the limit there is only what reading takes in passing (about one window more for each reader) and a single window larger
+    than the limit. An error in a reader is raised where its window is requested.
     """
 
     def __init__(self, read: Callable[[Window], Pair], limit_bytes: int, readers: int = 1) -> None:
@@ -67,7 +67,7 @@ class ReadAhead:
             raise
 
     def expect(self, windows: Iterable[Window]) -> None:
-        """Start reading what will be asked for next, in this order, as far as memory allows; forgets what was expected before."""
+        """Start reading the next windows in this order, as far as memory allows; earlier expectations are dropped."""
         ordered = list(dict.fromkeys(windows))
         self._expected = set(ordered)
         for window in ordered:
@@ -79,7 +79,7 @@ class ReadAhead:
             self._keep(window, self._pool.submit(self._read, window))
 
     def close(self) -> None:
-        """Stop reading and forget everything."""
+        """Stop reading and drop everything."""
         if self._pool is not None:
             self._pool.shutdown(cancel_futures=True)
         self._pool, self.held_bytes = None, 0
@@ -94,7 +94,7 @@ class ReadAhead:
         self.held_bytes -= window.bytes
 
     def _make_room(self, needed_bytes: int, over: bool = False) -> bool:
-        """Whether it fits now. Goes first: what is read and not expected, oldest first; for `over` also what is expected."""
+        """Free memory and tell whether the bytes fit now: first unexpected windows, oldest first; with `over` also expected ones."""
         for expected_too in (False, True) if over else (False,):
             for window in list(self._kept):
                 if self.held_bytes + needed_bytes <= self.limit_bytes:
@@ -105,13 +105,12 @@ class ReadAhead:
 
 
 class PairSet:
-    """The pairs of some stacks; what was used last and what comes next is kept in memory, up to a limit.
+    """The pairs of some stacks; recently used and expected pictures are cached, up to a limit.
 
     slices: only these of the stacks that it names.
-    cache_mib: the limit. Where all pairs fit they stay, and each file is read once; slices share what belongs to their stack.
-    Where they do not, crops are cut from windows: only
-    the rows of a crop are read, over the whole width, as the file holds them. On slices of 24 megapixels 256 rows take 1/16 of the
-    time and memory of a whole one. Reading takes about one window more in passing for each reader (`ReadAhead`).
+    cache_mib: the limit. If all pairs fit they stay, and each file is read once; slices share what belongs to their stack.
+    Otherwise crops are cut from windows: only the rows of a crop are read, over the whole width, as the file holds them. On slices of
+    24 megapixels 256 rows take 1/16 of the time and memory of a whole one. Reading takes about one window more in passing for each reader.
     A copy for another process (pickle) starts with an empty memory.
     """
 
@@ -133,7 +132,7 @@ class PairSet:
         return len(self.keys)
 
     def __getitem__(self, index: int) -> Pair:
-        """The whole picture."""
+        """Return the whole picture."""
         return self._cache.get(self._window(index, slice(0, self.size_px(index)[0])))
 
     def label(self, index: int) -> str:
@@ -141,27 +140,27 @@ class PairSet:
         return f"{stack_name(stack)} slice {slice_index}"
 
     def left_out(self, stack: FocalStack) -> list[int]:
-        """The slices of one of its stacks that do not belong to it."""
+        """Return the slices of one of its stacks that do not belong to it."""
         chosen = self._slices.get(stack_name(stack))
         return [] if chosen is None else [index for index in range(len(stack)) if index not in chosen]
 
     def size_px(self, index: int) -> tuple[int, int]:
-        """(height, width) of a pair, from the header of its file."""
+        """Return (height, width) of a pair, from the header of its file."""
         if index not in self._sizes_px:
             self._sizes_px[index] = slice_size_px(*self.keys[index])
         return self._sizes_px[index]
 
     @functools.cached_property
     def all_fit(self) -> bool:
-        """Whether all pairs stay in memory once they are read."""
+        """Tell whether all pairs stay in memory once they are read."""
         return sum(self._bytes(index, self.size_px(index)[0]) for index in range(len(self))) <= self._cache.limit_bytes
 
     def window(self, index: int, rows: slice) -> Window:
-        """What to read for some rows: just these, or the whole picture where all of them fit."""
+        """Return what to read for some rows: just these, or the whole picture if all of them fit."""
         return self._window(index, slice(0, self.size_px(index)[0]) if self.all_fit else rows)
 
     def cut(self, window: Window, rows: slice, columns: slice) -> Pair:
-        """A part of a picture (a view) from a window with all its rows; rows, columns: in the picture."""
+        """Cut a part of a picture (a view) from a window with all its rows; rows, columns: in the picture."""
         return self._cache.get(window).cut(slice(rows.start - window.top, rows.stop - window.top), columns)
 
     def expect(self, windows: Iterable[Window]) -> None:
@@ -170,7 +169,7 @@ class PairSet:
             self._cache.expect(windows)
 
     def pieces(self, index: int) -> Iterator[Pair]:
-        """A whole picture in one piece where all fit in memory, else a few rows after the other."""
+        """Yield a whole picture in one piece if all fit in memory, else a few rows after the other."""
         height = self.size_px(index)[0]
         step = height if self.all_fit else _PIECE_ROWS
         windows = [self._window(index, slice(top, min(top + step, height))) for top in range(0, height, step)]
@@ -179,7 +178,7 @@ class PairSet:
             yield self._cache.get(window)
 
     def close(self) -> None:
-        """Forget all pictures and stop reading ahead."""
+        """Drop all pictures and stop reading ahead."""
         self._cache.close()
         self._shared.clear()
 

@@ -1,10 +1,9 @@
-"""Some rows of an EXR file, without reading the rest of it.
+"""Reading of some rows of an EXR file without the rest of it.
 
-Training on crops of large pictures would otherwise decode 24 megapixels for each crop. Scan lines that are not compressed (depth, the
-all-in-focus picture and small slices of this project) and those in ZIP blocks (https://openexr.com/en/latest/OpenEXRFileLayout.html) are
-found and decoded here, because OpenEXR's own Python module keeps all other threads waiting while it decodes, and what is used here does
-not. Scan lines in other blocks (PIZ, which large slices have) are decoded by that module, these rows only; tiles and cropped pictures are
-read whole and cut.
+Training on crops of large pictures would otherwise decode 24 megapixels for each crop. Uncompressed scan lines (depth, the
+all-in-focus picture and small slices of this project) and those in ZIP blocks (https://openexr.com/en/latest/OpenEXRFileLayout.html)
+are found and decoded here, because OpenEXR's own Python module blocks all other threads while it decodes. Scan lines in other blocks
+(PIZ, used for large slices) are decoded by that module, these rows only; tiles and cropped pictures are read whole and cut.
 """
 
 import functools
@@ -33,7 +32,7 @@ _KEPT_HEADERS = 4096
 
 @dataclass(frozen=True)
 class _Layout:
-    """offsets: where each block starts. channels: (name, type) in the order of the file."""
+    """The layout of a file. offsets: where each block starts. channels: (name, type) in the order of the file."""
 
     height: int
     width: int
@@ -48,7 +47,7 @@ class _Layout:
 
 
 def exr_size_px(path: Path) -> tuple[int, int]:
-    """(height, width) of the first part; of a file with scan lines only the header is read."""
+    """Return (height, width) of the first part; for scan lines only the header is read."""
     layout = _layout_of(path)
     if layout is not None:
         return layout.height, layout.width
@@ -59,9 +58,9 @@ def exr_size_px(path: Path) -> tuple[int, int]:
 
 
 def read_rows(path: Path, rows: slice, names: Sequence[str] = (), optional: Sequence[str] = ()) -> dict[str, Rows]:
-    """The named channels of the first part as float32 (rows, width), and those of `optional` that the file has.
+    """Read the named channels of the first part as float32 (rows, width), and those of `optional` that the file has.
 
-    rows: a plain slice within the picture. Raises InputError where the file is missing or damaged or lacks a channel.
+    rows: a plain slice within the picture. Raises InputError if the file is missing or damaged or lacks a channel.
     """
     layout = _layout_of(path)
     if layout is None and (found_by_rows := _decoded_by_openexr(path, rows, (*names, *optional))) is not None:
@@ -82,8 +81,10 @@ def read_rows(path: Path, rows: slice, names: Sequence[str] = (), optional: Sequ
 
 
 def _opened(path: Path) -> tuple[Any, tuple[int, int]] | None:
-    """(the file in OpenEXR's older interface, which reads some rows alone, (height, width)); None where it is no whole picture in scan
-    lines or cannot be opened."""
+    """Return (the file in OpenEXR's older interface, which reads some rows alone, (height, width)).
+
+    None if it is not a whole picture in scan lines or cannot be opened.
+    """
     import OpenEXR
 
     try:
@@ -98,7 +99,7 @@ def _opened(path: Path) -> tuple[Any, tuple[int, int]] | None:
 
 
 def _decoded_by_openexr(path: Path, rows: slice, wanted: Sequence[str]) -> dict[str, Rows] | None:
-    """The channels that the file has of those wanted; None where it has to be read whole."""
+    """Return those of the wanted channels that the file has; None if it has to be read whole."""
     import Imath
 
     opened = _opened(path)
@@ -128,7 +129,7 @@ def _decoded(path: Path, layout: _Layout, rows: slice, wanted: Sequence[str]) ->
 
 
 def _block(file: BinaryIO, layout: _Layout, block: int, lines: int) -> np.ndarray:
-    """(lines, line_bytes) uint8. A block that compression would have made larger is stored as it is."""
+    """Return (lines, line_bytes) uint8. A block that compression would have enlarged is stored uncompressed."""
     file.seek(layout.offsets[block])
     _, length = struct.unpack("<ii", file.read(8))
     stored, size = file.read(length), lines * layout.line_bytes
@@ -138,7 +139,7 @@ def _block(file: BinaryIO, layout: _Layout, block: int, lines: int) -> np.ndarra
 
 
 def _layout_of(path: Path) -> _Layout | None:
-    """None where the file is not plain scan lines of half and float, or its picture is not its display window."""
+    """Return None if the file is not plain scan lines of half and float, or its picture is not its display window."""
     try:
         changed = path.stat()
     except OSError:
@@ -192,7 +193,7 @@ def _channels(entries: bytes) -> tuple[tuple[str, np.dtype], ...]:
 
 
 def _word(file: BinaryIO) -> str:
-    """A text that ends with a zero byte; "" ends the header."""
+    """Read a text that ends with a zero byte; "" ends the header."""
     letters = bytearray()
     while (letter := file.read(1)) not in (b"\0", b""):
         letters += letter

@@ -1,8 +1,7 @@
-"""Some rows of a slice with all that its stack knows of them; nothing else is decoded.
+"""Training pairs from FocalStack folders: (all-in-focus picture, circles of confusion) -> photographed slice.
 
-Which pixels of a slice count: those whose depth and radiance are known and where nothing moved.
-
-Training pairs from FocalStack folders: (all-in-focus picture, circles of confusion) -> photographed slice.
+Some rows of a slice and its stack can be read without decoding the rest. Pixels count if their depth and radiance are known and
+nothing moved there.
 """
 
 from dataclasses import dataclass, replace
@@ -31,8 +30,10 @@ _LOW_CONFIDENCE = "low_confidence"
 
 @dataclass(frozen=True)
 class StackRows:
-    """What all slices of a stack share. rows: which of the picture. all_in_focus: (H, W, 3) linear Rec.709. confidence: of depth.
-    exclusions: masks by reason."""
+    """Rows shared by all slices of a stack.
+
+    rows: which of the picture. all_in_focus: (H, W, 3) linear Rec.709. confidence: of depth. exclusions: masks by reason.
+    """
 
     rows: slice
     all_in_focus: Float32[np.ndarray, "height width 3"]
@@ -43,7 +44,7 @@ class StackRows:
 
 @dataclass(frozen=True)
 class SliceRows:
-    """target: (H, W, 3) linear Rec.709."""
+    """Rows of one slice. target: (H, W, 3) linear Rec.709."""
 
     shared: StackRows
     target: Float32[np.ndarray, "height width 3"]
@@ -52,12 +53,15 @@ class SliceRows:
 
 
 def slice_size_px(stack: FocalStack, index: int) -> tuple[int, int]:
-    """(height, width), from the header of its file."""
+    """Return (height, width), from the header of its file."""
     return exr_size_px(stack.folder / stack.slices[index].path)
 
 
 def read_stack_rows(stack: FocalStack, rows: slice) -> StackRows:
-    """rows: a plain slice within the picture. Raises InputError where the stack is not merged and metric, or a file cannot be read."""
+    """Read rows of a stack, a plain slice within the picture.
+
+    Raises InputError if the stack is not merged and metric, or a file cannot be read.
+    """
     if not (stack.merged and stack.is_metric):
         raise InputError(f"{stack.folder} has no all-in-focus picture with depth in metres: run `mrbokeh capture merge` on it")
     depth = read_rows(stack.depth_path, rows, ("Z", "confidence"))
@@ -68,7 +72,7 @@ def read_stack_rows(stack: FocalStack, rows: slice) -> StackRows:
 
 
 def read_slice_rows(stack: FocalStack, index: int, rows: slice, shared: StackRows | None = None) -> SliceRows:
-    """shared: these rows of the stack, where they have been read; raises as `read_stack_rows` does."""
+    """Read rows of a slice. shared: these rows of the stack, if already read; raises as `read_stack_rows` does."""
     shared = read_stack_rows(stack, rows) if shared is None else shared
     photograph = read_rows(stack.folder / stack.slices[index].path, rows, "RGB", (SATURATED, VALID))
     saturated, valid = photograph.pop(SATURATED, None), photograph.pop(VALID, None)
@@ -94,10 +98,12 @@ def _stacked(channels: dict[str, Float32[np.ndarray, "height width"]]) -> Float3
 
 @dataclass(frozen=True)
 class Counting:
-    """least_confidence: pixels with less trustworthy depth do not count, nor those of the mask low_confidence; 0 counts all.
+    """Rules that decide which pixels count.
+
+    least_confidence: pixels with less trustworthy depth do not count, nor those of the mask low_confidence; 0 counts all.
     saturation: pixels of a slice at or above this radiance do not count; None sets no such limit.
-    saturated: whether pixels count in whose slice the sensor was full.
-    one_sided: they count, but only where the result is darker than the slice, which is what a full photosite tells.
+    saturated: whether pixels count where the sensor was saturated.
+    one_sided: they count, but only if the result is darker than the slice, since a full photosite states a lower bound.
     """
 
     least_confidence: float = 0.1
@@ -110,7 +116,7 @@ WHERE_TRUTH_IS_KNOWN = Counting(least_confidence=0.0, saturated=True)
 
 
 def counting_of(settings: TrainSettings) -> Counting:
-    """What counts in a training run."""
+    """Return the rules of a training run."""
     return Counting(
         settings.least_confidence,
         settings.saturation,
@@ -120,7 +126,7 @@ def counting_of(settings: TrainSettings) -> Counting:
 
 
 def pixel_weight(read: SliceRows, counting: Counting) -> Float32[np.ndarray, "height width"]:
-    """(H, W): 1 where the pixel counts, else 0."""
+    """Return (H, W): 1 where the pixel counts, else 0."""
     exclusions = read.shared.exclusions
     counted = (read.shared.confidence >= counting.least_confidence) & read.valid
     for reason in REASONS:
@@ -135,13 +141,13 @@ def pixel_weight(read: SliceRows, counting: Counting) -> Float32[np.ndarray, "he
 
 @dataclass(frozen=True)
 class Pair:
-    """One slice, or a part of it, and what it was made of.
+    """One slice, or a part of it, and its inputs.
 
     all_in_focus, target: (H, W, 3) linear radiance. coc_px: (H, W) signed diameters.
     weight: (H, W), 1 where the pixel counts, 0 where its depth or its radiance is not known or something moved.
-    f_number, focal_length_mm: of the lens. coc_px_per_dioptre: how fast blur grows; focus_dioptres: what is in focus on the axis.
+    f_number, focal_length_mm: of the lens. coc_px_per_dioptre: growth of the blur; focus_dioptres: the focus on the axis.
     origin_px: (top, left) in the whole frame, of frame_px (height, width).
-    saturated: (H, W) where the target is only known to be at least so bright; None where no pixel is looked at so.
+    saturated: (H, W) where the target is only a lower bound; None if no pixel is treated so.
     """
 
     all_in_focus: Float32[np.ndarray, "height width 3"]
@@ -163,16 +169,16 @@ class Pair:
 
     @property
     def place(self) -> Float32[np.ndarray, "height width 2"]:
-        """Field positions: of every pixel's centre, right and down from the middle of the frame, in half diagonals."""
+        """Return the field positions of all pixel centres, right and down from the middle of the frame, in half diagonals."""
         return field_positions((self.coc_px.shape[0], self.coc_px.shape[1]), self.frame_px, self.origin_px)
 
     @property
     def dioptres(self) -> Float32[np.ndarray, "height width"]:
-        """(H, W) 1 / depth; where the focus is tilted or curved, relative to a flat one."""
+        """Return (H, W) 1 / depth; for a tilted or curved focus, relative to a flat one."""
         return (self.focus_dioptres - self.coc_px / self.coc_px_per_dioptre).astype(np.float32)
 
     def cut(self, rows: slice, columns: slice) -> "Pair":
-        """A part, which is a view. rows, columns: plain slices within this pair."""
+        """Return a part, which is a view. rows, columns: plain slices within this pair."""
         saturated = None if self.saturated is None else self.saturated[rows, columns]
         return replace(
             self,
@@ -185,14 +191,14 @@ class Pair:
         )
 
     def weighted(self, factor: Float32[np.ndarray, "height width"]) -> "Pair":
-        """Pixels count by so much more or less."""
+        """Return the pair with the weights of its pixels multiplied."""
         return replace(self, weight=self.weight * factor)
 
 
 def read_pair(
     stack: FocalStack, index: int, counting: Counting | None = None, rows: slice | None = None, shared: StackRows | None = None
 ) -> Pair:
-    """rows: only these of the picture are read; None: all of them. shared: what the stack has in these rows, else it is read too."""
+    """Read a pair. rows: only these of the picture; None: all of them. shared: the stack's data of these rows, if already read."""
     counting, frame_px = counting or Counting(), slice_size_px(stack, index)
     read = read_slice_rows(stack, index, rows or slice(0, frame_px[0]), shared)
     lens = stack.lens_of(index)
@@ -212,7 +218,7 @@ def read_pair(
 
 
 def _coc_px(stack: FocalStack, index: int, read: StackRows, frame_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
-    """`FocalStack.coc_px` wants the whole picture where the focus is tilted or curved, for it then depends on the place."""
+    """Return the circles of confusion of some rows; `FocalStack.coc_px` needs the whole picture for a tilted or curved focus."""
     lens = stack.lens_of(index)
     if lens.has_flat_focus or read.depth_m.shape == frame_px:
         return stack.coc_px(index, read.depth_m)

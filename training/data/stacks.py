@@ -1,4 +1,4 @@
-"""Focal stacks to train on or to test on: their names, whether they can be used, and which of them, or of their slices, are held out."""
+"""Focal stacks to train or test on: their names, whether they are usable, and which of them, or of their slices, are held out."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ ChosenSlices = Mapping[str, Sequence[int]]
 
 @dataclass(frozen=True)
 class Split:
-    """train, test: whole stacks. held_out_slices: of the only stack, which then is in both."""
+    """A split into training and test. train, test: whole stacks. held_out_slices: of the only stack, which then is in both."""
 
     train: tuple[FocalStack, ...]
     test: tuple[FocalStack, ...]
@@ -32,7 +32,7 @@ class Split:
         return {stack_name(self.train[0]): chosen} if self.held_out_slices else {}
 
     def words(self) -> str:
-        """What is trained on and what is kept apart, for people."""
+        """Describe for people what is trained on and what is held out."""
         kept = ", ".join(str(index) for index in self.held_out_slices)
         if kept:
             trained = len(self.train[0]) - len(self.held_out_slices)
@@ -48,7 +48,7 @@ class Split:
 
 @dataclass(frozen=True)
 class Seen:
-    """What a network was trained on: names of stacks, all slices of them but held_out_slices where there is only one."""
+    """The training data of a network: names of stacks, all slices of them but held_out_slices if there is only one."""
 
     stacks: tuple[str, ...]
     held_out_slices: tuple[int, ...] = ()
@@ -60,13 +60,13 @@ class Seen:
 
 
 def stack_name(stack: FocalStack) -> str:
-    """scene/stack: how a run remembers what it was trained on."""
+    """Return scene/stack, the name under which a run remembers its training data."""
     folder = stack.folder.resolve()
     return f"{folder.parent.name}/{folder.name}"
 
 
 def require_usable(stack: FocalStack) -> None:
-    """Registered, merged and metric, or InputError."""
+    """Raise InputError unless the stack is registered, merged and metric."""
     if not (stack.merged and stack.registered):
         raise InputError(f"{stack.folder} is not registered and merged yet: run `mrbokeh capture merge` on it")
     if not stack.is_metric:
@@ -78,7 +78,7 @@ def require_usable(stack: FocalStack) -> None:
 
 
 def named(stacks: Sequence[FocalStack], held_out: Sequence[str]) -> list[str]:
-    """Full names of the stacks that are held out by name (their folder, or scene/folder). Raises InputError for a name nobody has."""
+    """Return the full names of stacks held out by name (their folder, or scene/folder). Raises InputError for an unknown name."""
     known = [stack_name(stack) for stack in stacks]
     unknown = [name for name in held_out if not any(_is_called(each, name) for each in known)]
     if unknown:
@@ -87,13 +87,13 @@ def named(stacks: Sequence[FocalStack], held_out: Sequence[str]) -> list[str]:
 
 
 def drawn(stacks: Sequence[FocalStack], test_fraction: float, seed: int) -> list[str]:
-    """Full names of the stacks that are held out by lot: at least one where there are two, unless the fraction is 0."""
+    """Draw the full names of the stacks to hold out: at least one of two or more, unless the fraction is 0."""
     count = max(1, round(test_fraction * len(stacks))) if test_fraction > 0 and len(stacks) > 1 else 0
     return list(np.random.default_rng(seed).permutation(sorted(stack_name(stack) for stack in stacks))[:count])
 
 
 def split_stacks(stacks: Sequence[FocalStack], apart: Sequence[str]) -> tuple[list[FocalStack], list[FocalStack]]:
-    """(to train on, held out), whole stacks. apart: full names. Raises InputError where none is left to train on."""
+    """Return (to train on, held out), whole stacks. apart: full names. Raises InputError if none is left to train on."""
     by_name = {stack_name(stack): stack for stack in stacks}
     train = [stack for name, stack in by_name.items() if name not in apart]
     if not train:

@@ -1,6 +1,6 @@
-"""What a network must know of its data before it is built: from the pictures of scenes, or from the manifest of a data set.
+"""Sources of training data, scene folders or a data set with a manifest, and the facts that a network needs before it is built.
 
-Where the stacks come from: scene folders, or a data set whose manifest knows its split, its radiance scale and its largest blur.
+A manifest knows the split, the radiance scale and the largest blur; for scene folders the pictures are read.
 """
 
 from collections.abc import Sequence
@@ -22,7 +22,9 @@ _SAME = 1e-3
 
 @dataclass(frozen=True)
 class DataFacts:
-    """lens: focused where the first slice was; only its focus may change later, or of several lenses the one in the middle of all slices.
+    """Facts of the data.
+
+    lens: focused as for the first slice; only its focus may change later; among several lenses the middle one of all slices.
     largest_coc_px: the largest diameter among pixels that count. radiance_scale: the radiance at the top of the network's range.
     f_numbers, focal_lengths_mm: (lowest, highest) over all slices.
     """
@@ -37,9 +39,9 @@ class DataFacts:
 
 
 def gather_facts(pairs: PairSet, several_lenses: bool = False) -> DataFacts:
-    """One pass over all pairs, whose largest radiance is the scale; raises InputError where they are not of one lens and one size.
+    """Gather the facts in one pass over all pairs, whose largest radiance is the scale. Raises InputError for several lenses or sizes.
 
-    several_lenses: for a network that is told which, f-number and focal length may differ.
+    several_lenses: f-number and focal length may differ, for a network that takes them as inputs.
     """
     lens, size = lens_of_stacks(pairs.stacks, several_lenses), pairs.size_px(0)
     for index, (stack, _) in enumerate(pairs.keys):
@@ -53,7 +55,7 @@ def gather_facts(pairs: PairSet, several_lenses: bool = False) -> DataFacts:
 
 
 def manifest_facts(dataset: FocalStackDataset, stacks: Sequence[FocalStack], several_lenses: bool = False) -> DataFacts:
-    """No picture is opened; raises as `gather_facts` does. stacks: those to train on."""
+    """Return the facts without opening a picture; raises as `gather_facts` does. stacks: those to train on."""
     size = (dataset.stacks[0].height_px, dataset.stacks[0].width_px)
     for record in dataset.stacks:
         _require_same_size(record.name, size, (record.height_px, record.width_px))
@@ -62,16 +64,16 @@ def manifest_facts(dataset: FocalStackDataset, stacks: Sequence[FocalStack], sev
 
 
 def lens_ranges(stacks: Sequence[FocalStack]) -> tuple[tuple[float, float], tuple[float, float]]:
-    """(lowest, highest) f-number and focal length in mm of all slices; f-numbers as measured where blur was calibrated."""
+    """Return (lowest, highest) f-number and focal length in mm of all slices; f-numbers as measured if blur was calibrated."""
     lenses = [stack.lens_of(index) for stack in stacks for index in range(len(stack))]
     f_numbers, focal_lengths_mm = [each.f_number for each in lenses], [each.focal_length_mm for each in lenses]
     return (min(f_numbers), max(f_numbers)), (min(focal_lengths_mm), max(focal_lengths_mm))
 
 
 def lens_of_stacks(stacks: Sequence[FocalStack], several_lenses: bool = False) -> Lens:
-    """`common_lens`, or for several: the one in the middle of all slices, ordered by focal length and f-number.
+    """Return `common_lens`, or for several lenses the middle one of all slices, ordered by focal length and f-number.
 
-    Raises InputError where sensors differ, for f-number and focal length do not tell how many pixels a millimetre has.
+    Raises InputError if sensors differ, since f-number and focal length do not tell how many pixels a millimetre has.
     """
     if not several_lenses:
         return common_lens(stacks)
@@ -87,9 +89,9 @@ def lens_of_stacks(stacks: Sequence[FocalStack], several_lenses: bool = False) -
 
 
 def common_lens(stacks: Sequence[FocalStack]) -> Lens:
-    """The lens of all slices; its f-number is the median, since where blur was calibrated each slice has a measured one of its own.
+    """Return the lens of all slices, with the median f-number, since calibrated slices each have a measured one.
 
-    Raises InputError where stacks state different lenses.
+    Raises InputError if stacks state different lenses.
     """
     expected = _stated(stacks[0])
     for stack in stacks:
@@ -118,13 +120,13 @@ def _require_same_size(name: str, size: tuple[int, ...], other_size: tuple[int, 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """All stacks, whichever part they belong to; dataset: the manifest that they came with, in its order, or None."""
+    """All stacks, training and test; dataset: the manifest that they came with, in its order, or None."""
 
     stacks: tuple[FocalStack, ...]
     dataset: FocalStackDataset | None = None
 
     def split(self, held_out: Sequence[str], test_fraction: float, seed: int) -> Split:
-        """Whole stacks: held out are those named; without names those of the manifest; without one a fraction.
+        """Split whole stacks: hold out those named; without names those of the manifest; without one a fraction.
 
         Of a single stack slices are held out, those of the manifest or `slices_to_hold_out`, unless the fraction is 0.
         """
@@ -144,14 +146,14 @@ class TrainingData:
         return slices_to_hold_out(self.stacks[0]) if test_fraction > 0.0 else ()
 
     def facts(self, pairs: PairSet, several_lenses: bool = False) -> DataFacts:
-        """Read facts from the manifest, or by a look at every pair to train on. several_lenses: f-number and focal length may differ."""
+        """Read facts from the manifest, or from every pair to train on. several_lenses: f-number and focal length may differ."""
         if self.dataset is None:
             return gather_facts(pairs, several_lenses)
         return manifest_facts(self.dataset, pairs.stacks, several_lenses)
 
 
 def training_data(folders: Sequence[Path]) -> TrainingData:
-    """The stacks of a data set, or of scene folders. Raises InputError where they cannot be used or are a mixture of both."""
+    """Return the stacks of a data set, or of scene folders. Raises InputError if they cannot be used or are a mixture of both."""
     datasets = [folder for folder in folders if (folder / FILE_NAME).is_file()]
     if datasets and len(folders) > 1:
         raise InputError(
@@ -181,7 +183,7 @@ def _of_dataset(dataset: FocalStackDataset) -> TrainingData:
 
 
 def _require_no_manifest(stack: FocalStack) -> None:
-    """A part of a data set, given as a scene, would be split anew, and what is held out trained on."""
+    """Refuse a part of a data set given as a scene: it would be split anew, and held-out stacks trained on."""
     dataset = stack.folder.resolve().parent.parent
     if (dataset / FILE_NAME).is_file():
         raise InputError(f"{stack.folder} belongs to the data set {dataset}: give {dataset} itself, so that its split holds")

@@ -1,1 +1,1 @@
-"""Networks and classical renderers against photographs that none of them has seen."""
+"""Evaluation of networks and classical renderers on photographs that none of them has seen."""

@@ -1,12 +1,11 @@
-"""Every method on every unseen slice: scores, costs, a focus pull, tables and sheets of pictures.
+"""Comparison of every method on every unseen slice: scores, costs, a focus pull, tables and sheets of pictures.
 
-What a picture costs: time, and memory beyond what the process held before.
+Costs are time, and memory beyond what the process held before.
 
-Does a result stay calm while the focus moves? Second differences in time along a pull against those of the truth.
-
-Where a stack is a fine pull itself, its slices are the truth. Of others, frames are made between the focus distances of two
-neighbouring slices and compared with the polygon renderer, the fast twin of the scatter reference (its own flicker there is that of the
-reference to 3 %: 2.7e-4, rms of the second difference over 4, on the desk of the demo).
+A focus pull measures flicker: second differences in time along the pull against those of the truth. If a stack is a fine pull itself,
+its slices are the truth. Otherwise frames are made between the focus distances of two neighbouring slices and compared with the
+polygon renderer, the fast twin of the scatter reference (its own flicker there is that of the reference to 3 %: 2.7e-4, rms of the
+second difference over 4, on the desk of the demo).
 """
 
 import ctypes
@@ -44,16 +43,16 @@ Image = Float32[np.ndarray, "height width 3"]
 
 
 def timed(work: Callable[[], Result]) -> tuple[Result, float]:
-    """(the result, seconds)."""
+    """Return (the result, seconds)."""
     started_s = time.perf_counter()
     result = work()
     return result, time.perf_counter() - started_s
 
 
 def peak_memory_mib(work: Callable[[], object]) -> float:
-    """How far the memory of the process rises while `work` runs; nan where the system (other than Linux) does not tell.
+    """Return the rise of the process's memory while `work` runs; nan on systems other than Linux.
 
-    What is loaded before, such as the weights of a network, does not count; freed memory is given back to the system first.
+    Memory used before, such as the weights of a network, does not count; freed memory is given back to the system first.
     """
     _give_back()
     try:
@@ -80,24 +79,24 @@ def _status_kib(name: str) -> int:
 
 @dataclass(frozen=True)
 class FocusPull:
-    """frames: the focus moving on by even steps. truth: (H, W, 3) of each, masked as `shown` does; against: what it is, in words."""
+    """A focus pull. frames: the focus moving by even steps. truth: (H, W, 3) of each, masked as by `shown`; against: its name, in words."""
 
     frames: tuple[UnseenSlice, ...]
     truth: tuple[Image, ...]
     against: str
 
     def flicker_of(self, method: Method) -> float:
-        """Radiance, 0 for a result that is as calm as the truth (mrbokeh.images.image_metrics.flicker)."""
+        """Return the flicker in radiance, 0 for a result as calm as the truth (mrbokeh.images.image_metrics.flicker)."""
         return flicker([shown(method.blur(frame), frame) for frame in self.frames], self.truth)
 
 
 def shown(picture: Image, frame: UnseenSlice) -> Image:
-    """Pixels that do not count are black, in the results as in the truth."""
+    """Blacken pixels that do not count, in the results as in the truth."""
     return picture * frame.pair.weight[..., None]
 
 
 def focus_pull(stack: FocalStack, frames: int = FRAMES) -> FocusPull:
-    """The stack itself where it is fine, else `frames` between the two slices in its middle."""
+    """Return the stack itself if it is fine, else `frames` between the two slices in its middle."""
     pairs = PairSet([stack], WHERE_TRUTH_IS_KNOWN, cache_mib=0)
     order = sorted(range(len(stack)), key=lambda index: 1.0 / (stack.slices[index].focus_distance_m or np.inf))
     if is_fine(stack):
@@ -107,7 +106,7 @@ def focus_pull(stack: FocalStack, frames: int = FRAMES) -> FocusPull:
 
 
 def is_fine(stack: FocalStack) -> bool:
-    """Enough slices, and from one to the next the circles of confusion change by FINE_STEP_PX at most."""
+    """Tell whether a stack has enough slices and its circles of confusion change by at most FINE_STEP_PX between slices."""
     dioptres = np.sort([1.0 / (each.focus_distance_m or np.inf) for each in stack.slices])
     if len(dioptres) < LEAST_FRAMES:
         return False
@@ -116,7 +115,7 @@ def is_fine(stack: FocalStack) -> bool:
 
 
 def _made_pull(ends: Sequence[UnseenSlice], frames: int) -> FocusPull:
-    """Even steps in dioptres from the first slice's focus to the last's; the lens and the pixels that count are the first's."""
+    """Make even steps in dioptres from the first slice's focus to the last's; the lens and the mask are the first's."""
     dioptres = np.linspace(1.0 / ends[0].lens.focus_distance_m, 1.0 / ends[-1].lens.focus_distance_m, frames)
     moving = tuple(ends[0].focused_at(float(1.0 / each) if each > 0 else np.inf) for each in dioptres)
     reference = renderer_method(REFERENCE_RENDERER)
@@ -130,7 +129,7 @@ def flickers(methods: Sequence[Method], pull: FocusPull) -> dict[str, float]:
 
 @dataclass(frozen=True)
 class Extras:
-    """What is measured besides the scores. lpips: a distance, or None. pull_frames: of the focus pull, 0 for none."""
+    """Measurements besides the scores. lpips: a distance, or None. pull_frames: of the focus pull, 0 for none."""
 
     lpips: Perceptual | None = None
     pull_frames: int = FRAMES
@@ -139,7 +138,7 @@ class Extras:
 
 @dataclass(frozen=True)
 class Unseen:
-    """What no network was trained on: whole stacks, or, with slices, some slices held out of stacks that networks were trained on."""
+    """Data that no network was trained on: whole stacks, or, with slices, some slices held out of stacks that networks were trained on."""
 
     stacks: tuple[FocalStack, ...]
     slices: ChosenSlices = field(default_factory=dict)
@@ -153,9 +152,9 @@ class Unseen:
 
 
 def compare(methods: Sequence[Method], unseen: Unseen, out: Path, extras: Extras | None = None) -> Evaluation:
-    """All unseen slices by all methods; writes evaluation.md, .csv and .png and evaluation_crops.png into `out`.
+    """Evaluate all methods on all unseen slices; write evaluation.md, .csv and .png and evaluation_crops.png into `out`.
 
-    A focus pull goes over a whole stack, so there is none where slices of it were trained on.
+    A focus pull needs a whole stack, so there is none if slices of it were trained on.
     """
     extras = extras or Extras()
     sheets = Sheets(methods, len(unseen.pairs()))
@@ -171,7 +170,7 @@ def compare(methods: Sequence[Method], unseen: Unseen, out: Path, extras: Extras
 
 
 def scored(methods: Sequence[Method], unseen: Unseen, extras: Extras, sheets: Sheets | None = None) -> Evaluation:
-    """The scores alone. Time and memory are those of methods that have run before: the first picture of each is made twice."""
+    """Return the scores alone. Time and memory are those of methods that have run before: the first picture of each is made twice."""
     pairs = unseen.pairs()
     scores: list[Score] = []
     memory = {}
@@ -195,9 +194,9 @@ def scored(methods: Sequence[Method], unseen: Unseen, extras: Extras, sheets: Sh
 
 
 def unseen_of(stacks: Sequence[FocalStack], seen: Sequence[Seen]) -> Unseen:
-    """The stacks that no network was trained on; where there are none, the slices that all of them held out.
+    """Return the stacks that no network was trained on; without any, the slices that all networks held out.
 
-    Raises InputError where nothing is left.
+    Raises InputError if nothing is left.
     """
     slices = {stack_name(stack): sorted(set.intersection(*(each.unseen_slices(stack) for each in seen))) for stack in stacks}
     whole = tuple(stack for stack in stacks if len(slices[stack_name(stack)]) == len(stack))
@@ -213,6 +212,6 @@ def unseen_of(stacks: Sequence[FocalStack], seen: Sequence[Seen]) -> Unseen:
 
 
 def _warmed_up(method: Method, seen: UnseenSlice, memory: bool) -> float:
-    """Compiles what a first picture compiles, then the memory of a second one."""
+    """Run a first picture, which compiles, and return the memory of a second one."""
     method.blur(seen)
     return peak_memory_mib(partial(method.blur, seen)) if memory else float("nan")

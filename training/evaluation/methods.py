@@ -1,8 +1,7 @@
-"""What is compared: networks, Gaussians of the right size, the sharp picture, and the renderers of this project with the slice's lens.
+"""The methods compared: networks, Gaussians of the right size, the sharp picture, and this project's renderers with the slice's lens.
 
-What a network must beat: a Gaussian of the right size; and light that is thrown without asking what hides it.
-
-A trained network, as a run or as ONNX, as a plain function of a pair.
+A network must beat a Gaussian of the right size, and light that is scattered without regard to occlusion. A trained network, as a run
+or as ONNX, becomes a plain function of a pair.
 """
 
 from collections.abc import Callable, Sequence
@@ -36,9 +35,9 @@ RENDERERS = ("polygon", "low-rank", "laplacian", "scatter")
 
 
 def sigma_per_coc(aperture: Aperture) -> float:
-    """Standard deviation per axis of the aperture's blur over its circle of confusion: 1/4 for a disc, whose second moment it has.
+    """Return the standard deviation per axis of the aperture's blur over its circle of confusion: 1/4 for a disc, by its second moment.
 
-    Measured on the aperture itself, so that a hexagon is given the somewhat narrower Gaussian that fits it.
+    Measured on the aperture itself, so that a hexagon gets the somewhat narrower Gaussian that fits it.
     """
     diameter_px = 41.0
     kernel = aperture.rasterize(diameter_px).kernel
@@ -51,7 +50,7 @@ def sigma_per_coc(aperture: Aperture) -> float:
 def gaussian_scatter(
     rgb: Float32[np.ndarray, "height width 3"], coc_px: Float32[np.ndarray, "height width"], sigma_over_coc: float = 0.25
 ) -> Float32[np.ndarray, "height width 3"]:
-    """Every pixel spreads its light as a Gaussian of its own size; the sum is divided by the weight that arrived."""
+    """Spread the light of every pixel as a Gaussian of its own size, and divide by the weight that arrived."""
     light = np.dstack([rgb, np.ones(coc_px.shape, np.float32)])
     levels, shares = _levels(np.abs(coc_px) * sigma_over_coc)
     spread = np.zeros_like(light)
@@ -64,7 +63,7 @@ def gaussian_scatter(
 def gaussian_gather(
     rgb: Float32[np.ndarray, "height width 3"], coc_px: Float32[np.ndarray, "height width"], sigma_over_coc: float = 0.25
 ) -> Float32[np.ndarray, "height width 3"]:
-    """Every pixel is the mean of its surroundings under a Gaussian of its own size."""
+    """Average the surroundings of every pixel under a Gaussian of its own size."""
     levels, shares = _levels(np.abs(coc_px) * sigma_over_coc)
     gathered = np.zeros_like(rgb)
     for sigma, share in zip(levels, shares, strict=True):
@@ -74,7 +73,7 @@ def gaussian_gather(
 
 
 def _levels(sigma_px: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Standard deviations in steps, and how much of each pixel belongs to each (linear between two neighbours)."""
+    """Return standard deviations in steps, and the share of each pixel in each (linear between two neighbours)."""
     position = sigma_px / SIGMA_STEP_PX
     count = int(np.ceil(position.max(initial=0.0))) + 1
     shares = [np.clip(1.0 - np.abs(position - level), 0.0, 1.0).astype(np.float32) for level in range(count)]
@@ -92,9 +91,9 @@ def scatter_reference(
     coc_px: Float32[np.ndarray, "height width"],
     aperture: Aperture,
 ) -> Float32[np.ndarray, "height width 3"]:
-    """The reference renderer with the aperture of the lens, as one opaque layer, at exactly these circles of confusion.
+    """Run the reference renderer with the aperture of the lens, as one opaque layer, at exactly these circles of confusion.
 
-    The picture is continued beyond its border, from where light enters it.
+    The picture is extended beyond its border, from where light enters it.
     """
     from mrbokeh.images.layer import opaque
     from mrbokeh.renderers.scatter_reference import blur_layer
@@ -108,7 +107,7 @@ def scatter_reference(
 
 
 def blur_of(network: Path, device: str = "cpu") -> tuple[Blur, Seen]:
-    """(the function, what it was trained on) of a run folder or an .onnx file. device: of a run, cpu or cuda."""
+    """Return (the function, the training data) of a run folder or an .onnx file. device: of a run, cpu or cuda."""
     if network.suffix.lower() == ".onnx":
         exported = OnnxNetwork(network)
 
@@ -129,7 +128,7 @@ def blur_of(network: Path, device: str = "cpu") -> tuple[Blur, Seen]:
 
 @dataclass(frozen=True)
 class Method:
-    """One way from an all-in-focus picture to a blurred one."""
+    """A way from an all-in-focus picture to a blurred one."""
 
     name: str
     blur: Callable[[UnseenSlice], Image]
@@ -141,14 +140,14 @@ def network_method(name: str, blur: Blur) -> Method:
 
 
 def network_methods(networks: Sequence[Path], device: str = "cpu") -> tuple[list[Method], list[Seen]]:
-    """(methods, what each was trained on) of run folders and .onnx files."""
+    """Return (methods, training data of each) of run folders and .onnx files."""
     found = [blur_of(path, device) for path in networks]
     methods = [network_method(name, blur) for name, (blur, _) in zip(network_names(networks), found, strict=True)]
     return methods, [seen for _, seen in found]
 
 
 def network_names(networks: Sequence[Path]) -> list[str]:
-    """One network is "network"; more have the names of their files, with their folders where these are alike."""
+    """Name networks: a single one "network", several by their files, with their folders if these are alike."""
     if len(networks) == 1:
         return [NETWORK]
     names = [each.stem if each.suffix.lower() == ".onnx" else each.resolve().name for each in networks]
@@ -164,7 +163,7 @@ def plain_methods() -> list[Method]:
 
 
 def nearest_method() -> Method:
-    """Return, for slices held out of one stack, the photograph of the nearest focus that was trained on, as it is."""
+    """Return, for slices held out of one stack, the photograph of the nearest focus that was trained on, unchanged."""
 
     def nearest(seen: UnseenSlice) -> Image:
         assert seen.nearest is not None, "only slices held out of a stack have a nearest one"
@@ -174,7 +173,7 @@ def nearest_method() -> Method:
 
 
 def renderer_methods(names: Sequence[str]) -> list[Method]:
-    """The renderers of those names, with the lens of the slice and its depth; raises InputError for other names."""
+    """Return the renderers of those names, with the lens of the slice and its depth; raises InputError for other names."""
     unknown = [name for name in names if name not in BY_NAME]
     if unknown:
         raise InputError(f"expected renderers among {', '.join(BY_NAME)}, got {', '.join(unknown)}: networks go before --data")
@@ -186,7 +185,7 @@ def renderer_method(name: str) -> Method:
 
 
 def bank_methods(names: Sequence[str], bank: Path) -> list[Method]:
-    """Return those of the renderers that can take a bank of kernels, with it; "polygon, measured" and so on."""
+    """Return those renderers that can take a bank of kernels, with it; "polygon, measured" and so on."""
     return [_renderer_method(f"{name}, measured", chosen_renderer(name, bank)) for name in names if name in WITH_BANKS]
 
 

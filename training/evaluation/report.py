@@ -1,6 +1,6 @@
-"""An evaluation as a Markdown table and as CSV.
+"""Reports of an evaluation: a Markdown table, CSV, and sheets of pictures.
 
-Sheets of pictures of an evaluation: whole slices, and crops where the network is worst and where the lights are.
+The sheets show whole slices, and crops where the network is worst and where the highlights are.
 """
 
 import csv
@@ -17,7 +17,7 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.system.atomic_files import atomic_path
 from training.evaluation.methods import NO_BLUR, Method
 from training.evaluation.scores import NOT_MEASURED, Evaluation, Score
-from training.evaluation.unseen_slice import UnseenSlice, light_discs
+from training.evaluation.unseen_slice import UnseenSlice, highlight_discs
 
 HEADINGS = ("method", "PSNR dB", "SSIM", "edge PSNR dB", "energy", "leak", "lights", "LPIPS", "flicker", "ms", "MiB")
 _LEGEND = (
@@ -33,7 +33,7 @@ Image = Float32[np.ndarray, "height width 3"]
 
 
 def table_rows(result: Evaluation) -> list[tuple[str, ...]]:
-    """One row of text per method under HEADINGS, best PSNR first."""
+    """Return one row of text per method under HEADINGS, best PSNR first."""
     return [_row(result, name) for name in sorted(result.methods, key=lambda name: result.mean(name, "psnr_db"), reverse=True)]
 
 
@@ -50,7 +50,7 @@ def number(value: float, digits: int) -> str:
 
 
 def gain_lines(result: Evaluation) -> list[str]:
-    """How far each network is above the sharp picture and above the better Gaussian, one sentence each."""
+    """Return how far each network is above the sharp picture and above the better Gaussian, one sentence each."""
     if NO_BLUR not in result.methods or not result.rivals:
         return []
     return [
@@ -61,7 +61,7 @@ def gain_lines(result: Evaluation) -> list[str]:
 
 
 def write_table(path: Path, result: Evaluation, against: str, what: str) -> None:
-    """against: what the focus pull was compared with, "" where there was none. what: the slices are."""
+    """Write the Markdown table. against: the truth of the focus pull, "" without one. what: names the slices."""
     lines = [
         f"Mean over {result.slices} {what}. {_LEGEND}",
         "",
@@ -80,7 +80,7 @@ def markdown_table(headings: Sequence[str], rows: Sequence[Sequence[str]]) -> li
 
 
 def write_numbers(path: Path, scores: Sequence[Score]) -> None:
-    """One line per method and slice."""
+    """Write the CSV: one line per method and slice."""
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         rows: Any = csv.DictWriter(file, [each.name for each in fields(Score)])
         rows.writeheader()
@@ -88,7 +88,7 @@ def write_numbers(path: Path, scores: Sequence[Score]) -> None:
 
 
 class Sheets:
-    """Rows of at most MOST_ROWS slices, spread over all, and their crops; filled slice by slice, so that few pictures are kept."""
+    """Sheets with rows of at most MOST_ROWS slices, spread over all, and their crops; filled slice by slice to keep few pictures."""
 
     def __init__(self, methods: Sequence[Method], slices: int) -> None:
         self._kinds = {each.name: each.kind for each in methods}
@@ -101,18 +101,18 @@ class Sheets:
             return
         shown = self._shown(seen, results)
         self._rows.append(SheetRow(seen.label, shown))
-        for what, window in telling_windows(seen, next(iter(results.values()))).items():
+        for what, window in informative_crops(seen, next(iter(results.values()))).items():
             self._crops.append(
                 SheetRow(f"{seen.label}, {what}", {caption: enlarged(picture[window]) for caption, picture in shown.items()})
             )
 
     def write(self, out: Path) -> None:
-        """evaluation.png and evaluation_crops.png."""
+        """Write evaluation.png and evaluation_crops.png."""
         write_contact_sheet(out / "evaluation.png", self._rows)
         write_contact_sheet(out / "evaluation_crops.png", self._crops)
 
     def _shown(self, seen: UnseenSlice, results: Mapping[str, Image]) -> dict[str, Image]:
-        """Input, truth, the networks, the best of every other kind, and what the first network has wrong."""
+        """Return input, truth, the networks, the best of every other kind, and the first network's errors."""
         shown = {"input": seen.pair.all_in_focus, "truth": seen.pair.target}
         networks = [name for name in results if self._kinds[name] == "network"]
         rivals = [self._best(seen, results, kind) for kind in ("Gaussian", "renderer")]
@@ -127,16 +127,16 @@ class Sheets:
         return max(names, key=lambda name: psnr(results[name], seen.pair.target, mask=seen.counted), default=None)
 
 
-def telling_windows(seen: UnseenSlice, result: Image) -> dict[str, tuple[slice, slice]]:
-    """Squares around the largest error of a result and, where there are any, around the brightest disc of a light."""
+def informative_crops(seen: UnseenSlice, result: Image) -> dict[str, tuple[slice, slice]]:
+    """Return squares around the largest error of a result and, if there are any, around the brightest disc of a highlight."""
     error = (np.abs(np.clip(result, 0, 1) - np.clip(seen.pair.target, 0, 1)).sum(axis=2)) * seen.pair.weight
     windows = {"largest error": _window(error)}
-    discs = light_discs(seen)
+    discs = highlight_discs(seen)
     return windows | ({"lights": _window(seen.pair.target.sum(axis=2) * discs)} if discs.any() else {})
 
 
 def _window(interest: Float32[np.ndarray, "height width"]) -> tuple[slice, slice]:
-    """The square whose neighbourhood has most of it."""
+    """Return the square with the largest sum of interest around it."""
     from scipy.ndimage import uniform_filter
 
     side = min(CROP_PX, *interest.shape)
@@ -146,7 +146,7 @@ def _window(interest: Float32[np.ndarray, "height width"]) -> tuple[slice, slice
 
 
 def enlarged(crop: Image) -> Float32[np.ndarray, "enlarged_height enlarged_width 3"]:
-    """Whole pixels, so that one sees them."""
+    """Enlarge by whole pixels, so that they can be seen."""
     times = max(1, round(CELL_PX / crop.shape[1]))
     return crop.repeat(times, axis=0).repeat(times, axis=1)
 

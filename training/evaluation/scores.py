@@ -1,10 +1,8 @@
-"""How well one method did on one slice, in numbers.
+"""Scores of one method on one slice, and LPIPS (Zhang et al. 2018) with weights that the user has.
 
-LPIPS (Zhang et al. 2018) with weights that the user has.
-
-None are shipped: its networks were trained on ImageNet photographs and its weights come under terms of their own; and it was made
-for small 8-bit pictures, so that blurred lights above white are invisible to it. With the package `lpips` installed elsewhere, a file is
-made by torch.onnx.export(lpips.LPIPS(net="alex"), (a, b), "lpips.onnx") with free height and width.
+No weights are shipped: LPIPS's networks were trained on ImageNet photographs and its weights come under terms of their own; and it was
+made for small 8-bit pictures, so that it cannot see blurred highlights above white. With the package `lpips` installed elsewhere, a
+file is made by torch.onnx.export(lpips.LPIPS(net="alex"), (a, b), "lpips.onnx") with free height and width.
 """
 
 from collections.abc import Callable, Sequence
@@ -18,7 +16,7 @@ from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.images.image_metrics import energy_ratio, leak, light_error, psnr, ssim
 from mrbokeh.renderers.onnx_sessions import open_session
 from mrbokeh.system.errors import InputError
-from training.evaluation.unseen_slice import UnseenSlice, edge_band, light_discs, sharp_side
+from training.evaluation.unseen_slice import UnseenSlice, edge_band, highlight_discs, sharp_side
 
 Image = Float32[np.ndarray, "height width 3"]
 Perceptual = Callable[[Image, Image], float]
@@ -27,12 +25,12 @@ NOT_MEASURED = "LPIPS is not measured: no weights are shipped (see --lpips)."
 
 @dataclass(frozen=True)
 class Score:
-    """One method on one slice, over all pixels but those that moved, have no data or show a calibration board.
+    """Scores of one method on one slice, over all pixels but those that moved, have no data or show a calibration board.
 
     psnr_db, ssim: linear radiance clipped to [0, 1]. edge_psnr_db: near depth edges. energy_ratio: light of the result over that of
-    the truth, unclipped. leak: light that runs over the sharp side of depth edges, over the light of the truth there.
-    highlight_error: absolute error over light, unclipped, in the discs of lights; clipped lights score high here and nowhere else.
-    lpips: with weights that the user has. seconds: for the picture. nan where a slice has no such place or nothing was measured.
+    the truth, unclipped. leak: light that spills over the sharp side of depth edges, over the light of the truth there.
+    highlight_error: absolute error over light, unclipped, in the discs of highlights; clipped highlights score high here and nowhere else.
+    lpips: with weights that the user has. seconds: for the picture. nan if a slice has no such place or nothing was measured.
     """
 
     stack: str
@@ -52,11 +50,11 @@ MEASURES = tuple(each.name for each in fields(Score) if each.name not in ("stack
 
 
 class SliceScorer:
-    """Scores of any number of methods on one slice, whose telling pixels are found once. lpips: distance of two linear pictures."""
+    """A scorer of any number of methods on one slice, whose masks are computed once. lpips: distance of two linear pictures."""
 
     def __init__(self, seen: UnseenSlice, lpips: Perceptual | None = None) -> None:
         self._seen, self._lpips = seen, lpips
-        self._edges, self._sharp, self._discs = edge_band(seen), sharp_side(seen), light_discs(seen)
+        self._edges, self._sharp, self._discs = edge_band(seen), sharp_side(seen), highlight_discs(seen)
 
     def score(self, method: str, picture: Image, seconds: float = float("nan")) -> Score:
         seen, truth, counted = self._seen, self._seen.pair.target, self._seen.counted
@@ -81,8 +79,11 @@ class SliceScorer:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """scores: of every method on every slice. networks: which methods are networks; rivals: which are plain Gaussians.
-    flicker, peak_memory_mib: by method, where they were measured."""
+    """The scores of every method on every slice.
+
+    networks: names of methods that are networks; rivals: those that are plain Gaussians.
+    flicker, peak_memory_mib: by method, if they were measured.
+    """
 
     scores: tuple[Score, ...]
     networks: tuple[str, ...]
@@ -99,7 +100,7 @@ class Evaluation:
         return len({(each.stack, each.slice_index) for each in self.scores})
 
     def mean(self, method: str, measure: str) -> float:
-        """Over the slices that have the measure; nan where none has."""
+        """Average over the slices that have the measure; nan if none has."""
         return mean_known([getattr(each, measure) for each in self.scores if each.method == method])
 
     def gain_db(self, network: str, rival: str) -> float:
@@ -116,7 +117,7 @@ def mean_known(values: Sequence[float]) -> float:
 
 
 class OnnxPerceptualDistance:
-    """Distance of two linear pictures by a network (.onnx) that takes two (1, 3, H, W) sRGB pictures in [-1, 1] and gives one number."""
+    """The distance of two linear pictures by a network (.onnx) that maps two (1, 3, H, W) sRGB pictures in [-1, 1] to a number."""
 
     def __init__(self, path: Path) -> None:
         if not path.is_file() or path.suffix.lower() != ".onnx":
@@ -132,6 +133,6 @@ class OnnxPerceptualDistance:
 
 
 def encoded(rgb: Image) -> Float32[np.ndarray, "1 3 height width"]:
-    """sRGB of what a display shows, radiance clipped to [0, 1], mapped to [-1, 1]."""
+    """Encode as sRGB for display, radiance clipped to [0, 1], mapped to [-1, 1]."""
     display = 2.0 * linear_to_srgb(np.clip(rgb, 0.0, 1.0)) - 1.0
     return np.ascontiguousarray(display.transpose(2, 0, 1)[None]).astype(np.float32)

@@ -1,6 +1,6 @@
-"""One slice that no network was trained on: what is known of it, and itself as the truth.
+"""A slice that no network was trained on, with its data and itself as the truth, and masks of its informative pixels.
 
-Where in a slice the telling pixels lie: near depth edges, on their sharp side, in the discs of lights.
+The masks mark pixels near depth edges, on their sharp side, and in the discs of highlights.
 """
 
 from collections.abc import Sequence
@@ -29,9 +29,12 @@ Mask = Bool[np.ndarray, "height width"]
 
 @dataclass(frozen=True)
 class UnseenSlice:
-    """pair: what networks get, with the truth. lens: gives the pair's circles of confusion from depth_m, in metres.
-    saturated: where the photograph says only "at least that much". nearest: where it was held out of its stack, the slice of the
-    nearest focus that was not."""
+    """One unseen slice.
+
+    pair: the networks' input, with the truth. lens: gives the pair's circles of confusion from depth_m, in metres.
+    saturated: where the photograph is only a lower bound. nearest: the slice of the nearest focus that was trained on, if this one
+    was held out of its stack.
+    """
 
     stack: str
     index: int
@@ -47,18 +50,18 @@ class UnseenSlice:
 
     @property
     def counted(self) -> Bool[np.ndarray, "height width"]:
-        """Pixels whose truth is known."""
+        """Return the pixels whose truth is known."""
         return self.pair.weight > 0
 
     def focused_at(self, focus_distance_m: float) -> "UnseenSlice":
-        """The same view with another focus; its target and saturation are still those of the slice."""
+        """Return the view with another focus; its target and saturation are still those of the slice."""
         lens = self.lens.focused_at(focus_distance_m)
         coc_px = lens.coc_px(self.depth_m, self.depth_m.shape[1]).astype(np.float32)
         return replace(self, lens=lens, pair=replace(self.pair, coc_px=coc_px))
 
 
 def unseen_slice(pairs: PairSet, index: int) -> UnseenSlice:
-    """Read what belongs to the pair at that index of the set."""
+    """Read the pair at that index of the set with its lens and depth."""
     stack, slice_index = pairs.keys[index]
     saturated = stack.slice_masks(slice_index).saturated
     nearest = _nearest(stack, slice_index, pairs.left_out(stack))
@@ -81,25 +84,25 @@ def _nearest(stack: FocalStack, index: int, others: Sequence[int]) -> Float32[np
 
 
 def _lens(stack: FocalStack, index: int) -> Lens:
-    """The lens of the slice, opened by as much as registration enlarged its blur."""
+    """Return the lens of the slice, opened by as much as registration enlarged its blur."""
     lens = stack.lens_of(index)
     return replace(lens, f_number=lens.f_number / stack.slices[index].scale)
 
 
 def edge_band(seen: UnseenSlice) -> Mask:
-    """Pixels that count within half of the largest circle of confusion of a depth edge, as far as its blur can reach."""
+    """Mark counted pixels within half of the largest circle of confusion of a depth edge, as far as its blur can reach."""
     reach_px = max(1, int(np.ceil(np.abs(seen.pair.coc_px[seen.counted]).max(initial=0.0) / 2.0)))
     step_dioptres = EDGE_STEP_PX / seen.lens.coc_px_per_dioptre(seen.depth_m.shape[1])
     return depth_edge_mask(seen.depth_m, reach_px, step_dioptres) & seen.counted
 
 
 def sharp_side(seen: UnseenSlice) -> Mask:
-    """The part of the band that is in focus, over which the light of the other side may run."""
+    """Mark the part of the band that is in focus, over which light of the other side may spill."""
     return edge_band(seen) & (np.abs(seen.pair.coc_px) <= SHARP_PX)
 
 
-def light_discs(seen: UnseenSlice) -> Mask:
-    """Pixels that count and that light above white reaches from pixels blurred by at least LEAST_DISC_PX."""
+def highlight_discs(seen: UnseenSlice) -> Mask:
+    """Mark counted pixels reached by light above white from pixels blurred by at least LEAST_DISC_PX."""
     from mrbokeh.renderers.scatter_reference import scatter
 
     excess = np.maximum(seen.pair.all_in_focus.max(axis=2) - WHITE, 0.0).astype(np.float64)

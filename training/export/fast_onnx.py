@@ -1,7 +1,4 @@
-"""How many decibel a fast graph loses against the trained network.
-
-A trained network as a fast ONNX file, written only where it loses less than it may.
-"""
+"""Export of a trained network as a fast ONNX file, written only if its loss against the trained network stays within a budget in dB."""
 
 import json
 import math
@@ -40,8 +37,8 @@ ROUNDS = 3
 
 
 @dataclass(frozen=True)
-class Look:
-    """One picture: inputs of the graph by name, what the trained network makes of it, and the truth and its weight where they are known.
+class LossSample:
+    """One picture: inputs of the graph by name, the trained network's result, and the truth and its weight if they are known.
 
     All (1, C, H, W); lens is (1, 2).
     """
@@ -52,27 +49,27 @@ class Look:
     weight: Tensor | None = None
 
 
-def loss_db(session: onnxruntime.InferenceSession, looks: Sequence[Look]) -> float:
-    """Mean over pictures of the PSNR (linear radiance clipped to [0, 1]) that is lost against the truth.
+def loss_db(session: onnxruntime.InferenceSession, samples: Sequence[LossSample]) -> float:
+    """Return the mean loss over pictures of the PSNR (linear radiance clipped to [0, 1]) against the truth.
 
-    Without a truth it is what the difference to the trained network would cost one that is ASSUMED_PSNR_DB from it:
+    Without a truth it is the loss that the difference to the trained network would cause at ASSUMED_PSNR_DB:
     10 lg(1 + error / error of that network).
     """
     losses = []
-    for look in looks:
+    for sample in samples:
         names = {each.name for each in session.get_inputs()}
-        feed = {name: values.numpy() for name, values in look.inputs.items() if name in names}
+        feed = {name: values.numpy() for name, values in sample.inputs.items() if name in names}
         fast = torch.from_numpy(session.run(["blurred"], feed)[0])
-        if look.truth is None:
-            losses.append(10.0 * math.log10(1.0 + _error(fast, look.trained, None) * 10.0 ** (ASSUMED_PSNR_DB / 10.0)))
+        if sample.truth is None:
+            losses.append(10.0 * math.log10(1.0 + _error(fast, sample.trained, None) * 10.0 ** (ASSUMED_PSNR_DB / 10.0)))
         else:
-            errors = [max(_error(each, look.truth, look.weight), 1e-12) for each in (fast, look.trained)]
+            errors = [max(_error(each, sample.truth, sample.weight), 1e-12) for each in (fast, sample.trained)]
             losses.append(10.0 * math.log10(errors[0] / errors[1]))
     return float(np.mean(losses))
 
 
-def made_up_look(network: BlurNetwork, facts: NetworkFacts, size_px: tuple[int, int] = (216, 384)) -> Look:
-    """A picture of everything: texture of all scales, lights, and every circle of confusion, in ramps and in steps."""
+def made_up_sample(network: BlurNetwork, facts: NetworkFacts, size_px: tuple[int, int] = (216, 384)) -> LossSample:
+    """Make up a picture with texture of all scales, highlights, and every circle of confusion, in ramps and in steps."""
     height, width = (facts.height_px, facts.width_px) if facts.tiled else size_px
     rng = np.random.default_rng(0)
     rgb = np.zeros((3, height, width), np.float32)
@@ -86,31 +83,31 @@ def made_up_look(network: BlurNetwork, facts: NetworkFacts, size_px: tuple[int, 
     inputs = {"rgb": rgb[None], "coc_px": (facts.largest_coc_px * ramp)[None, None]}
     inputs["place"] = field_positions((height, width)).transpose(2, 0, 1)[None]
     inputs["lens"] = np.array([[facts.lens.f_number, facts.lens.focal_length_mm]], np.float32)
-    return _looked({name: torch.from_numpy(np.ascontiguousarray(values, np.float32)) for name, values in inputs.items()}, network)
+    return _sample({name: torch.from_numpy(np.ascontiguousarray(values, np.float32)) for name, values in inputs.items()}, network)
 
 
-def looks_at(scenes: Sequence[Path], network: BlurNetwork, facts: NetworkFacts) -> list[Look]:
-    """Some slices that the network was not trained on, or any where it was trained on all; no more than the middle of large pictures."""
+def loss_samples(scenes: Sequence[Path], network: BlurNetwork, facts: NetworkFacts) -> list[LossSample]:
+    """Return some slices that the network was not trained on, or any if it was trained on all; large pictures are cropped to the middle."""
     from training.data.stacks import Seen, stack_name
 
     stacks = training_data(scenes).stacks
     seen = Seen(facts.trained_on, facts.held_out_slices)
     slices = {stack_name(stack): sorted(seen.unseen_slices(stack)) for stack in stacks}
     pairs = PairSet(stacks, WHERE_TRUTH_IS_KNOWN, cache_mib=0, slices=slices if any(slices.values()) else None)
-    looks = []
+    samples = []
     for index in np.unique(np.linspace(0, len(pairs) - 1, SLICES).round()):
         pair = pairs[int(index)]
         if not facts.tiled:
             pair = pair.cut(*(_middle(length) for length in pair.coc_px.shape))
         batch = stack_pairs([pair])
         inputs = {"rgb": batch.rgb, "coc_px": batch.coc_px, "place": batch.place, "lens": batch.lens}
-        looks.append(_looked(inputs, network, batch.target, batch.weight))
-    return looks
+        samples.append(_sample(inputs, network, batch.target, batch.weight))
+    return samples
 
 
 @torch.no_grad()
-def _looked(inputs: dict[str, Tensor], network: BlurNetwork, truth: Tensor | None = None, weight: Tensor | None = None) -> Look:
-    return Look(inputs, network(**inputs), truth, weight)
+def _sample(inputs: dict[str, Tensor], network: BlurNetwork, truth: Tensor | None = None, weight: Tensor | None = None) -> LossSample:
+    return LossSample(inputs, network(**inputs), truth, weight)
 
 
 def _error(a: Tensor, b: Tensor, weight: Tensor | None) -> float:
@@ -125,8 +122,11 @@ def _middle(length_px: int) -> slice:
 
 @dataclass(frozen=True)
 class FastExported:
-    """loss_db: measured (see `training.export.fast_onnx`); naive_ms, fast_ms: of a picture with every circle of confusion
-    everywhere, the lowest of some rounds in turns; difference: largest one to PyTorch."""
+    """The exported network.
+
+    loss_db: as measured. naive_ms, fast_ms: of a picture with every circle of confusion everywhere, the lowest of some alternating
+    rounds. difference: the largest one to PyTorch.
+    """
 
     facts: NetworkFacts
     plan: Plan
@@ -137,9 +137,9 @@ class FastExported:
 
 
 def export_fast_run(run_folder: Path, path: Path, max_psnr_loss_db: float = 0.2, scenes: Sequence[Path] = ()) -> FastExported:
-    """The finished network of a run as `path`. scenes: focal stacks with the truth; without them a made-up picture decides.
+    """Export the finished network of a run to `path`. scenes: focal stacks with the truth; without them a made-up picture decides.
 
-    Raises InputError, and leaves no file, where no plan keeps within the budget.
+    Raises InputError, and leaves no file, if no plan keeps within the budget.
     """
     network, settings, facts = load_run(run_folder)
     return export_fast_network(network, settings.network, facts, path, max_psnr_loss_db=max_psnr_loss_db, scenes=scenes)
@@ -156,11 +156,11 @@ def export_fast_network(
 ) -> FastExported:
     network_facts = network_facts_of(network, settings, facts)
     candidates = plans(network)
-    looks = looks_at(scenes, network, network_facts) if scenes else [made_up_look(network, network_facts)]
+    samples = loss_samples(scenes, network, network_facts) if scenes else [made_up_sample(network, network_facts)]
     with atomic_path(path) as temporary, tempfile.TemporaryDirectory() as folder:
-        plan, loss = _boldest(network, candidates, network_facts, temporary, lambda session: loss_db(session, looks), max_psnr_loss_db)
+        plan, loss = _boldest(network, candidates, network_facts, temporary, lambda session: loss_db(session, samples), max_psnr_loss_db)
         export_network(network, settings, facts, Path(folder) / "naive.onnx")
-        naive_ms, fast_ms = _timed([Path(folder) / "naive.onnx", temporary], made_up_inputs(network_facts, looks[0]))
+        naive_ms, fast_ms = _timed([Path(folder) / "naive.onnx", temporary], made_up_inputs(network_facts, samples[0]))
         exported = OnnxNetwork(temporary)
         result = FastExported(
             facts=exported.facts,
@@ -182,7 +182,7 @@ def _boldest(
     loss: Callable[[onnxruntime.InferenceSession], float],
     max_loss_db: float,
 ) -> tuple[Plan, float]:
-    """The first plan within the budget, written to `path`, and what it loses."""
+    """Write the first plan within the budget to `path` and return it with its loss."""
     losses = []
     for plan in track(candidates, "plans tried"):
         write_model(network, plan, facts, path)
@@ -201,14 +201,14 @@ def write_model(network: BlurNetwork, plan: Plan, facts: NetworkFacts, path: Pat
     path.write_bytes(model.SerializeToString())
 
 
-def made_up_inputs(facts: NetworkFacts, look: Look) -> dict[str, np.ndarray]:
-    """What is timed: the look's picture, repeated to the size at which networks are timed where the size is free.
+def made_up_inputs(facts: NetworkFacts, sample: LossSample) -> dict[str, np.ndarray]:
+    """Return the inputs to be timed: the sample's picture, repeated to the standard size for timing if the size is free.
 
-    Every circle of confusion is everywhere, in no order, so that nothing can be left out: the slowest picture there is.
+    Every circle of confusion is everywhere, in no order, so that nothing can be skipped: the slowest picture there is.
     """
-    height, width = look.inputs["rgb"].shape[2:] if facts.tiled else TIMED_SIZE_PX
+    height, width = sample.inputs["rgb"].shape[2:] if facts.tiled else TIMED_SIZE_PX
     inputs = {}
-    for name, values in look.inputs.items():
+    for name, values in sample.inputs.items():
         array = values.numpy()
         if array.ndim == 4:
             repeats = (1, 1, -(-height // array.shape[2]), -(-width // array.shape[3]))
@@ -219,7 +219,7 @@ def made_up_inputs(facts: NetworkFacts, look: Look) -> dict[str, np.ndarray]:
 
 
 def _timed(paths: Sequence[Path], inputs: dict[str, np.ndarray]) -> list[float]:
-    """Milliseconds of each network, the lowest of some rounds in which they take turns."""
+    """Return the milliseconds of each network, the lowest of some alternating rounds."""
     sessions = [open_session(path) for path in paths]
     best = [float("inf")] * len(paths)
     for round_number in range(ROUNDS + 1):

@@ -1,14 +1,8 @@
-"""What every part of the gated graph reads: light, gates and the sizes of the picture at each resolution.
+"""The gated form as a graph: light is gated at full resolution, spread at that of its group and weighed at full resolution again.
 
-First round of the gated graph: what the bins of a group spread, at the resolution of the group.
-
-Second round of the gated graph: a pointwise network sees gates and coverages, and its weights add up what the bins spread.
-
-The gated form as a graph: light is gated at full resolution, spread at that of its group and weighed at full resolution again.
-
-Groups to which no pixel belongs are skipped, others are computed where their light goes. In words of training/networks/gated_network.py: a first
-round gives what every group spreads, then the pointwise network sees gates and coverages, and a second round adds up weight times
-spread light.
+Groups to which no pixel belongs are skipped, others are computed where their light reaches. In terms of
+training/networks/gated_network.py: a first round gives what every group spreads, then the pointwise network sees gates and coverages,
+and a second round adds up weight times spread light.
 """
 
 import functools
@@ -30,10 +24,10 @@ _GROUPS_AT_ONCE = 5
 
 @dataclass(frozen=True)
 class GatedInputs:
-    """Names of values at full resolution, with zeros added below and right so that the coarsest pixels are whole.
+    """Names of values at full resolution, padded with zeros at the bottom and right so that the coarsest pixels are whole.
 
     light: (B, 1, maps, H, W), the colours and ones; ramps: (B, bins + 1, H, W), see `ramp_lines`; features: (B, features, H, W) of place
-    and lens, or ""; position: (B, 1, H, W), the circle of confusion that gates look at; size: H and W; true_size: before zeros were added.
+    and lens, or ""; position: (B, 1, H, W), the circle of confusion that gates look at; size: H and W; true_size: before padding.
     """
 
     light: str
@@ -45,7 +39,7 @@ class GatedInputs:
 
 
 def graph_inputs(network: BlurNetwork) -> dict[str, list[int | str]]:
-    """Name to shape."""
+    """Return the shape of each input by name."""
     planes: dict[str, list[int | str]] = {"rgb": ["batch", 3, "height", "width"], "coc_px": ["batch", 1, "height", "width"]}
     if network.field_position:
         planes["place"] = ["batch", 2, "height", "width"]
@@ -55,7 +49,7 @@ def graph_inputs(network: BlurNetwork) -> dict[str, list[int | str]]:
 
 
 def prepared(graph: GraphBuilder, network: BlurNetwork, weights: GatedWeights, coarsest: int) -> GatedInputs:
-    """coarsest: factor of all groups."""
+    """Add the values that every part of the graph reads. coarsest: factor of all groups."""
     true_size = [graph.size("rgb", 2), graph.size("rgb", 3)]
     shape = graph.op("Concat", graph.size("coc_px", 0), graph.ints([weights.colours]), *true_size, axis=0)
     ones = graph.op("Expand", graph.floats(np.ones((1, weights.colours, 1, 1))), shape)
@@ -80,14 +74,14 @@ def prepared(graph: GraphBuilder, network: BlurNetwork, weights: GatedWeights, c
 
 
 def times(graph: GraphBuilder, weight: np.ndarray, planes: str, size: list[str]) -> str:
-    """weight (outputs, inputs) at every pixel: as a matrix product, for a Conv first brings the planes into another layout."""
+    """Multiply by weight (outputs, inputs) at every pixel, as a matrix product, since a Conv first reorders the planes."""
     flat = graph.op("Reshape", planes, graph.ints([0, weight.shape[1], -1]))
     product = graph.op("MatMul", graph.floats(weight), flat)
     return graph.op("Reshape", product, graph.op("Concat", graph.ints([0, len(weight)]), *size, axis=0))
 
 
 def ramp_lines(knots_px: np.ndarray) -> np.ndarray:
-    """(bins + 1, 2), slope and offset: lines that, clipped to [0, 1], rise between neighbouring knots; 1 before them all, 0 after.
+    """Return (bins + 1, 2), slope and offset: lines that, clipped to [0, 1], rise between neighbouring knots; first 1, last 0 everywhere.
 
     The gate of a knot is the ramp before it less the one after it: half as many maps as two lines for each hat.
     """
@@ -124,7 +118,7 @@ def _features(graph: GraphBuilder, network: BlurNetwork, grow: _Grow, size: list
 
 
 def spread(graph: GraphBuilder, weights: GatedWeights, inputs: GatedInputs, group: Group, window: Window) -> tuple[str, str]:
-    """(B, bins * maps, h, w) light and coverage in the window, and (B, bins * colours, H, W) the coverage everywhere at full resolution."""
+    """Return (B, bins * maps, h, w) light and coverage in the window, and (B, bins * colours, H, W) coverage at full resolution."""
 
     def then(graph: GraphBuilder) -> list[str]:
         gated = _gated(graph, weights, inputs, group, window)
@@ -151,13 +145,13 @@ def spread(graph: GraphBuilder, weights: GatedWeights, inputs: GatedInputs, grou
 
 
 def _where_covered(graph: GraphBuilder, coverage: str, colours: int) -> str:
-    """0 where negative lobes leave less than nothing of a bin: its light goes too, or their ratio would be anything."""
+    """Return 0 where negative lobes make a bin's coverage negative: its light is dropped too, or their ratio would be arbitrary."""
     covered = graph.op("Cast", graph.op("Greater", coverage, graph.floats(0.0)), to=1)
     return covered if colours == 1 else graph.op("Concat", covered, covered, axis=2)
 
 
 def _gated(graph: GraphBuilder, weights: GatedWeights, inputs: GatedInputs, group: Group, window: Window) -> str:
-    """(B, bins * bases * maps, h, w): the light of each bin's pixels, gathered in tents."""
+    """Return (B, bins * bases * maps, h, w): the light of each bin's pixels, gathered in tents."""
     ramps = window.cut(graph, graph.sliced(inputs.ramps, group.first, group.end + 1, 1))
     gates = graph.op("Sub", graph.sliced(ramps, 0, group.count, 1), graph.sliced(ramps, 1, group.count + 1, 1))
     size = [graph.size(gates, 2), graph.size(gates, 3)]
@@ -170,7 +164,7 @@ def _gated(graph: GraphBuilder, weights: GatedWeights, inputs: GatedInputs, grou
 
 
 def _shares(graph: GraphBuilder, weights: GatedWeights, group: Group, features: str, size: list[str]) -> str:
-    """(B, bins, bases, 1, h, w)."""
+    """Return (B, bins, bases, 1, h, w)."""
     weight, bias = weights.shares[group.first : group.end], weights.shares_bias[group.first : group.end]
     product = times(graph, weight.reshape(-1, weight.shape[-1]), features, size)
     logits = graph.op("Add", product, graph.floats(bias.reshape(-1, 1, 1)))
@@ -179,7 +173,7 @@ def _shares(graph: GraphBuilder, weights: GatedWeights, group: Group, features: 
 
 
 def hidden_features(graph: GraphBuilder, weights: GatedWeights, inputs: GatedInputs, coverages: Sequence[str]) -> str:
-    """(B, hidden + 1, H, W), the last one 1. coverages: of the groups in order, at full resolution."""
+    """Return (B, hidden + 1, H, W), the last one 1. coverages: of the groups in order, at full resolution."""
     of_coverages = np.repeat(weights.of_coverages / weights.colours, weights.colours, axis=0).T
     weight = np.concatenate([_on_ramps(weights), np.pad(of_coverages, ((0, 1), (0, 0)))], axis=1)
     seen = graph.op("Concat", inputs.ramps, *coverages, axis=1)
@@ -187,7 +181,7 @@ def hidden_features(graph: GraphBuilder, weights: GatedWeights, inputs: GatedInp
 
 
 def _on_ramps(weights: GatedWeights) -> np.ndarray:
-    """(hidden + 1, bins + 1): what acts on gates, and the bias, acting on ramps; the first ramp is 1 everywhere."""
+    """Return (hidden + 1, bins + 1): the weights of the gates and the bias, rewritten for ramps; the first ramp is 1 everywhere."""
     weight = np.pad(weights.of_gates, ((1, 1), (0, 1)))
     on_ramps = np.diff(weight, axis=0)
     on_ramps[0] += np.append(weights.hidden_bias, 1.0)
@@ -201,7 +195,7 @@ def total_light(
     spread: Sequence[tuple[Group, Window, str]],
     hidden: str,
 ) -> str:
-    """(B, maps, H, W): the sum over bins of weight times spread light. spread: of each group its window and what it spreads there."""
+    """Return (B, maps, H, W): the sum over bins of weight times spread light. spread: of each group its window and its light there."""
     parts = []
     for first in range(0, len(spread), _GROUPS_AT_ONCE):
         members = spread[first : first + _GROUPS_AT_ONCE]
@@ -213,7 +207,7 @@ def total_light(
 def _weights(
     graph: GraphBuilder, weights: GatedWeights, inputs: GatedInputs, members: Sequence[tuple[Group, Window, str]], hidden: str
 ) -> list[str]:
-    """Add the weights of some groups, each (B, bins, H, W); several at once, for a matrix of few rows is slow to multiply with."""
+    """Add the weights of some groups, each (B, bins, H, W); several at once, since a matrix of few rows multiplies slowly."""
     bins = slice(members[0][0].first, members[-1][0].end)
     weight = np.concatenate([weights.logits[bins], weights.logits_bias[bins, None]], axis=1)
     counts = [group.count for group, _, _ in members]
@@ -228,7 +222,7 @@ def _weights(
 
 
 def _weighed(graph: GraphBuilder, group: Group, window: Window, light: str, weights: str) -> str:
-    """(B, maps, H, W): weight times what the group spreads, summed over its bins."""
+    """Return (B, maps, H, W): weight times the group's spread light, summed over its bins."""
 
     def then(graph: GraphBuilder) -> list[str]:
         planes = enlarged(graph, light, group.factor)
@@ -241,7 +235,7 @@ def _weighed(graph: GraphBuilder, group: Group, window: Window, light: str, weig
 
 
 def _nothing(values: int) -> Callable[[GraphBuilder], list[str]]:
-    """The other branch: zeros that are added at no cost, or never looked at."""
+    """Return the other branch: zeros that are added at no cost, or never looked at."""
     return lambda graph: [graph.floats(np.zeros((1, 1, 1, 1))) for _ in range(values)]
 
 
@@ -252,7 +246,7 @@ def _split(graph: GraphBuilder, planes: str, parts: int) -> list[str]:
 def gated_model(network: BlurNetwork, weights: GatedWeights, factors: Sequence[int]) -> ModelProto:
     """Build the graph of a network without tiles from its weights, or fewer of them.
 
-    factors: for n = 1, 2, ... by how much the resolution is lowered.
+    factors: for n = 1, 2, ... the reduction of the resolution.
     """
     groups, graph = groups_of(weights, factors), GraphBuilder()
     coarsest = max(group.factor for group in groups)

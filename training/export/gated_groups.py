@@ -1,6 +1,6 @@
-"""The bins of the gated form in groups that are computed together, each at a resolution of its own.
+"""Groups of the gated form's bins that are computed together, each at its own resolution and in a window of the picture.
 
-Where in a picture a group of bins has pixels, and how far their light goes; nothing is computed outside.
+A window encloses the pixels of a group and the reach of their light; nothing is computed outside.
 """
 
 import math
@@ -18,7 +18,7 @@ _PASSES, _COARSE_PASSES = 250.0, 100.0  # measured on Zen 5, in multiplications 
 
 @dataclass(frozen=True)
 class Group:
-    """Bins first to end, in order. factor: 1, 2 or 4, by which their resolution is lowered.
+    """Bins first to end, in order. factor: 1, 2 or 4, the reduction of their resolution.
 
     kernels: (bins * bases * maps, 1, k, k), for Conv. span_px: the signed diameters between which a pixel belongs to one of these bins.
     """
@@ -35,12 +35,12 @@ class Group:
 
 
 def groups_of(weights: GatedWeights, factors: Sequence[int]) -> list[Group]:
-    """factors: for n = 1, 2, ... A group is as fine as its smallest kernel asks."""
+    """Group the bins; a group is as fine as its smallest kernel needs. factors: for n = 1, 2, ..."""
     return [_group(weights, bins, factor) for bins, factor in shared(weights, factors)]
 
 
 def cost(weights: GatedWeights, factors: Sequence[int]) -> float:
-    """Multiplications per pixel, with passes over a map counted as what takes as long."""
+    """Return multiplications per pixel, counting passes over a map by their time."""
     total = 0.0
     for bins, factor in shared(weights, factors):
         radius = max(weights.radii_px[each] for each in bins)
@@ -50,13 +50,13 @@ def cost(weights: GatedWeights, factors: Sequence[int]) -> float:
 
 
 def reach_px(weights: GatedWeights, factors: Sequence[int]) -> int:
-    """How far from a pixel the graph looks."""
+    """Return how far from a pixel the graph looks."""
     radii = [(max(weights.radii_px[each] for each in bins), factor) for bins, factor in shared(weights, factors)]
     return max(radius if factor == 1 else factor * (taps_radius(radius, factor) + 1) for radius, factor in radii)
 
 
 def shared(weights: GatedWeights, factors: Sequence[int]) -> list[tuple[range, int]]:
-    """Which bins share a group, and its factor. What does not fill a group is left around the focus."""
+    """Return the bins of each group, and its factor; an incomplete group is left around the focus."""
     at_once, count = weights.bins_at_once, len(weights.knots_px)
     centre = int(np.argmin(np.abs(weights.knots_px)))
     near, far = centre // at_once * at_once, count - (count - 1 - centre) // at_once * at_once
@@ -81,14 +81,14 @@ def _at_resolution(kernels: np.ndarray, factor: int) -> np.ndarray:
 
 
 def _span_px(knots_px: Sequence[float] | np.ndarray, bins: range) -> tuple[float, float]:
-    """The knots beside these bins, outermost ones open."""
+    """Return the knots beside these bins, outermost ones open."""
     low = float(knots_px[bins.start - 1]) if bins.start else -math.inf
     return low, float(knots_px[bins.stop]) if bins.stop < len(knots_px) else math.inf
 
 
 @dataclass(frozen=True)
 class Window:
-    """Whether a group has any pixels, and the rectangle around what they reach: values of the graph, of shape () and (2,).
+    """The rectangle reached by a group's pixels, and whether there are any: values of the graph, of shape () and (2,).
 
     starts and ends: row and column, multiples of `step`, the coarsest factor of all groups; size: of the whole picture.
     """
@@ -99,17 +99,17 @@ class Window:
     size: str
 
     def cut(self, graph: GraphBuilder, planes: str, axes: Sequence[int] = (2, 3)) -> str:
-        """The part of planes inside."""
+        """Return the part of planes inside."""
         return graph.op("Slice", planes, self.starts, self.ends, graph.ints(list(axes)))
 
     def placed(self, graph: GraphBuilder, planes: str) -> str:
-        """Planes (B, C, h, w) of the window in the whole picture, zeros around them."""
+        """Pad planes (B, C, h, w) of the window with zeros to the whole picture."""
         none = graph.ints([0, 0])
         return graph.op("Pad", planes, graph.op("Concat", none, self.starts, none, graph.op("Sub", self.size, self.ends), axis=0))
 
 
 def windows_of(graph: GraphBuilder, groups: Sequence[Group], position: str, size: Sequence[str], step: int) -> list[Window]:
-    """position: (B, 1, H, W), signed diameters; size: H and W, multiples of step."""
+    """Add the windows. position: (B, 1, H, W), signed diameters; size: H and W, multiples of step."""
     whole = graph.op("Concat", *size, axis=0)
     return [_window(graph, group, position, whole, step) for group in groups]
 
@@ -130,6 +130,6 @@ def _window(graph: GraphBuilder, group: Group, position: str, size: str, step: i
 
 
 def reach_of(group: Group, step: int) -> int:
-    """Steps that the light of a group goes at most, with the cells that it is gathered in and interpolated between."""
+    """Return the reach of a group's light in steps, with the cells of gathering and interpolation."""
     taps = group.kernels.shape[-1] // 2
     return -(-group.factor * (taps + (2 if group.factor > 1 else 0)) // step)

@@ -1,10 +1,9 @@
-"""What a trained gated network consists of, bin by bin in ascending order of signed diameter, as arrays that can be changed.
+"""Weights of a trained gated network, bin by bin in ascending order of signed diameter, and fewer bins that approximate them.
 
-The same lens with fewer bins where they are close together for the size of their blur.
-
-Everything that a bin has (its kernels, its part in the pointwise networks) is a function of the signed diameter, known at the knots. With
-fewer knots it is the function, linear between the knots that are left, that is nearest to it in the sense of squares; gates are linear
-between knots as well, so a pixel between two of them is spread by the same mixture of their kernels.
+Bins that are close together for the size of their blur are thinned out. Everything that a bin has (its kernels, its part in the
+pointwise networks) is a function of the signed diameter, known at the knots. With fewer knots it is the piecewise linear function over
+them with the least squared difference; gates are linear between knots as well, so a pixel between two of them is spread by the same
+mixture of their kernels.
 """
 
 import math
@@ -24,11 +23,12 @@ _NEGLIGIBLE = 1e-5  # part of a knot, a matter of rounding
 
 @dataclass(frozen=True)
 class GatedWeights:
-    """knots_px: (bins,), signed diameters at which gates peak. kernels: for each bin (bases, colours, k, k), every kernel with sum 1.
+    """The weights as arrays.
 
-    Pointwise, in words of training/networks/gated_network.py: of_gates and of_coverages (bins, hidden) with hidden_bias (hidden,) give the hidden
-    features, logits (bins, hidden) and logits_bias (bins,) what a bin counts. shares (bins, bases, features) and shares_bias (bins,
-    bases) choose between bases; they are empty where there is one.
+    knots_px: (bins,), signed diameters at which gates peak. kernels: for each bin (bases, colours, k, k), every kernel with sum 1.
+    of_gates and of_coverages: (bins, hidden), with hidden_bias (hidden,) they give the hidden features of
+    training/networks/gated_network.py. logits (bins, hidden) and logits_bias (bins,): the weight of a bin. shares (bins, bases, features)
+    and shares_bias (bins, bases): the choice between bases; empty for a single base.
     """
 
     knots_px: np.ndarray
@@ -51,12 +51,12 @@ class GatedWeights:
 
     @property
     def maps(self) -> int:
-        """Maps of a bin with one base: the light, and the coverage of each kernel."""
+        """Return the maps of a bin with one base: the light, and the coverage of each kernel."""
         return 3 + self.colours
 
     @property
     def bins_at_once(self) -> int:
-        """The fewest bins that fill blocks of channels without a rest."""
+        """Return the fewest bins that fill blocks of channels without a rest."""
         return CHANNELS // math.gcd(CHANNELS, self.maps * self.bases)
 
     @property
@@ -85,20 +85,20 @@ def weights_of(tiles: GatedTiles) -> GatedWeights:
 
 
 def pointwise(convolution: nn.Conv2d) -> tuple[np.ndarray, np.ndarray]:
-    """(outputs, inputs) and (outputs,)."""
+    """Return (outputs, inputs) and (outputs,)."""
     assert convolution.bias is not None
     return convolution.weight.detach()[:, :, 0, 0].numpy(), convolution.bias.detach().numpy()
 
 
 def _kernels(tiles: GatedTiles, n: int) -> np.ndarray:
-    """(bins of this size, bases, colours, 2n+1, 2n+1)."""
+    """Return (bins of this size, bases, colours, 2n+1, 2n+1)."""
     magnitude = tiles.kernels[n - 1].detach().abs()[0].double()
     kernels = magnitude / magnitude.sum(dim=(-2, -1), keepdim=True)
     return kernels.reshape(-1, tiles.bases, *kernels.shape[1:]).numpy()
 
 
 def widened(kernels: Float[np.ndarray, "... k k"], size: int) -> Float[np.ndarray, "... size size"]:
-    """Put zeros around kernels."""
+    """Pad kernels with zeros."""
     margin = (size - kernels.shape[-1]) // 2
     return np.pad(kernels, [(0, 0)] * (kernels.ndim - 2) + [(margin, margin)] * 2)
 
@@ -110,9 +110,9 @@ def thinned(weights: GatedWeights, spacing: float) -> GatedWeights:
 
 
 def fewer_knots(knots_px: Float[np.ndarray, " bins"], spacing: float, whole: int) -> Float64[np.ndarray, " fewer"]:
-    """Knots at least `spacing` times their diameter apart, in front of the focus and behind it; the first one and both ends stay.
+    """Return knots at least `spacing` times their diameter apart, in front of the focus and behind it; the first and both ends stay.
 
-    On each side a multiple of `whole` of them, where there are that many: so many share a convolution.
+    Each side has a multiple of `whole` of them, if there are that many: so many share a convolution.
     """
     centre = int(np.argmin(np.abs(knots_px)))
     near = _side(knots_px[centre::-1] - knots_px[centre], abs(knots_px[centre]), spacing, whole)
@@ -121,7 +121,7 @@ def fewer_knots(knots_px: Float[np.ndarray, " bins"], spacing: float, whole: int
 
 
 def _side(away_px: np.ndarray, first_px: float, spacing: float, whole: int) -> np.ndarray:
-    """away_px: distances of a side's knots from the one in the middle, which is the first of them and is left out of the result."""
+    """Thin one side. away_px: distances of its knots from the one in the middle, which is their first and is left out of the result."""
     count = int(np.ceil(_bins_up_to(away_px, first_px, spacing)[-1] / whole - 1e-9)) * whole
     if count >= len(away_px) - 1:
         return away_px[1:]
@@ -130,18 +130,18 @@ def _side(away_px: np.ndarray, first_px: float, spacing: float, whole: int) -> n
 
 
 def _bins_up_to(away_px: np.ndarray, first_px: float, spacing: float) -> np.ndarray:
-    """So many bins, in parts, lie before each knot where they are as dense as before or as the spacing asks, whichever is less."""
+    """Return how many bins, in fractions, lie before each knot at the lesser of the present density and that of the spacing."""
     steps = np.abs(np.diff(away_px))
     return np.concatenate([[0.0], np.cumsum(steps / np.maximum(steps, spacing * (first_px + np.abs(away_px[1:]))))])
 
 
 def hats(at_px: Float[np.ndarray, " places"], knots_px: Float[np.ndarray, " knots"]) -> Float64[np.ndarray, "places knots"]:
-    """How much of each knot there is at each place; rows sum to 1, the outermost hats go on for ever."""
+    """Return the share of each knot at each place; rows sum to 1, the outermost hats extend to infinity."""
     return np.stack([np.interp(at_px, knots_px, row) for row in np.eye(len(knots_px))], axis=1)
 
 
 def with_knots(weights: GatedWeights, knots_px: Float[np.ndarray, " fewer"]) -> GatedWeights:
-    """Weights for these knots, ascending. Kernels are cut to the size of the largest that has a part in them; their sums stay 1."""
+    """Return weights for these knots, ascending. Kernels take the size of the largest that contributes; their sums stay 1."""
     mixture = hats(weights.knots_px, knots_px)
     fit = _fit(weights.knots_px, knots_px)
 

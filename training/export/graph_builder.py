@@ -1,14 +1,12 @@
-"""A kernel at a fraction of the resolution: gather light in tents, convolve with few taps, interpolate.
+"""Writing an ONNX graph node by node, and kernels at a fraction of the resolution.
 
-Tents are what linear interpolation does in reverse: a pixel gives its light to the cells beside it by nearness, so that the light's
-centre of mass stays where it is (of a plain mean over cells it would jump by up to half a cell). A pixel at place p of its cell of
-s x s, spread by coarse taps K and brought back, ends as E_p K E_p'^T with
-E_p[d, j] = sum over cells c of tent(p, c) hat((p + d + 1/2) / s - 1/2 - j - c) / s, d counting pixels from p and j cells. K is
-the one whose results are nearest to the kernel in the sense of squares over all s^2 places, scaled to its sum: light is conserved.
+Light is gathered in tents, convolved with few taps and interpolated. Tents are linear interpolation in reverse: a pixel gives its light
+to the neighbouring cells by nearness, so that the light's centre of mass is kept (a plain mean over cells would move it by up to half a
+cell). A pixel at place p of its cell of s x s, spread by coarse taps K and brought back, ends as E_p K E_p'^T with
+E_p[d, j] = sum over cells c of tent(p, c) hat((p + d + 1/2) / s - 1/2 - j - c) / s, d counting pixels from p and j cells. K has
+the least squared difference to the kernel over all s^2 places, scaled to its sum: light is conserved.
 It undoes the smoothing of tents and interpolation with small negative lobes at the rim of a disc; without them the loss is two to
 four times as large.
-
-Writing an ONNX graph node by node.
 """
 
 import itertools
@@ -24,12 +22,12 @@ OPSET, IR_VERSION = 18, 9
 
 
 def taps_radius(radius_px: int, factor: int) -> int:
-    """Cells on each side that a kernel of this radius reaches; one more than its width asks, for interpolation reaches one further."""
+    """Return the cells on each side that a kernel of this radius reaches, including one for interpolation."""
     return max(1, -(-(2 * radius_px + 1) // (2 * factor)))
 
 
 def coarse_kernel(kernel: Float[np.ndarray, "size size"], factor: int) -> Float64[np.ndarray, "taps taps"]:
-    """The taps of a kernel (size odd, values >= 0) at 1/factor of the resolution."""
+    """Return the taps of a kernel (size odd, values >= 0) at 1/factor of the resolution."""
     responses = _responses(kernel.shape[0] // 2, factor)
     gram, mean = np.einsum("pdi,pdj->ij", responses, responses), responses.sum(axis=0)
     solved = np.linalg.inv(gram + _RIDGE * gram.max() * np.eye(len(gram)))
@@ -38,13 +36,13 @@ def coarse_kernel(kernel: Float[np.ndarray, "size size"], factor: int) -> Float6
 
 
 def seen_kernel(taps: Float64[np.ndarray, "taps taps"], factor: int, radius_px: int) -> Float64[np.ndarray, "size size"]:
-    """What a pixel is really spread by, the mean over its places in a cell."""
+    """Return the effective spread of a pixel, the mean over its places in a cell."""
     mean = _responses(radius_px, factor).mean(axis=0)
     return mean @ taps @ mean.T
 
 
 def binned(kernels: Float[np.ndarray, "maps size size"], factor: int) -> Float[np.ndarray, "maps taps taps"]:
-    """Kernels that may be negative, for maps that stay coarse: every value goes to the cells beside it, by nearness; sums are kept."""
+    """Bin kernels that may be negative, for maps that stay coarse: every value goes to neighbouring cells by nearness; sums are kept."""
     radius = kernels.shape[-1] // 2
     taps = -(-radius // factor)
     away, cells = np.arange(-radius, radius + 1) / factor, np.arange(-taps, taps + 1)
@@ -53,13 +51,13 @@ def binned(kernels: Float[np.ndarray, "maps size size"], factor: int) -> Float[n
 
 
 def tent(factor: int) -> Float64[np.ndarray, " pixels"]:
-    """Shares of the 2 * factor pixels around the centre of a cell that it gathers, along one side; their sum is 1."""
+    """Return the shares of the 2 * factor pixels around the centre of a cell that it gathers, along one side; their sum is 1."""
     away = (np.arange(2 * factor) + 0.5) / factor - 1.0
     return (1.0 - np.abs(away)) / factor
 
 
 def _responses(radius_px: int, factor: int) -> Float64[np.ndarray, "factor reach taps"]:
-    """E_p for every place p; the reach in pixels is wide enough for all that the taps can touch."""
+    """Return E_p for every place p; the reach in pixels covers everything that the taps can touch."""
     taps = taps_radius(radius_px, factor)
     reach = factor * (taps + 3)
     away, cells, places = np.arange(-reach, reach + 1), np.arange(-taps, taps + 1), np.arange(factor)
@@ -76,7 +74,7 @@ def _padded(kernel: np.ndarray, size: int) -> np.ndarray:
 
 
 class GraphBuilder:
-    """Collects nodes and constants; values are names. Branches see the values of the graph around them."""
+    """A collector of nodes and constants; values are names. Branches see the values of the graph around them."""
 
     def __init__(self, names: "itertools.count[int] | None" = None) -> None:
         self._names = itertools.count() if names is None else names
@@ -84,7 +82,7 @@ class GraphBuilder:
         self._constants: list[TensorProto] = []
 
     def op(self, kind: str, *inputs: str, **attributes: Any) -> str:
-        """A node with one output, whose name is returned."""
+        """Add a node with one output and return its name."""
         return self.ops(kind, *inputs, outputs=1, **attributes)[0]
 
     def ops(self, kind: str, *inputs: str, outputs: int, **attributes: Any) -> list[str]:
@@ -99,18 +97,18 @@ class GraphBuilder:
         return self._constant(np.asarray(values, np.int64))
 
     def sliced(self, value: str, start: int | str, end: int | str, axis: int) -> str:
-        """value[start:end] along an axis; a bound given by name is a value of the graph of shape (1,)."""
+        """Return value[start:end] along an axis; a bound given by name is a value of the graph of shape (1,)."""
         bounds = [each if isinstance(each, str) else self.ints([each]) for each in (start, end)]
         return self.op("Slice", value, *bounds, self.ints([axis]))
 
     def size(self, value: str, axis: int) -> str:
-        """The length of a value along an axis, shape (1,)."""
+        """Return the length of a value along an axis, shape (1,)."""
         return self.op("Shape", value, start=axis, end=axis + 1)
 
     def when(
         self, condition: str, then: Callable[["GraphBuilder"], Sequence[str]], otherwise: Callable[["GraphBuilder"], Sequence[str]]
     ) -> list[str]:
-        """Only one of the two is computed. Both give as many values."""
+        """Add an `If`, of which only one branch is computed. Both give as many values."""
         branches = {}
         for name, write in (("then_branch", then), ("else_branch", otherwise)):
             inside = GraphBuilder(self._names)
@@ -118,7 +116,7 @@ class GraphBuilder:
         return self.ops("If", condition, outputs=len(branches["then_branch"].output), **branches)
 
     def model(self, inputs: dict[str, list[int | str]], output: str, shape: list[int | str]) -> ModelProto:
-        """The whole, with `output` renamed to "blurred". inputs: name to shape, free sizes as names."""
+        """Return the whole model, with `output` renamed to "blurred". inputs: name to shape, free sizes as names."""
         self._nodes.append(helper.make_node("Identity", [output], ["blurred"]))
         graph = self._graph("network", [_value(name, sizes) for name, sizes in inputs.items()], [])
         graph.output.append(_value("blurred", shape))
@@ -134,13 +132,13 @@ class GraphBuilder:
 
 
 def gathered(graph: GraphBuilder, planes: str, channels: int, factor: int) -> str:
-    """Light in coarse pixels, by tents (`coarse_kernels.tent`); sides must be multiples of the factor."""
+    """Gather light in coarse pixels, by tents (`tent`); sides must be multiples of the factor."""
     shares = np.tile(np.outer(tent(factor), tent(factor)), (channels, 1, 1, 1))
     return graph.op("Conv", planes, graph.floats(shares), group=channels, strides=[factor] * 2, pads=[factor // 2] * 4)
 
 
 def enlarged(graph: GraphBuilder, planes: str, factor: int) -> str:
-    """Linear interpolation between the centres of coarse pixels."""
+    """Interpolate linearly between the centres of coarse pixels."""
     if factor == 1:
         return planes
     return graph.op("Resize", planes, "", graph.floats([1, 1, factor, factor]), mode="linear", coordinate_transformation_mode="half_pixel")

@@ -1,4 +1,4 @@
-"""A trained network as an ONNX file that says which lens it is, written only if it computes what the trained one does."""
+"""Export of a trained network as an ONNX file with its lens inside, written only if it computes the same as the trained network."""
 
 import json
 import logging
@@ -26,20 +26,20 @@ OPSET = 18
 
 @dataclass(frozen=True)
 class Exported:
-    """The facts in the file, and how far ONNX Runtime is from PyTorch (see `largest_difference`)."""
+    """The facts in the file, and the difference between ONNX Runtime and PyTorch (see `largest_difference`)."""
 
     facts: NetworkFacts
     difference: float
 
 
 def export_run(run_folder: Path, path: Path) -> Exported:
-    """The finished network of a run as `path`. Raises InputError, and leaves no file, where the two do not agree."""
+    """Export the finished network of a run to `path`. Raises InputError, and leaves no file, if the two do not agree."""
     network, settings, facts = load_run(run_folder)
     return export_network(network, settings.network, facts, path)
 
 
 def export_network(network: BlurNetwork, settings: NetworkSettings, facts: RunFacts, path: Path) -> Exported:
-    """Without tiles height and width of the graph are free; with tiles they are those of the training pictures."""
+    """Export a network. Without tiles height and width of the graph are free; with tiles they are those of the training pictures."""
     network_facts = network_facts_of(network, settings, facts)
     with atomic_path(path) as temporary:
         _write(network, network_facts, temporary)
@@ -56,7 +56,7 @@ def export_network(network: BlurNetwork, settings: NetworkSettings, facts: RunFa
 
 
 def record_path(path: Path) -> Path:
-    """Beside the network, for people and programs that do not open ONNX: its facts and the measured parity."""
+    """Return the path of the record beside the network, for readers that do not open ONNX: its facts and the measured parity."""
     return path.with_name(path.name + ".json")
 
 
@@ -103,7 +103,7 @@ def _write(network: BlurNetwork, facts: NetworkFacts, path: Path) -> None:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """The exporter speaks of packages that are not installed and not needed."""
+    """Silence the exporter's messages about packages that are not installed and not needed."""
     logger = logging.getLogger("torch.onnx")
     level = logger.level
     with warnings.catch_warnings():
@@ -116,7 +116,7 @@ def _quiet() -> Iterator[None]:
 
 
 def picture_for_parity(facts: NetworkFacts, seed: int = 0) -> tuple[Tensor, Tensor]:
-    """Noise with lights up to the radiance scale and every circle of confusion that the network was trained for."""
+    """Return noise with highlights up to the radiance scale and every circle of confusion that the network was trained for."""
     rng = np.random.default_rng(seed)
     height, width = (facts.height_px, facts.width_px) if facts.tiled else (96 + 2 * seed, 128 + 4 * seed)
     rgb = rng.random((1, 3, height, width), dtype=np.float32)
@@ -126,7 +126,7 @@ def picture_for_parity(facts: NetworkFacts, seed: int = 0) -> tuple[Tensor, Tens
 
 
 def inputs_for_parity(facts: NetworkFacts, seed: int = 0) -> dict[str, Tensor]:
-    """All inputs of the graph by name: that picture as a whole frame, seen by a lens drawn from those trained on."""
+    """Return all inputs of the graph by name: that picture as a whole frame, seen by a lens drawn from those trained on."""
     rgb, coc_px = picture_for_parity(facts, seed)
     inputs = {"rgb": rgb, "coc_px": coc_px}
     if facts.field_position:
@@ -139,7 +139,7 @@ def inputs_for_parity(facts: NetworkFacts, seed: int = 0) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def largest_difference(network: BlurNetwork, exported: OnnxNetwork) -> float:
-    """The largest difference between PyTorch and ONNX Runtime over two pictures: absolute up to white (1.0), relative above."""
+    """Return the largest difference between PyTorch and ONNX Runtime over two pictures: absolute up to white (1.0), relative above."""
     differences = []
     for seed in (0, 1):
         inputs = inputs_for_parity(exported.facts, seed)

@@ -1,4 +1,4 @@
-"""What may be made faster in a network, from the boldest plan to one that changes nothing."""
+"""Plans for a faster network, from the boldest one to one that changes nothing."""
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
@@ -25,9 +25,9 @@ _MATRIX_OVER_CONVOLUTION = 0.5  # measured on Zen 5: multiplications a second of
 
 @dataclass(frozen=True)
 class Plan:
-    """least_pixels: so many coarse pixels a kernel is wide, at least. factors: for n = 1, 2, ...; ranks: likewise, None is not separable.
+    """A plan. least_pixels: the least width of a kernel in coarse pixels. factors, ranks: for n = 1, 2, ...; rank None is not separable.
 
-    spacing: of the bins of the gated form, see `fewer_bins.thinned`; bins: how many that leaves, 0 in the published form.
+    spacing: of the bins of the gated form, see `gated_weights.thinned`; bins: how many that leaves, 0 in the published form.
     reach_px: how far from a pixel the graph looks.
     """
 
@@ -42,7 +42,7 @@ class Plan:
         return {"factors": list(self.factors), "ranks": list(self.ranks), "spacing": self.spacing, "bins": self.bins}
 
     def words(self) -> str:
-        """One line for people."""
+        """Describe the plan in one line."""
         shares = [f"{self.factors.count(factor)} at 1/{factor}" for factor in sorted(set(self.factors))]
         ranks = sorted(rank for rank in self.ranks if rank is not None)
         low_rank = f"{len(ranks)} separable of rank {ranks[0]} to {ranks[-1]}" if ranks else "none separable"
@@ -50,7 +50,7 @@ class Plan:
 
 
 def plans(network: BlurNetwork) -> Sequence[Plan]:
-    """Boldest first. Large kernels go to coarse pixels as long as they are still `least_pixels` of them wide."""
+    """Return the plans, boldest first. Large kernels move to coarse pixels while they stay at least `least_pixels` of them wide."""
     if isinstance(network.tiles, GatedTiles) and network.grid is not None:
         raise InputError(
             "a fast export of the gated form needs a network without tiles: train with tile_px 0 (field_bases learn the field)"
@@ -63,7 +63,7 @@ def plans(network: BlurNetwork) -> Sequence[Plan]:
 
 
 def _gated_plans(tiles: GatedTiles) -> list[Plan]:
-    """Every resolution with every number of bins, in the order of what they cost; of those that come to the same the first."""
+    """Return every resolution with every number of bins, by cost; of equivalent ones the first."""
     found: dict[Hashable, tuple[float, Plan]] = {}
     sizes, whole = range(1, len(tiles.kernels) + 1), weights_of(tiles)
     for spacing in SPACINGS:
@@ -99,7 +99,7 @@ def model_of(network: BlurNetwork, plan: Plan) -> ModelProto:
 
 
 def _rank(block: ResidualBlock) -> int | None:
-    """The smallest rank that misses little of both convolutions of a block, where it takes less time than they do."""
+    """Return the smallest rank with little error in both convolutions of a block, if it takes less time than they do."""
     n = block.radius
     worth = int(_MATRIX_OVER_CONVOLUTION * (2 * n + 1) ** 2 / (2 * (piece_px(n) + 2 * n)))
     both = [kernels_of(each, each.out_channels)[0] for each in (block.first, block.second)]

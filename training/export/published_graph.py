@@ -1,14 +1,12 @@
-"""Kernels of many maps as sums of separable ones, applied as matrix products.
-
-A one-dimensional convolution of a row in pieces of T pixels is the product of the pieces, each with a margin, and a banded (Toeplitz)
-matrix of (T + 2n) x T. That is more multiplications than a convolution takes, but a processor does them about ten times faster
-than ONNX Runtime convolves with long thin kernels.
-
-The published form as a graph whose convolutions are in the layout that ONNX Runtime is fast at.
+"""The published form as a graph whose convolutions are in a layout that ONNX Runtime is fast at.
 
 Channel by channel convolutions are about ten times faster where channels come in multiples of 16. A network of many tiles gets a
-few channels of zeros; one of few tiles is cut into strips of rows for every convolution, which become channels. Neither changes the result.
-Blocks may have separable kernels instead (`separable`), or run at half or a quarter of the resolution: these do change it.
+few channels of zeros; one of few tiles is cut into strips of rows for every convolution, which become channels. Neither changes the
+result. Blocks may have separable kernels instead, or run at half or a quarter of the resolution: these do change it.
+
+Separable kernels are applied as matrix products: a one-dimensional convolution of a row in pieces of T pixels is the product of the
+pieces, each with a margin, and a banded (Toeplitz) matrix of (T + 2n) x T. That is more multiplications than a convolution takes, but
+a processor does them about ten times faster than ONNX Runtime convolves with long thin kernels.
 """
 
 import functools
@@ -34,9 +32,10 @@ _MODES = {"replicate": "edge", "reflect": "reflect", "zeros": "constant"}
 
 @dataclass(frozen=True)
 class SeparableKernels:
-    """columns, rows: (maps, rank, 2n+1); kernel m is the sum over r of outer(columns[m, r], rows[m, r]).
+    """Kernels as sums of separable ones.
 
-    relative_error: what is missing, norm over norm, of all kernels together.
+    columns, rows: (maps, rank, 2n+1); kernel m is the sum over r of outer(columns[m, r], rows[m, r]).
+    relative_error: of all kernels together, norm over norm.
     """
 
     columns: Float32[np.ndarray, "maps rank size"]
@@ -53,7 +52,7 @@ class SeparableKernels:
 
 
 def separable_kernels(kernels: Float[np.ndarray, "maps size size"], rank: int) -> SeparableKernels:
-    """The best of this rank with the sum of each kernel kept (`kernels.low_rank_kernel`); a kernel of all zeros stays so."""
+    """Return the best approximation of this rank with the sum of each kernel kept (`kernels.low_rank_kernel`); zeros stay zeros."""
     columns, rows = (np.zeros((len(kernels), rank, kernels.shape[1])) for _ in range(2))
     for index, kernel in enumerate(kernels):
         if kernel.any():
@@ -64,7 +63,7 @@ def separable_kernels(kernels: Float[np.ndarray, "maps size size"], rank: int) -
 
 
 def convolve_separably(graph: GraphBuilder, padded: str, kernels: SeparableKernels, size: tuple[str, str]) -> str:
-    """padded (B, maps, H + 2n, W + 2n) correlated with each map's kernel: (B, maps, H, W). size: values of shape (1,) for H and W."""
+    """Correlate padded (B, maps, H + 2n, W + 2n) with each map's kernel: (B, maps, H, W). size: values of shape (1,) for H and W."""
     piece = piece_px(kernels.radius_px)
     rows, columns = (_pieces(graph, each, piece) for each in size)
     across = _across(graph, padded, kernels, columns, piece)
@@ -72,7 +71,7 @@ def convolve_separably(graph: GraphBuilder, padded: str, kernels: SeparableKerne
 
 
 def piece_px(radius_px: int) -> int:
-    """T: longer pieces waste more of the matrix, shorter ones more of the margins."""
+    """Return T: longer pieces waste more of the matrix, shorter ones more of the margins."""
     return 64 if radius_px > 12 else 32
 
 
@@ -99,7 +98,7 @@ def _across(graph: GraphBuilder, padded: str, kernels: SeparableKernels, columns
 
 
 def _down(graph: GraphBuilder, across: list[str], kernels: SeparableKernels, sizes: tuple[str, str, str], piece: int) -> str:
-    """The sum over terms; pieces of rows, with their margins, are gathered by index."""
+    """Sum over the terms; pieces of rows, with their margins, are gathered by index."""
     rows, height, width = sizes
     starts = graph.op("Mul", graph.op("Range", graph.ints(0), graph.op("Squeeze", rows), graph.ints(1)), graph.ints(piece))
     reach = graph.ints(np.arange(piece + 2 * kernels.radius_px)[None])
@@ -113,7 +112,7 @@ def _down(graph: GraphBuilder, across: list[str], kernels: SeparableKernels, siz
 
 
 def _toeplitz(vectors: Float32[np.ndarray, "maps size"], piece: int) -> Float32[np.ndarray, "maps reach piece"]:
-    """Matrix m maps T + 2n pixels to their correlation with vector m at T places."""
+    """Return matrices that map T + 2n pixels to their correlation with vector m at T places."""
     maps, size = vectors.shape
     matrix = np.zeros((maps, piece + size - 1, piece), np.float32)
     for place in range(piece):
@@ -123,14 +122,14 @@ def _toeplitz(vectors: Float32[np.ndarray, "maps size"], piece: int) -> Float32[
 
 @dataclass(frozen=True)
 class BlockPlan:
-    """factor: by which the resolution of a block is lowered. rank: of its kernels, or None to leave them whole."""
+    """The plan of a block. factor: reduction of its resolution. rank: of its kernels, or None to leave them whole."""
 
     factor: int = 1
     rank: int | None = None
 
 
 class PublishedGraph:
-    """Writes the graph of one network; `plans` has one for each block."""
+    """A writer of the graph of one network; `plans` has one for each block."""
 
     def __init__(self, network: BlurNetwork, plans: Sequence[BlockPlan]) -> None:
         assert isinstance(network.tiles, PublishedTiles)
@@ -161,7 +160,7 @@ class PublishedGraph:
         return graph.model({"rgb": ["batch", 3, *sizes], "coc_px": ["batch", 1, *sizes]}, blurred, ["batch", 3, *sizes])
 
     def _encoded(self) -> str:
-        """(B, 4 tiles, t, t) in [-1, 1]."""
+        """Return (B, 4 tiles, t, t) in [-1, 1]."""
         graph, network = self.graph, self.network
         one = graph.floats(1.0)
         fraction = graph.op("Div", "coc_px", graph.floats(network.largest_coc_px))
@@ -178,7 +177,7 @@ class PublishedGraph:
         return graph.op("Concat", *cuts, axis=1) if len(cuts) > 1 else cuts[0]
 
     def _widened(self, convolution: nn.Conv2d) -> tuple[str, str]:
-        """A grouped pointwise convolution as a full one, with spare outputs that are 0."""
+        """Return a grouped pointwise convolution as a full one, with spare outputs that are 0."""
         assert convolution.bias is not None
         grouped, groups = convolution.weight.detach()[:, :, 0, 0].numpy(), convolution.groups
         outputs, inputs = grouped.shape
@@ -196,7 +195,7 @@ class PublishedGraph:
         return self.graph.op("Conv", state, *self._widened(block.mix), group=1)
 
     def _change(self, state: str, block: ResidualBlock, plan: BlockPlan) -> str:
-        """What a block adds to the state."""
+        """Return what a block adds to the state."""
         graph, factor = self.graph, plan.factor
         if factor == 1:
             return self._two_convolutions(state, (self.height, self.width), block, plan)
@@ -224,7 +223,7 @@ class PublishedGraph:
         return y if self.strips == 1 else self._joined(y, size)
 
     def _in_strips(self, padded: str, height: str, n: int) -> str:
-        """(B, channels, H + 2n, W + 2n) to (B, channels * strips, h + 2n, W + 2n)."""
+        """Cut (B, channels, H + 2n, W + 2n) into (B, channels * strips, h + 2n, W + 2n)."""
         graph = self.graph
         strip = graph.op("Div", graph.op("Add", height, graph.ints([self.strips - 1])), graph.ints([self.strips]))
         starts = graph.op("Mul", graph.ints(np.arange(self.strips)[:, None]), strip)
@@ -240,7 +239,7 @@ class PublishedGraph:
         return graph.sliced(graph.op("Reshape", strips, shape), 0, size[0], 2)
 
     def _pictures(self, state: str, x: str) -> str:
-        """C2 over features and colours of each tile, then the mean of the tiles where they overlap."""
+        """Apply C2 over features and colours of each tile, then average the tiles where they overlap."""
         graph, tiles, grid = self.graph, self.tiles.tile_count, self.network.grid
         features, inputs = self.tiles.c1.out_channels // tiles, self.tiles.c1.in_channels // tiles
         order = [place for tile in range(tiles) for place in _tile_channels(tile, features, inputs, self.channels)]
@@ -259,7 +258,7 @@ class PublishedGraph:
 
 
 def kernels_of(convolution: nn.Conv2d, channels: int, factor: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """(channels, k, k) at a fraction of the resolution, and (channels,); spare ones 0."""
+    """Return (channels, k, k) at a fraction of the resolution, and (channels,); spare ones 0."""
     assert convolution.bias is not None
     spare = channels - convolution.out_channels
     kernels = convolution.weight.detach()[:, 0].numpy()

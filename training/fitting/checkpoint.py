@@ -1,8 +1,7 @@
-"""How a run came along: a table and a picture of it, in the folder of the run.
+"""Checkpoints: everything that a training run needs to continue as if it had never stopped, in one file that is whole or absent.
 
-A network while it learns: its weights, their average, the best so far, and the optimizer.
-
-Checkpoints: everything a training run needs to go on as if it had never stopped, in one file that is whole or absent.
+That is the learner (weights, their average, the best so far, the optimizer) and the progress with its curve, which is also written as
+a table and a picture.
 """
 
 import copy
@@ -30,7 +29,10 @@ FILE_NAME = "checkpoint.pt"
 
 
 class CurvePoint(NamedTuple):
-    """loss: smoothed, of training; held_out_psnr_db: nan between the looks at held-out slices; learning_rate: of the step before."""
+    """A point of the curve.
+
+    loss: smoothed, of training. held_out_psnr_db: nan between the looks at held-out slices. learning_rate: of the step before.
+    """
 
     step: int
     elapsed_s: float
@@ -40,7 +42,7 @@ class CurvePoint(NamedTuple):
 
 
 def write_curve(folder: Path, curve: Sequence[CurvePoint]) -> None:
-    """curve.csv; the PSNR is empty where nobody looked."""
+    """Write curve.csv; the PSNR is empty between looks."""
     with atomic_path(folder / TABLE_NAME) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         rows = csv.writer(file)
         rows.writerow(CurvePoint._fields)
@@ -48,7 +50,7 @@ def write_curve(folder: Path, curve: Sequence[CurvePoint]) -> None:
 
 
 def draw_curve(folder: Path, curve: Sequence[CurvePoint]) -> None:
-    """curve.png: loss and learning rate (both logarithmic) and the PSNR on held-out slices, over steps."""
+    """Draw curve.png: loss and learning rate (both logarithmic) and the PSNR on held-out slices, over steps."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.0, 6.5), layout="constrained")
@@ -67,7 +69,7 @@ def draw_curve(folder: Path, curve: Sequence[CurvePoint]) -> None:
 
 
 class Learner:
-    """network: what is trained, average: the moving average that becomes the result; both in float32 whatever the precision.
+    """A network while it learns. network: the trained weights, average: their moving average, the result; float32 whatever the precision.
 
     best: the averaged weights of the best look at held-out slices, or None before the first.
     """
@@ -83,17 +85,17 @@ class Learner:
 
     @property
     def learning_rate(self) -> float:
-        """The learning rate of the last step."""
+        """Return the learning rate of the last step."""
         return float(self._optimizer.param_groups[0]["lr"])
 
     def begin(self, rate_factor: float) -> None:
-        """Start a step at this part of the peak learning rate, without gradients."""
+        """Start a step at this fraction of the peak learning rate, without gradients."""
         for group in self._optimizer.param_groups:
             group["lr"] = self._settings.learning_rate * rate_factor
         self._optimizer.zero_grad(set_to_none=True)
 
     def autocast(self) -> torch.autocast:
-        """The block in which the network and its loss are computed in the chosen precision."""
+        """Return the context in which the network and its loss are computed in the chosen precision."""
         half = _HALVES.get(self._settings.precision)
         return torch.autocast(self.device.type, half, enabled=half is not None)
 
@@ -102,7 +104,7 @@ class Learner:
         self._scaler.scale(loss).backward()
 
     def apply(self, step: int) -> None:
-        """Update the weights; their average follows, faster while it is young (step counts from 0)."""
+        """Update the weights; their average follows, faster in early steps (step counts from 0)."""
         if self._settings.clip_norm > 0.0:
             self._scaler.unscale_(self._optimizer)
             torch.nn.utils.clip_grad_norm_(self.network.parameters(), self._settings.clip_norm)
@@ -117,7 +119,7 @@ class Learner:
         self.best = {name: value.detach().cpu().clone() for name, value in self.average.state_dict().items()}
 
     def take_best(self) -> None:
-        """The average becomes the best so far, if there is one."""
+        """Replace the average by the best so far, if there is one."""
         if self.best is not None:
             self.average.load_state_dict(self.best)
 
@@ -131,7 +133,7 @@ class Learner:
         }
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Raises RuntimeError, KeyError or ValueError where the state is that of another network."""
+        """Restore a state. Raises RuntimeError, KeyError or ValueError if it is that of another network."""
         self.network.load_state_dict(state["network"])
         self.average.load_state_dict(state["average"])
         self.best = state["best"]
@@ -141,12 +143,12 @@ class Learner:
 
 @dataclass
 class Progress:
-    """State of a run; the one thing that changes while it trains.
+    """The mutable state of a run.
 
     pictures: drawn so far, by all processes together.
     best_psnr_db, best_step: of the best look at held-out slices; looks_since_best: how many came after it.
-    points_due: of the curve, so many parts of the budget have been noted.
-    kept_step: of the weights that the finished network has; stopped_early: before the budget was used, for want of anything better.
+    points_due: parts of the budget noted in the curve so far.
+    kept_step: of the finished network's weights; stopped_early: before the budget was used, for lack of improvement.
     """
 
     step: int = 0
@@ -168,7 +170,7 @@ class Progress:
         self.smoothed_loss = loss if math.isnan(self.smoothed_loss) else 0.98 * self.smoothed_loss + 0.02 * loss
 
     def looked(self, psnr_db: float) -> bool:
-        """Count a look at held-out slices; whether it is the best so far. nan never is."""
+        """Count a look at held-out slices and tell whether it is the best so far; nan never is."""
         if psnr_db > self.best_psnr_db:
             self.best_psnr_db, self.best_step, self.looks_since_best = psnr_db, self.step, 0
             return True
@@ -184,7 +186,7 @@ def save_checkpoint(path: Path, progress: Progress, learner: Learner, rng: np.ra
 
 
 def read_checkpoint(path: Path) -> dict[str, Any] | None:
-    """What `restore_checkpoint` takes; None where there is no such file."""
+    """Read the state for `restore_checkpoint`; None if there is no such file."""
     if not path.exists():
         return None
     try:
@@ -195,7 +197,7 @@ def read_checkpoint(path: Path) -> dict[str, Any] | None:
 
 
 def restore_checkpoint(path: Path, state: dict[str, Any], learner: Learner, rng: np.random.Generator) -> Progress:
-    """Put everything back; raises InputError where this is not a checkpoint of such a run. path: for the message."""
+    """Restore a checkpoint; raises InputError if it is not one of such a run. path: for the message."""
     try:
         learner.restore(state["learner"])
         rng.bit_generator.state = state["batch_rng"]

@@ -1,7 +1,7 @@
-"""Several processes train one network: each has its own pictures, all have the same weights, the first one writes.
+"""Training by several processes: each has its own pictures, all have the same weights, the first one writes.
 
 `torchrun` starts them and tells each its number. Gradients are averaged once a step, in one message that also carries the loss, the
-time and who was asked to stop, so that all processes take the same decisions. (DistributedDataParallel would send while the gradient is
+time and stop requests, so that all processes take the same decisions. (DistributedDataParallel would send while the gradient is
 still computed; it only sees calls of `forward`, and these networks are too small for that to pay.)
 """
 
@@ -25,7 +25,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Ranks:
-    """This process among all: number 0 to count - 1; local: its number on this machine, of local_count."""
+    """This process among all: number 0 to count - 1, of local_count on this machine."""
 
     device: torch.device
     number: int = 0
@@ -34,11 +34,11 @@ class Ranks:
 
     @property
     def first(self) -> bool:
-        """Whether this process writes, validates and prints."""
+        """Tell whether this process writes, validates and prints."""
         return self.number == 0
 
     def from_first(self, work: Callable[[], Result]) -> Result:
-        """What the first process gets by this; its InputError is raised in all."""
+        """Return the first process's result in all processes; its InputError is raised in all."""
         if self.count == 1:
             return work()
         told: list[Result | InputError | None] = [None]
@@ -53,9 +53,9 @@ class Ranks:
         return told[0]  # type: ignore[return-value]
 
     def average_gradients(self, network: torch.nn.Module, sums: Sequence[float]) -> list[float]:
-        """Replace the gradients by their mean over all processes; returns each of the numbers summed over all.
+        """Replace the gradients by their mean over all processes; return each of the numbers summed over all.
 
-        A parameter without a gradient counts as 0, unless it has none anywhere: then the optimizer goes on leaving it out.
+        A parameter without a gradient counts as 0, unless it has none anywhere: then the optimizer keeps leaving it out.
         """
         if self.count == 1:
             return list(sums)
@@ -73,9 +73,9 @@ class Ranks:
 
 @contextmanager
 def joined(device: str) -> Iterator[Ranks]:
-    """The group of processes that torchrun started, or this one alone. device: auto, cpu, cuda or cuda:N.
+    """Join the group of processes that torchrun started, or run alone. device: auto, cpu, cuda or cuda:N.
 
-    Raises InputError where a machine has more processes than GPUs.
+    Raises InputError if a machine has more processes than GPUs.
     """
     count = int(os.environ.get("WORLD_SIZE", "1"))
     if count == 1:
@@ -93,7 +93,7 @@ def joined(device: str) -> Iterator[Ranks]:
 
 
 def _own_device(name: str, local: int, local_count: int) -> torch.device:
-    """Each process of a machine has a GPU of its own."""
+    """Return the GPU of this process; each process of a machine has one of its own."""
     if _device(name).type != "cuda":
         return torch.device("cpu")
     if local_count > torch.cuda.device_count():

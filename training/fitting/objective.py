@@ -1,6 +1,6 @@
-"""What else a loss may look at than pixels: the light of a neighbourhood, and edges. Errors are (B, C, H, W), weights broadcast to them.
+"""The training objective, and the schedule of the learning rate.
 
-What training strives for, and how fast it steps.
+Beside the pixels a loss may compare the light of neighbourhoods and edges. Errors are (B, C, H, W), weights broadcast to them.
 """
 
 import math
@@ -23,10 +23,10 @@ def weighted_mean_square(error: Tensor, weight: Tensor) -> Tensor:
 
 
 def local_light_error(error: Tensor, counted: Tensor, largest_coc_px: float) -> Tensor:
-    """The mean error about each pixel, under a Gaussian as wide as the largest blur, of the pixels that count.
+    """Return the mean error about each pixel, under a Gaussian as wide as the largest blur, of the pixels that count.
 
-    Blur moves light within a circle of confusion and neither takes nor makes any. A Gaussian and no box, because a box sees a light that
-    moved by one pixel across its side: with 16 px, twelve times as much as one that lost a tenth. The standard deviation is half of
+    Blur moves light within a circle of confusion and conserves it. A box instead of the Gaussian would react to a highlight that moved
+    by one pixel across its side: with 16 px, twelve times as much as to one that lost a tenth. The standard deviation is half of
     the largest diameter. Next to pixels that do not count it is the mean of the others (normalised convolution, Knutsson and Westin 1993).
     """
     sigma_px = max(0.5 * largest_coc_px, 0.5)
@@ -34,7 +34,7 @@ def local_light_error(error: Tensor, counted: Tensor, largest_coc_px: float) -> 
 
 
 def gradient_error(error: Tensor, weight: Tensor) -> Tensor:
-    """Mean square difference of the error between neighbours, right and down, where both count: blur too much or too little of an edge."""
+    """Return the mean square difference of the error between neighbours, right and down, where both count: wrong blur of an edge."""
     total = count = error.new_zeros(())
     for axis in (2, 3):
         length = error.shape[axis] - 1
@@ -45,7 +45,7 @@ def gradient_error(error: Tensor, weight: Tensor) -> Tensor:
 
 
 def gaussian(picture: Tensor, sigma_px: float) -> Tensor:
-    """(B, C, H, W) convolved with a normalised Gaussian cut off at 3 standard deviations; black beyond the border."""
+    """Convolve (B, C, H, W) with a normalised Gaussian cut off at 3 standard deviations; black beyond the border."""
     radius = math.ceil(3.0 * sigma_px)
     offsets = torch.arange(-radius, radius + 1, dtype=picture.dtype, device=picture.device)
     kernel = torch.exp(-0.5 * (offsets / sigma_px).square())
@@ -57,7 +57,7 @@ def gaussian(picture: Tensor, sigma_px: float) -> Tensor:
 
 @runtime_checkable
 class Network(Protocol):
-    """What the objective asks of a network (`training.networks.network.BlurNetwork`)."""
+    """The interface that the objective needs of a network (`training.networks.network.BlurNetwork`)."""
 
     grid: TileGrid | None
 
@@ -67,10 +67,10 @@ class Network(Protocol):
 
 
 def loss(network: Network, batch: Batch, radiance_scale: float, largest_coc_px: float, settings: TrainSettings) -> Tensor:
-    """Everything that one batch is judged by: a scalar.
+    """Return the loss of one batch: a scalar.
 
-    loss_scope "picture" judges the reassembled picture (Mandl et al. 2024, Section 3.3), "tile" the mean over tiles of what each one
-    makes of its own part, before overlaps are averaged; a tile counts where any of its pixels does.
+    loss_scope "picture" judges the reassembled picture (Mandl et al. 2024, Section 3.3), "tile" the mean over tiles of each one's own
+    part, before overlaps are averaged; a tile counts if any of its pixels does.
     """
     inputs = (batch.rgb, batch.coc_px, batch.place, batch.lens)
     if settings.loss_scope == "picture" or network.grid is None:
@@ -83,7 +83,7 @@ def loss(network: Network, batch: Batch, radiance_scale: float, largest_coc_px: 
 
 
 def judged(result: Tensor, batch: Batch, radiance_scale: float, largest_coc_px: float, settings: TrainSettings) -> Tensor:
-    """The mean square error, and as much as the settings say of the light of neighbourhoods and of edges; for equal pictures 0."""
+    """Return the mean square error plus the weighted terms for neighbourhoods and edges; 0 for equal pictures."""
     total = mean_square_error(result, batch, radiance_scale, settings)
     if settings.energy_weight == 0.0 and settings.edge_weight == 0.0:
         return total
@@ -98,12 +98,12 @@ def judged(result: Tensor, batch: Batch, radiance_scale: float, largest_coc_px: 
 
 
 def mean_square_error(result: Tensor, batch: Batch, radiance_scale: float, settings: TrainSettings) -> Tensor:
-    """Eq. 3 over the reassembled pictures, in the units of the network, [-1, 1]; pixels without weight do not count."""
+    """Return Eq. 3 over the reassembled pictures, in the units of the network, [-1, 1]; pixels without weight do not count."""
     return weighted_mean_square(_error(result, batch, radiance_scale, settings), _weight(batch, settings))
 
 
 def _weight(batch: Batch, settings: TrainSettings) -> Tensor:
-    """(B, 3, H, W); "relative" turns the error of bright pixels into that of their ratio."""
+    """Return (B, 3, H, W); "relative" turns the error of bright pixels into that of their ratio."""
     weight = batch.weight.expand_as(batch.target)
     if settings.loss_weighting == "relative":
         weight = weight / batch.target.amax(dim=1, keepdim=True).clamp(min=1.0).square()
@@ -111,7 +111,7 @@ def _weight(batch: Batch, settings: TrainSettings) -> Tensor:
 
 
 def _error(result: Tensor, batch: Batch, radiance_scale: float, settings: TrainSettings) -> Tensor:
-    """Result less slice, in the units of the network. A full photosite says "at least so bright": more than that is no error."""
+    """Return result less slice, in the units of the network. At a full photosite, a lower bound, a brighter result is no error."""
     result, target = result.float(), batch.target
     if settings.sensor_white is not None:
         result, target = result.clamp(max=settings.sensor_white), target.clamp(max=settings.sensor_white)
@@ -120,13 +120,13 @@ def _error(result: Tensor, batch: Batch, radiance_scale: float, settings: TrainS
 
 
 def _tiles(batch: Batch, grid: TileGrid) -> list[Batch]:
-    """The part of a batch that each tile is judged by."""
+    """Return the part of a batch that each tile is judged by."""
     planes = {name: split(part, grid).chunk(len(grid), dim=1) for name, part in batch.parts().items() if part.dim() == 4}
     return [replace(batch, **{name: parts[tile] for name, parts in planes.items()}) for tile in range(len(grid))]
 
 
 def learning_rate_factor(done: float, warm_up: float) -> float:
-    """Return the share of the peak after this fraction of the budget: a linear rise, then half a cosine to zero."""
+    """Return the fraction of the peak after this fraction of the budget: a linear rise, then half a cosine to zero."""
     if done < warm_up:
         return max(done / warm_up, 0.02)
     return 0.5 * (1.0 + math.cos(math.pi * min(1.0, (done - warm_up) / (1.0 - warm_up))))

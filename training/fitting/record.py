@@ -1,8 +1,6 @@
-"""Sheets of predictions on held-out slices, one for every look, so that one can watch a network learn.
+"""Files that a run writes while it trains: curve, sheets, checkpoints, and the network at the end.
 
-How far a network has come, on a few slices of stacks that are held out; they are read when asked for, not kept.
-
-What a run leaves in its folder while it trains: curve, sheets, checkpoints, and the network at the end.
+A few held-out slices show the network's progress, as a PSNR and as sheets of predictions; they are read on demand, not kept.
 """
 
 import math
@@ -46,7 +44,7 @@ def small_picture(picture: Float32[np.ndarray, "height width 3"]) -> Float32[np.
 
 
 def write_sheet(run_folder: Path, step: int, rows: Sequence[SheetRow]) -> None:
-    """sheets/step_0000123.png. At most MOST_KEPT are kept: the first, the last, and of the others such that lie far apart."""
+    """Write sheets/step_0000123.png. At most MOST_KEPT are kept: the first, the last, and others that are far apart."""
     if not rows:
         return
     folder = run_folder / FOLDER_NAME
@@ -63,9 +61,10 @@ def _step(path: Path) -> int:
 
 @dataclass(frozen=True)
 class Look:
-    """psnr_db: mean over slices, of linear radiance clipped to [0, 1] where the truth is known; nan where nothing is held out.
+    """A look at held-out slices.
 
-    rows: for a sheet: the sharp picture, what the network makes of it, and the photograph.
+    psnr_db: mean over slices, of linear radiance clipped to [0, 1] where the truth is known; nan if nothing is held out.
+    rows: for a sheet: the sharp picture, the network's prediction, and the photograph.
     """
 
     psnr_db: float
@@ -73,7 +72,7 @@ class Look:
 
 
 class HeldOutSlices:
-    """Some slices, spread over stacks and focus range: the middle of each, or all of it where tiles have their own places."""
+    """Some slices, spread over stacks and focus range: the middle of each, or all of it if tiles have their own places."""
 
     def __init__(self, stacks: Sequence[FocalStack], slices: ChosenSlices | None = None) -> None:
         self._pairs = PairSet(stacks, WHERE_TRUTH_IS_KNOWN, cache_mib=0, slices=slices)
@@ -100,7 +99,7 @@ class HeldOutSlices:
 
 
 def _middle(pair: Pair) -> Pair:
-    """At most SIDE_PX wide and high; what gets light from outside has no weight."""
+    """Crop to at most SIDE_PX wide and high; pixels that get light from outside have no weight."""
     halo_px = math.ceil(float(np.abs(pair.coc_px).max()) / 2.0)
     parts, weights = [], []
     for length in pair.coc_px.shape:
@@ -123,7 +122,7 @@ def _psnr_db(result: torch.Tensor, batch: Batch) -> float:
 
 @dataclass(frozen=True)
 class Task:
-    """What a run is about: where it is kept, what it learns from and what it is tested on."""
+    """The task of a run: its folder, settings, training data and held-out slices."""
 
     folder: Path
     settings: TrainSettings
@@ -133,7 +132,7 @@ class Task:
 
 
 class Record:
-    """Written by the first process only; progress, learner and rng are those of the run, seen as they change."""
+    """The writer of a run's files, in the first process only; progress, learner and rng are shared with the run."""
 
     def __init__(self, task: Task, learner: Learner, progress: Progress, rng: np.random.Generator) -> None:
         self._task, self._learner, self._progress, self._rng = task, learner, progress, rng
@@ -141,19 +140,19 @@ class Record:
         self._drawn_s = -math.inf
 
     def note(self, psnr_db: float = math.nan) -> None:
-        """A point of the curve."""
+        """Append a point to the curve."""
         progress = self._progress
         elapsed_s, rate = round(progress.elapsed_s, 2), self._learner.learning_rate
         progress.curve.append(CurvePoint(progress.step, elapsed_s, progress.smoothed_loss, psnr_db, rate))
 
     def note_if_due(self, done: float) -> None:
-        """A point of the curve for every part of the budget; done: how much of it is used, in [0, 1]."""
+        """Append a point to the curve for every part of the budget; done: the used fraction of it."""
         if done * POINTS >= self._progress.points_due:
             self._progress.points_due = math.floor(done * POINTS) + 1
             self.note()
 
     def look(self) -> bool:
-        """At held-out slices; whether there has been nothing better for as long as patience lasts."""
+        """Look at held-out slices and tell whether patience is exhausted."""
         look = self._task.held_out.look(self._learner.average, self._learner.device)
         if self._progress.looked(look.psnr_db):
             self._learner.keep_best()
@@ -170,7 +169,7 @@ class Record:
         write_curve(self._task.folder, self._progress.curve)
 
     def finish(self) -> None:
-        """The last look, and the network: the last weights, or with patience the best ones."""
+        """Take the last look and save the network: the last weights, or with patience the best ones."""
         if not self._progress.stopped_early:
             self.look()
         self._progress.kept_step = self._progress.step

@@ -1,8 +1,7 @@
-"""Being asked to stop: Ctrl-C, or the SIGTERM with which batch systems announce that time is up.
+"""One run in memory: steps until the budget is used, with looks at held-out slices and checkpoints between them.
 
-Whether a budget in minutes has time for a network to learn anything, told by its first steps.
-
-One run in memory: steps until the budget is used, with looks at held-out slices and checkpoints between them.
+A run stops on request: Ctrl-C, or the SIGTERM with which batch systems announce that time is up. Its first steps tell whether a
+budget in minutes is long enough for a network to learn anything.
 """
 
 import math
@@ -38,7 +37,7 @@ _LONGEST_SHARE = 0.05  # of the budget until the rate is known; at LEAST_STEPS i
 
 
 class StoppedError(KeyboardInterrupt):
-    """A run that was asked to stop did so; number: of the signal. left: what there is now, in words."""
+    """A run stopped on request. number: of the signal. left: what is kept, in words."""
 
     def __init__(self, number: int, left: str) -> None:
         super().__init__(f"stopped by {signal.Signals(number).name}; {left}")
@@ -46,15 +45,15 @@ class StoppedError(KeyboardInterrupt):
 
     @property
     def exit_code(self) -> int:
-        """The code that shells give: 130 after Ctrl-C, 143 after SIGTERM."""
+        """Return the code that shells give: 130 after Ctrl-C, 143 after SIGTERM."""
         return 128 + self.number
 
 
 class Interruption:
-    """A block in which the signals only leave a note, so that a step is never torn; `asked` holds the last one.
+    """A block in which the signals only leave a note, so that a step is never cut short; `asked` holds the last one.
 
-    A signal that was ignored before stays so: shells start background jobs deaf to Ctrl-C.
-    Of a process on its own a second Ctrl-C stops at once, without a checkpoint (torchrun passes on what its children have got already).
+    A signal that was ignored before stays ignored: shells start background jobs deaf to Ctrl-C.
+    In a single process a second Ctrl-C stops at once, without a checkpoint (torchrun passes on what its children have got already).
     """
 
     def __init__(self, alone: bool = True) -> None:
@@ -79,7 +78,7 @@ class Interruption:
 
 
 def is_rate_known(ends_s: Sequence[float], budget_s: float) -> bool:
-    """Whether the steps so far tell the rate. ends_s: since training began; the first step also reads data and is not told by."""
+    """Tell whether the steps so far determine the rate. ends_s: since training began; the first step also reads data and is ignored."""
     if not ends_s:
         return False
     if len(ends_s) == 1:
@@ -93,12 +92,12 @@ def seconds_of_a_step(ends_s: Sequence[float]) -> float:
 
 
 def steps_within(ends_s: Sequence[float], budget_s: float) -> int:
-    """How many steps the whole budget makes at that rate."""
+    """Return how many steps the whole budget makes at that rate."""
     return len(ends_s) + max(0, int((budget_s - ends_s[-1]) / max(seconds_of_a_step(ends_s), 1e-9)))
 
 
 def too_few_words(ends_s: Sequence[float], settings: TrainSettings, halo_px: int, least: int) -> str:
-    """What to say to somebody whose budget has time for fewer steps than `least`. halo_px: see `training.data.batches.Drawing`."""
+    """Return the message for a budget with time for fewer steps than `least`. halo_px: see `training.data.batches.Drawing`."""
     minutes, step_s = settings.minutes or 0.0, seconds_of_a_step(ends_s)
     steps, enough = steps_within(ends_s, 60.0 * minutes), 1.25 * (ends_s[0] + least * step_s) / 60.0
     enough = math.ceil(enough) if enough > 5.0 else math.ceil(10.0 * enough) / 10.0
@@ -110,7 +109,7 @@ def too_few_words(ends_s: Sequence[float], settings: TrainSettings, halo_px: int
 
 
 def _shorter_steps(settings: TrainSettings, halo_px: int) -> list[str]:
-    """What makes a step shorter, the most effective first."""
+    """Return advice that makes a step shorter, the most effective first."""
     ways = []
     if settings.network.form == "published":
         ways.append("--preset demo")
@@ -124,8 +123,10 @@ def _shorter_steps(settings: TrainSettings, halo_px: int) -> list[str]:
 
 
 class Run:
-    """The constructor restores a checkpoint where there is one, unless it begins afresh. Every process has a run; that of the first one
-    writes and looks."""
+    """A training run; every process has one, and that of the first one writes and looks.
+
+    The constructor restores a checkpoint if there is one, unless it begins afresh.
+    """
 
     def __init__(self, task: Task, ranks: Ranks, afresh: bool = False) -> None:
         self.task, self.settings, self.ranks = task, task.settings, ranks
@@ -145,7 +146,7 @@ class Run:
     def require_steps(self, least: int) -> None:
         """Take the first steps of a budget in minutes; nothing is written.
 
-        Raises InputError where it has no time for `least` of them, StoppedError where any process is asked to stop.
+        Raises InputError if there is no time for `least` of them, StoppedError if any process is asked to stop.
         """
         if self.settings.minutes is None or self.progress.step:
             return
@@ -162,7 +163,7 @@ class Run:
             raise InputError(too_few_words(ends_s, self.settings, self._halo_px, least))
 
     def train(self) -> Progress:
-        """Use the rest of the budget; raises StoppedError, with a checkpoint, where any process is asked to stop."""
+        """Use the rest of the budget; raises StoppedError, with a checkpoint, if any process is asked to stop."""
         if self.progress.finished:
             return self.progress
         with self._interruption:
@@ -180,7 +181,7 @@ class Run:
         return Progress() if state is None else restore_checkpoint(path, state, self.learner, self._rng)
 
     def _done(self) -> float:
-        """How much of the budget is used, in [0, 1]."""
+        """Return the used fraction of the budget."""
         if self.settings.epochs is not None:
             return min(1.0, self.progress.pictures / (self.settings.epochs * len(self.task.pairs)))
         return min(1.0, self.progress.elapsed_s / (60.0 * (self.settings.minutes or 0.0) + 1e-9))
@@ -194,7 +195,7 @@ class Run:
                 self._keep()
 
     def _bar(self) -> dict[str, Any]:
-        """What is done of what: steps of those planned, or seconds of a budget in minutes beside the steps that they made."""
+        """Return the progress: steps of those planned, or seconds of a budget in minutes with the steps made."""
         progress, loss_words = self.progress, "" if math.isnan(self.progress.smoothed_loss) else f", loss {self.progress.smoothed_loss:.2e}"
         if self.settings.epochs is not None:
             planned = math.ceil(self.settings.epochs * len(self.task.pairs) / (self.settings.batch * self.ranks.count))
@@ -204,18 +205,30 @@ class Run:
         return {"description": description, "completed": min(progress.elapsed_s, budget_s), "total": budget_s}
 
     def _step(self, rate_factor: float) -> None:
-        """One update from `batch` pictures of each process, one after the other: a picture uses few of the network's bins, all
-        together most of them."""
+        """Make one update from `batch` pictures of each process, one after the other.
+
+        One picture uses few of the network's bins, all together most of them.
+        """
         self.learner.begin(rate_factor)
         mean_loss = self._agree(sum(self._learn_from(batch) for batch in self._draw()))
         self.learner.apply(self.progress.step)
         self.progress.took_step(mean_loss, self.settings.batch * self.ranks.count)
 
     def _draw(self) -> Iterator[Batch]:
-        """The pictures of this process, one by one. All draw from one sequence and pass over the pictures of the others, so that it
-        does not matter who draws what: two processes see what one with twice the batch sees."""
+        """Yield the pictures of this process, one by one.
+
+        All processes draw from one sequence and skip the pictures of the others, so that two processes see what one with twice the batch
+        sees.
+        """
         settings, noise = self.settings, self.settings.depth_noise
-        drawing = Drawing(self.task.pairs, settings.batch, self._crop_px, self._halo_px, settings.crops_per_picture, noise > 0.0)
+        drawing = Drawing(
+            pairs=self.task.pairs,
+            size=settings.batch,
+            crop_px=self._crop_px,
+            halo_px=self._halo_px,
+            crops_per_picture=settings.crops_per_picture,
+            noisy=noise > 0.0,
+        )
         place, most_px = (self.ranks.number, self.ranks.count), self.task.facts.largest_coc_px
         for batch in draw_share(drawing, self._rng, *place, depth_noise=noise, largest_coc_px=most_px):
             yield batch.to(self.ranks.device)
@@ -241,7 +254,7 @@ class Run:
         return time.monotonic() - self._started_s
 
     def _keep(self) -> None:
-        """Looks and checkpoints, where they are due."""
+        """Take looks and write checkpoints when they are due."""
         now_s = self.progress.elapsed_s
         if self.ranks.first:
             self._record.note_if_due(self._done())

@@ -1,4 +1,4 @@
-"""The folder of a training run: settings, what it was trained on, checkpoint, curve and the finished network."""
+"""The folder of a training run: settings, training data, checkpoint, curve and the finished network."""
 
 import subprocess
 from dataclasses import dataclass
@@ -23,11 +23,11 @@ NETWORK_NAME = "network.pt"
 
 @dataclass(frozen=True)
 class RunFacts:
-    """What a trained network holds for, and where it came from.
+    """The range of validity and the origin of a trained network.
 
-    largest_coc_px: diameter; radiance_scale: the radiance at the upper end of the network's range;
-    trained_on, held_out: names of stacks; held_out_slices: of the only stack, where there is one.
-    commit: of the source, or None where git is absent. lens_guessed: see NetworkFacts.
+    largest_coc_px: diameter. radiance_scale: the radiance at the upper end of the network's range.
+    trained_on, held_out: names of stacks. held_out_slices: of the only stack, if there is one.
+    commit: of the source, or None without git. lens_guessed: see NetworkFacts.
     f_numbers, focal_lengths_mm: (lowest, highest) of the data; None: those of `lens` alone.
     """
 
@@ -71,7 +71,7 @@ def read_facts(folder: Path) -> RunFacts:
 
 
 def build_network(settings: TrainSettings, facts: RunFacts) -> BlurNetwork:
-    """A fresh network for these data, weights drawn from the seed."""
+    """Build a fresh network for these data, with weights drawn from the seed."""
     tile = settings.network
     grid = TileGrid(facts.height_px, facts.width_px, tile.tile_px, tile.overlap_px) if tile.tile_px else None
     with torch.random.fork_rng():
@@ -91,7 +91,7 @@ def save_network(folder: Path, network: BlurNetwork) -> None:
 
 
 def load_run(folder: Path) -> tuple[BlurNetwork, TrainSettings, RunFacts]:
-    """The finished network of a run, in evaluation mode on the CPU."""
+    """Load the finished network of a run, in evaluation mode on the CPU."""
     settings, facts = read_settings(folder), read_facts(folder)
     if not (folder / NETWORK_NAME).is_file():
         raise InputError(
@@ -106,7 +106,7 @@ def load_run(folder: Path) -> tuple[BlurNetwork, TrainSettings, RunFacts]:
 
 
 def source_commit() -> str | None:
-    """The git commit of the source, with "-dirty" where files differ from it; None outside a checkout."""
+    """Return the git commit of the source, with "-dirty" if files differ from it; None outside a checkout."""
     folder = Path(__file__).resolve().parent
     command = ["git", "-C", str(folder), "describe", "--always", "--dirty", "--abbrev=40", "--exclude", "*"]
     try:

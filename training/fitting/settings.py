@@ -1,9 +1,4 @@
-"""Every choice of a training run in one frozen dataclass, saved as JSON beside the result.
-
-Single settings from the command line: `--set name=value`, of the type that the dataclass states.
-
-Settings to start from.
-"""
+"""Settings of a training run in one frozen dataclass, saved as JSON beside the result; presets; `--set name=value` overrides."""
 
 import difflib
 import math
@@ -119,7 +114,7 @@ Settings = TypeVar("Settings", NetworkSettings, TrainSettings)
 
 
 def _checked(kind: type[Settings], values: dict[str, Any], where: str) -> Settings:
-    """The dataclass from its JSON; raises InputError where a name is unknown."""
+    """Build the dataclass from its JSON; raises InputError for an unknown name."""
     unknown = set(values) - {each.name for each in fields(kind)}
     if unknown:
         raise InputError(f"{where} has unknown settings {sorted(unknown)}: expected some of {[each.name for each in fields(kind)]}")
@@ -139,9 +134,9 @@ def load_settings(path: Path) -> TrainSettings:
 
 
 def with_overrides(settings: TrainSettings, assignments: Sequence[str]) -> TrainSettings:
-    """Settings with each "name=value" replaced; names of the network's shape begin with "network.".
+    """Replace a setting for each "name=value"; names of the network's shape begin with "network.".
 
-    Giving one budget (minutes or epochs) takes the other away. Raises InputError where a name is unknown or a value of the wrong type.
+    Giving one budget (minutes or epochs) removes the other. Raises InputError for an unknown name or a value of the wrong type.
     """
     types_of = _types(TrainSettings)
     given = dict(_assignment(each, types_of) for each in assignments)
@@ -154,7 +149,7 @@ def with_overrides(settings: TrainSettings, assignments: Sequence[str]) -> Train
 
 
 def _types(kind: type, prefix: str = "") -> dict[str, Any]:
-    """Type by name of all settings, those inside of others with a dot."""
+    """Return the type by name of all settings, nested ones with a dot."""
     found: dict[str, Any] = {}
     for name, hint in get_type_hints(kind).items():
         found |= _types(hint, f"{prefix}{name}.") if isinstance(hint, type) and is_dataclass(hint) else {prefix + name: hint}
@@ -176,7 +171,7 @@ def _assignment(text: str, types_of: dict[str, Any]) -> tuple[str, Any]:
 
 
 def _reading(hint: Any) -> tuple[str, Callable[[str], Any]]:
-    """How values of a type are called, and what reads one from its text."""
+    """Return a type's name for people, and the function that parses its values."""
     if get_origin(hint) is Literal:
         choices = {str(choice): choice for choice in get_args(hint)}
         return "one of " + ", ".join(choices), lambda text: _among(choices, text)
@@ -195,7 +190,7 @@ def _among(choices: dict[str, Any], text: str) -> Any:
 
 
 def demo_settings(minutes: float = 2.5) -> TrainSettings:
-    """The preset of the demo: the gated form without tiles, which learns a lens in minutes on two cores."""
+    """Return the preset of the demo: the gated form without tiles, which learns a lens in minutes on two cores."""
     network = NetworkSettings(
         form="gated",
         width=2,
@@ -219,7 +214,7 @@ def demo_settings(minutes: float = 2.5) -> TrainSettings:
 
 
 def better_settings() -> TrainSettings:
-    """Our improvements together, for hours on a GPU: the gated form, with kernels for each colour that change over the frame.
+    """Return our improvements together, for hours on a GPU: the gated form, with kernels for each colour that change over the frame.
 
     It is signed and without range, so that headroom does not arise, and needs no tiles, so that it takes pictures of any size.
     """

@@ -1,6 +1,6 @@
-"""A run goes on only as what it was begun as.
+"""Fitting a network to focal stacks: settings and data are fixed here, then `Run` steps. All settings are in settings.py.
 
-Fit a network to focal stacks: what is learnt from what is settled here, then `Run` steps. Every choice is in settings.py.
+A run is continued only with the settings and data it was begun with.
 """
 
 import shutil
@@ -28,13 +28,13 @@ _MAY_DIFFER = ("threads", "device", "cache_mib", "checkpoint_every_s", "sheets")
 
 
 def require_same_settings(run_folder: Path, settings: TrainSettings) -> None:
-    """Raise InputError for other settings than those of the run, except where and how fast it computes and how often it writes."""
+    """Raise InputError for settings that differ from the run's, except where and how fast it computes and how often it writes."""
     if _begun(run_folder, SETTINGS_NAME):
         _require_same(run_folder, "settings", read_settings(run_folder), settings, _MAY_DIFFER)
 
 
 def require_same_data(run_folder: Path, facts: RunFacts) -> None:
-    """What a run has seen cannot be held out later."""
+    """Raise InputError for data that differ from the run's: what it has seen cannot be held out later."""
     if _begun(run_folder, FACTS_NAME):
         _require_same(run_folder, "data", read_facts(run_folder), facts, ("lens", "commit"))
 
@@ -52,7 +52,7 @@ def _require_same(run_folder: Path, what: str, before: object, now: object, may_
 
 
 def remove_unfinished(run_folder: Path) -> None:
-    """Remove what a killed run was writing: files get their name when they are whole."""
+    """Remove files that a killed run was writing; finished files have their final names."""
     for path in run_folder.rglob(".*.part.*"):
         path.unlink()
 
@@ -65,12 +65,12 @@ def fit(
     overwrite: bool = False,
     least_steps: int = LEAST_STEPS,
 ) -> Progress:
-    """Train, or go on training, into run_folder; a finished run is left as it is. held_out: see `TrainingData.split`.
+    """Train, or continue training, into run_folder; a finished run is left as it is. held_out: see `TrainingData.split`.
 
-    overwrite: start again where there is a run. least_steps: raises InputError, and writes or removes nothing, where the first steps say
-    that a budget in minutes has no time for so many.
-    Ctrl-C and SIGTERM end it after the step (StoppedError, a KeyboardInterrupt) with a checkpoint, from which the same call goes on; while
-    the first steps tell the time, with nothing changed.
+    overwrite: restart an existing run. least_steps: raises InputError, and writes or removes nothing, if the first steps show that a
+    budget in minutes has no time for so many.
+    Ctrl-C and SIGTERM end it after the step (StoppedError, a KeyboardInterrupt) with a checkpoint, from which the same call continues;
+    while the first steps are timed, with nothing changed.
     Processes that torchrun started train together; all need the data, only the first needs the folder.
     """
     with joined(settings.device) as ranks:
@@ -108,7 +108,7 @@ def _fit(
 
     with closing(pairs):
         facts = ranks.from_first(checked)
-        run = Run(Task(run_folder, settings, facts, pairs, validation), ranks, afresh=overwrite)
+        run = Run(Task(folder=run_folder, settings=settings, facts=facts, pairs=pairs, held_out=validation), ranks, afresh=overwrite)
         run.require_steps(least_steps)
         ranks.from_first(lambda: begun(facts))
         return run.train()

@@ -1,32 +1,27 @@
-"""DeepFocus (Xiao et al. 2018, "DeepFocus: Learned Image Synthesis for Computational Displays"), which Neural Bokeh compares itself with.
+"""The two networks that Neural Bokeh is compared with. Shapes are in words, as in training/networks/network.py.
 
-Written from the description alone. From the paper: the picture is interleaved (every 2 x 2 pixels become the channels of one, which
-loses nothing and doubles what a convolution sees); a stack of 3x3 convolutions with ELU and residual connections, 20 layers of 128
-filters, works there; a skip carries the interleaved input past it; de-interleaving gives the picture back.
-
-Ours, where we know of no statement or chose otherwise:
+DeepFocus (Xiao et al. 2018, "DeepFocus: Learned Image Synthesis for Computational Displays"), written from the description alone. From
+the paper: the picture is interleaved (every 2 x 2 pixels become the channels of one, which loses nothing and doubles the reach of a
+convolution); a stack of 3x3 convolutions with ELU and residual connections, 20 layers of 128 filters, works there; a skip carries
+the interleaved input past it; de-interleaving gives the picture back. Ours, where the paper is silent or we chose otherwise:
 - 20 layers are a first convolution, 9 residual blocks of two and a last one; `blocks` and `hidden` make other sizes.
 - A block is x + conv(ELU(conv(ELU(x)))), and the skip is concatenated before the last convolution, as in Neural Bokeh's Eq. 2.
-- The inputs are colour and circle of confusion (and place and lens where asked for), without the depth, which the circle is made of.
+- The inputs are colour and circle of confusion (and place and lens if requested), without the depth, from which the circle follows.
 - No batch normalisation: pictures come one at a time and differ in brightness, so that the statistics of a step are those of one
-  picture and not of the run. Residual branches that start small keep a deep stack trainable in its place.
+  picture and not of the run. Residual branches that start small keep a deep stack trainable instead.
 It learns faster from circles of confusion without a sign (`signed_coc` false).
 
-Shapes are in words, as in training/networks/network.py.
-
-Neural Cameras' blur (Mandl et al. 2021, "Neural Cameras: Learning Camera Characteristics for Coherent Mixed Reality Rendering"),
-which Neural Bokeh compares itself with: it "only learns the parameters of a Gaussian mixture model, which enables fast rendering, but
-suffers from a coarse approximation" (Mandl et al. 2024, Section 2.2).
-
-From the papers: a network gives the parameters of a mixture of Gaussians, and the mixture blurs. Ours, where we know no more:
-- A pointwise network of the circle of confusion (and place and lens where asked for) gives every pixel a mixture of `blocks`
-  Gaussians: weights, standard deviations and offsets. It starts near the standard deviation of a disc, a quarter of its diameter.
-- The mixture gathers: a pixel is a mean of its surroundings under its own mixture. It knows nothing of who hides whom.
+Neural Cameras' blur (Mandl et al. 2021, "Neural Cameras: Learning Camera Characteristics for Coherent Mixed Reality Rendering")
+"only learns the parameters of a Gaussian mixture model, which enables fast rendering, but suffers from a coarse approximation"
+(Mandl et al. 2024, Section 2.2). From the papers: a network gives the parameters of a mixture of Gaussians, and the mixture blurs.
+Ours, where we know no more:
+- A pointwise network of the circle of confusion (and place and lens if requested) gives every pixel a mixture of `blocks` Gaussians,
+  "a few" in the paper: weights, standard deviations and offsets. It starts near the standard deviation of a disc, a quarter of its
+  diameter.
+- The mixture gathers: a pixel is a mean of its surroundings under its own mixture. It ignores occlusion.
 - Rendering blends pictures blurred once by a few fixed Gaussians, sqrt(2) apart: a Gaussian between two of them is a share of each with
   the right variance; an offset is a share of the same picture shifted by about one standard deviation, with the right mean.
-
-Colours enter only as what is blurred, so the result is linear in radiance, and a lone light keeps all of its own.
-Shapes are in words, as in training/networks/network.py.
+Colours are only blurred, so the result is linear in radiance, and a single highlight keeps all of its light.
 """
 
 import itertools
@@ -48,9 +43,10 @@ SHARPEST_LOGIT = -6.0  # softplus gives 0.0025 px^2, the blur in focus at the st
 
 
 class DeepFocusTiles(nn.Module):
-    """Input (B, 4 or more, h, w) in [-1, 1]: R, G, B, circle of confusion, then place and lens where asked for; output (B, 3, h, w).
+    """DeepFocus on tiles.
 
-    Any size: an odd one is continued by a row or a column. Raises InputError where tiles is not 1.
+    Input (B, 4 or more, h, w) in [-1, 1]: R, G, B, circle of confusion, then place and lens if requested; output (B, 3, h, w).
+    Any size: an odd one is extended by a row or a column. Raises InputError if tiles is not 1.
     reach_px: how far from a pixel it looks. linear_in_radiance: it is not.
     """
 
@@ -84,7 +80,7 @@ class DeepFocusTiles(nn.Module):
 
     @torch.no_grad()
     def _start_as_identity(self, hidden: int) -> None:
-        """The last convolution copies the colours from the skip and adds little of the blocks, whose branches start small."""
+        """Let the last convolution copy the colours from the skip and add little of the blocks, whose branches start small."""
         weight, bias, cell = self.last.weight, self.last.bias, INTERLEAVING**2
         weight.mul_(START_OF_BRANCH)
         weight[:, hidden:] = 0.0
@@ -95,7 +91,7 @@ class DeepFocusTiles(nn.Module):
 
 
 def interleave(x: Tensor) -> Tensor:
-    """(B, C, h, w) to (B, 4 C, ceil(h / 2), ceil(w / 2)): the four pixels of a cell as channels, channel by channel, row by row."""
+    """Turn (B, C, h, w) into (B, 4 C, ceil(h / 2), ceil(w / 2)): the four pixels of a cell as channels, channel by channel, row by row."""
     height, width = x.shape[2:]
     # One line more on each side, of which as many are cut again as are not needed: no branch on the size, so that it stays free in ONNX.
     whole = functional.pad(x, (0, 1, 0, 1), mode="replicate")
@@ -103,7 +99,7 @@ def interleave(x: Tensor) -> Tensor:
 
 
 class _Convolution(nn.Conv2d):
-    """3x3 that keeps the size; what lies beyond the border is a setting."""
+    """A 3x3 convolution that keeps the size; the padding is a setting."""
 
     def __init__(self, inputs: int, outputs: int, settings: NetworkSettings) -> None:
         super().__init__(inputs, outputs, 3, padding=1, padding_mode=settings.padding)
@@ -122,9 +118,10 @@ class _ResidualBlock(nn.Module):
 
 
 class NeuralCameraTiles(nn.Module):
-    """Input (B, 4 or more, h, w) in [-1, 1]: R, G, B, circle of confusion, then place and lens where asked for; output (B, 3, h, w).
+    """Neural Cameras' mixture of Gaussians on tiles.
 
-    blocks: Gaussians in the mixture. Raises InputError where tiles is not 1. Beyond its border the picture is continued.
+    Input (B, 4 or more, h, w) in [-1, 1]: R, G, B, circle of confusion, then place and lens if requested; output (B, 3, h, w).
+    blocks: Gaussians in the mixture. Raises InputError if tiles is not 1. Beyond its border the picture is extended.
     reach_px: how far from a pixel it looks. linear_in_radiance: true without an activation at the end.
     """
 
@@ -145,7 +142,7 @@ class NeuralCameraTiles(nn.Module):
 
     @torch.no_grad()
     def _start_as_discs(self) -> None:
-        """Everywhere the same mixture of Gaussians around that of a disc; different ones, so that each can go its own way."""
+        """Start with one mixture everywhere, of different Gaussians around that of a disc, so that each can develop on its own."""
         last = self.layers[-1]
         assert isinstance(last, nn.Conv2d) and last.bias is not None
         last.weight.mul_(0.1)
@@ -168,7 +165,7 @@ class NeuralCameraTiles(nn.Module):
         return torch.tanh(y) if self.activation == "tanh" else y
 
     def mixture(self, coc: Tensor, more: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """(weights, variances in px^2, offsets x and y in shifts of the bank), each (B, colours, Gaussians, h, w), of every pixel.
+        """Return (weights, variances in px^2, offsets x and y in shifts of the bank), each (B, colours, Gaussians, h, w), of every pixel.
 
         coc (B, 1, h, w) as a fraction of the largest; more: place and lens.
         """
@@ -184,13 +181,13 @@ class NeuralCameraTiles(nn.Module):
 
 
 def _taps(offset_x: Tensor, offset_y: Tensor) -> tuple[Tensor, ...]:
-    """Shares of the unshifted picture and of those shifted right, left, down and up; they sum to 1 and their mean is the offset."""
+    """Return the shares of the unshifted picture and of those shifted right, left, down and up; their sum is 1, their mean the offset."""
     sides = [functional.relu(each) for each in (offset_x, -offset_x, offset_y, -offset_y)]
     return (1.0 - offset_x.abs() - offset_y.abs(), *sides)
 
 
 def bank_sigmas_px(largest_coc_px: float) -> list[float]:
-    """0 and then standard deviations sqrt(2) apart, up to the widest that a mixture for this circle of confusion may need."""
+    """Return 0 and then standard deviations sqrt(2) apart, up to the widest that a mixture for this circle of confusion may need."""
     largest = max(SMALLEST_SIGMA_PX, LARGEST_SIGMA_OVER_COC * abs(largest_coc_px))
     steps = max(1, math.ceil(math.log(largest / SMALLEST_SIGMA_PX, SIGMA_RATIO)))
     return [0.0] + [SMALLEST_SIGMA_PX * SIGMA_RATIO**step for step in range(steps + 1)]
@@ -213,13 +210,13 @@ class GaussianBank(nn.Module):
         self.register_buffer("variances", variances, persistent=False)
 
     def shares(self, variance: Tensor) -> list[Tensor]:
-        """How much of each blurred picture makes a Gaussian of this variance (px^2): linear between two neighbours, 1 beyond the last."""
+        """Return the share of each blurred picture in a Gaussian of this variance (px^2): linear between neighbours, 1 beyond the last."""
         lines = [((variance - low) / (high - low)).clamp(0.0, 1.0) for low, high in zip(self.variances, self.variances[1:], strict=False)]
         below = [torch.ones_like(variance), *lines]
         return [reached - passed for reached, passed in zip(below, [*lines, torch.zeros_like(variance)], strict=True)]
 
     def shifted(self, rgb: Tensor, index: int) -> tuple[Tensor, ...]:
-        """(B, 3, h, w) blurred, as seen from each pixel and from `shifts_px` right, left, below and above of it."""
+        """Return (B, 3, h, w) blurred, as seen from each pixel and from `shifts_px` right, left, below and above of it."""
         height, width = rgb.shape[2:]
         shift, radius = self.shifts_px[index], self.radii_px[index]
         wide = functional.pad(rgb, (radius + shift,) * 4, mode="replicate")
@@ -230,7 +227,7 @@ class GaussianBank(nn.Module):
 
 
 def gaussian_kernel(sigma_px: float, radius_px: int) -> Tensor:
-    """(1, 1, 1, 2 radius + 1), sum 1: a Gaussian at the centres of pixels; a single 1 for sigma 0."""
+    """Return (1, 1, 1, 2 radius + 1), sum 1: a Gaussian at the centres of pixels; a single 1 for sigma 0."""
     if radius_px == 0:
         return torch.ones(1, 1, 1, 1)
     offsets = torch.arange(-radius_px, radius_px + 1, dtype=torch.float64)
@@ -239,6 +236,6 @@ def gaussian_kernel(sigma_px: float, radius_px: int) -> Tensor:
 
 
 def _variance(kernel: Tensor) -> Tensor:
-    """Return the variance of what the kernel does on pixels, which for a narrow one differs from sigma^2."""
+    """Return the variance of the sampled kernel, which differs from sigma^2 for a narrow one."""
     radius = kernel.shape[-1] // 2
     return (kernel[0, 0, 0] * torch.arange(-radius, radius + 1, dtype=torch.float32).square()).sum()

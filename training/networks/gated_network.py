@@ -1,8 +1,4 @@
-"""Which circles of confusion each kernel of the gated form serves.
-
-How place and lens choose between the kernels of a bin.
-
-Our gated variant of Neural Bokeh: the same growing per-channel kernels, each serving the pixels whose blur it fits.
+"""Our gated variant of Neural Bokeh: the same growing per-channel kernels, each serving the pixels whose blur it fits.
 
 The published network must find out by itself, from one input channel, which kernel size belongs to which pixel. Here
 the residual blocks stand side by side instead of in a row, and the circle of confusion opens the gate of each:
@@ -19,7 +15,7 @@ other, and alpha like colour.
 
 Blur that varies over the frame, or with the lens's settings, needs no tiles: a bin has several kernels k_nb (`field_bases`), and
 colour_n = sum over b of k_nb * (share_nb gate_n rgb). The shares sum to 1 and depend on place and lens at the source q, where the
-light comes from, so light is conserved; see training/networks/gated_network.py.
+light comes from, so light is conserved (`FieldMixing`).
 """
 
 import math
@@ -34,9 +30,9 @@ LOGIT_LIMIT = 10.0
 
 
 def bins_px(blocks: int, per_size: int, signed: bool) -> tuple[list[float], list[int]]:
-    """(circles of confusion at which the gates peak, n of each one's kernel), by n, near before far.
+    """Return (circles of confusion at which the gates peak, n of each one's kernel), by n, near before far.
 
-    Kernel size 2n+1 serves diameters up to 2n-1: the pixel left on each side is for what the sensor itself blurs (its colour
+    Kernel size 2n+1 serves diameters up to 2n-1: the pixel left on each side is for the sensor's own blur (its colour
     filters, the resampling of registration). n = 1 serves 1 px and below (signed: its gate peaks at 0), every other n per_size diameters.
     """
     knots, radii = [0.0 if signed else 1.0], [1]
@@ -48,12 +44,12 @@ def bins_px(blocks: int, per_size: int, signed: bool) -> tuple[list[float], list
 
 
 def blocks_for_gates(largest_coc_px: float) -> int:
-    """The smallest N whose largest kernel, 2N+1 px, serves this circle of confusion (diameter)."""
+    """Return the smallest N whose largest kernel, 2N+1 px, serves this circle of confusion (diameter)."""
     return max(1, math.ceil((abs(largest_coc_px) + 1.0) / 2.0))
 
 
 def hat_lines(knots: list[float]) -> Tensor:
-    """(4, bins): slope and offset of each hat's rising line, then of its falling line; the outermost hats stay at 1."""
+    """Return (4, bins): slope and offset of each hat's rising line, then of its falling line; the outermost hats stay at 1."""
     ascending = sorted(knots)
     lines = []
     for knot in knots:
@@ -70,9 +66,9 @@ def _line_to_one(zero_at: float, one_at: float) -> tuple[float, float]:
 
 
 class FieldMixing(nn.Module):
-    """For every pixel and bin, shares of its light that sum to 1, one for each of the bin's kernels.
+    """Shares of each pixel's light in the kernels of a bin, which sum to 1.
 
-    A pointwise network of place and lens, then a softmax. It does not see the picture, so what it mixes stays linear in radiance.
+    A pointwise network of place and lens, then a softmax. It does not see the picture, so the mixture stays linear in radiance.
     """
 
     def __init__(self, inputs: int, hidden: int, bins: int, bases: int, tiles: int) -> None:
@@ -83,12 +79,12 @@ class FieldMixing(nn.Module):
         self.bias = nn.Parameter(torch.zeros(tiles, bins, bases))
 
     def features(self, where: Tensor) -> Tensor:
-        """(B, tiles, inputs, h, w) in [-1, 1] to (B, tiles * hidden, h, w)."""
+        """Map (B, tiles, inputs, h, w) in [-1, 1] to (B, tiles * hidden, h, w)."""
         batch, _, _, height, width = where.shape
         return torch.tanh(self.enter(where.reshape(batch, -1, height, width)))
 
     def shares(self, features: Tensor, bins: list[int]) -> Tensor:
-        """(B, tiles, these bins, bases, h, w)."""
+        """Return (B, tiles, these bins, bases, h, w)."""
         batch, _, height, width = features.shape
         weight, bias = self.weight[:, bins].reshape(-1, self.hidden, 1, 1), self.bias[:, bins].reshape(-1)
         logits = nn.functional.conv2d(features, weight, bias, groups=self.tile_count)
@@ -139,19 +135,19 @@ class GatedTiles(nn.Module):
         return torch.tanh(y) if self.activation == "tanh" else y
 
     def _used_bins(self, gates: Tensor) -> list[int]:
-        """The bins that any pixel belongs to; the others spread nothing and are left out, except from an exported graph."""
+        """Return the bins that any pixel belongs to; the others spread nothing and are skipped, except in an exported graph."""
         if torch.compiler.is_exporting():
             return list(range(len(self.knots)))
         return gates.detach().amax(dim=(0, 1, 3, 4)).nonzero()[:, 0].tolist()
 
     def gates(self, coc: Tensor) -> Tensor:
-        """(B, tiles, 1, h, w) circles of confusion in [-1, 1] to (B, tiles, bins, h, w): linear hats that sum to 1."""
+        """Map (B, tiles, 1, h, w) circles of confusion in [-1, 1] to (B, tiles, bins, h, w): linear hats that sum to 1."""
         position = coc * self.largest_coc_px if self.signed else (coc + 1.0) * (0.5 * self.largest_coc_px)
         rise, rise_0, fall, fall_0 = self.hats[:, None, None, :, None, None]
         return torch.minimum(position * rise + rise_0, position * fall + fall_0).clamp(0.0, 1.0)
 
     def _spread(self, rgb: Tensor, gates: Tensor, where: Tensor, used: list[int]) -> Tensor:
-        """What the used bins spread: (B, tiles, used, 3 + colours, h, w), colour and then the coverage of each kernel."""
+        """Return what the used bins spread: (B, tiles, used, 3 + colours, h, w), colour and then the coverage of each kernel."""
         light = torch.cat([rgb, torch.ones_like(rgb[:, :, : self.colours])], dim=2)[:, :, None]
         features = None if self.mixing is None else self.mixing.features(where)
         by_size = []
@@ -166,7 +162,7 @@ class GatedTiles(nn.Module):
         return torch.cat(by_size, dim=2)
 
     def _convolved(self, gated: Tensor, n: int, members: list[int]) -> Tensor:
-        """Bins of one size through their kernels; the coverage of a kernel goes the same way as its light.
+        """Convolve the bins of one size with their kernels, light and coverage alike.
 
         gated: (B, tiles, members, 3 + colours, h, w), with several bases (B, tiles, members, bases, 3 + colours, h, w).
         """
@@ -182,7 +178,7 @@ class GatedTiles(nn.Module):
         return blurred if self.mixing is None else blurred.sum(dim=3)
 
     def _weights(self, gates: Tensor, coverage: Tensor, used: list[int]) -> Tensor:
-        """(B, tiles, used, h, w): how much each used bin counts at a pixel, from the circles of confusion alone."""
+        """Return (B, tiles, used, h, w): the weight of each used bin at a pixel, from the circles of confusion alone."""
         batch, tiles, bins, height, width = gates.shape
         if len(used) < bins:
             coverage = torch.zeros_like(gates).index_copy(2, torch.tensor(used, device=gates.device), coverage)

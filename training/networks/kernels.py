@@ -1,11 +1,9 @@
-"""Depthwise convolutions whose gradient does not take minutes on a CPU.
+"""Depthwise convolutions with a fast gradient on the CPU, and the kernels with which networks start.
 
 Blur of d pixels needs kernels d + 1 wide, and PyTorch's own gradient with respect to depthwise weights grows on a CPU much faster than
 the convolution itself: one of 35 x 35 over 128 x 128 pixels took 170 times as long backward as forward. The gradient of a kernel is the
-correlation of what went in with the gradient of what came out, of which only the kernel's own pixels are wanted, and that of the input
-a convolution. Fourier transforms give both in about the time of the convolution forward.
-
-The kernels that the gated form begins with.
+correlation of the input with the gradient of the output, of which only the kernel's own pixels are needed, and that of the input
+is a convolution. Fourier transforms give both in about the time of the convolution forward.
 """
 
 import math
@@ -30,7 +28,7 @@ CAT_EYE, LEAN = 0.6, 0.5
 
 
 def depthwise(maps: Tensor, kernels: Tensor, bias: Tensor | None = None, padding: int = 0) -> Tensor:
-    """Every channel of (B, C, H, W) with its own (C, 1, k, k): `functional.conv2d` with C groups, in value and in gradient."""
+    """Convolve every channel of (B, C, H, W) with its own (C, 1, k, k): `functional.conv2d` with C groups, in value and in gradient."""
     if not _worth_it(maps, kernels):
         return functional.conv2d(maps, kernels, bias, padding=padding, groups=kernels.shape[0])
     blurred: Tensor = _Depthwise.apply(maps, kernels, padding)
@@ -38,7 +36,7 @@ def depthwise(maps: Tensor, kernels: Tensor, bias: Tensor | None = None, padding
 
 
 def _worth_it(maps: Tensor, kernels: Tensor) -> bool:
-    """On a CPU, in single precision, with wide kernels, and where a gradient is wanted at all."""
+    """Tell whether Fourier transforms pay: on a CPU, in single precision, with wide kernels, and if a gradient is needed at all."""
     if torch.compiler.is_exporting() or not (torch.is_grad_enabled() and kernels.requires_grad):
         return False
     return kernels.shape[-1] >= LEAST_SIZE and maps.device.type == "cpu" and not torch.is_autocast_enabled("cpu")
@@ -66,7 +64,7 @@ class _Depthwise(torch.autograd.Function):
 def _gradients(
     maps: Tensor, kernels: Tensor, gradient: Tensor, padding: int, wanted: tuple[bool, bool]
 ) -> tuple[Tensor | None, Tensor | None]:
-    """(of the maps, of the kernels (C, k, k)), each where it is wanted.
+    """Return (of the maps, of the kernels (C, k, k)), each if needed.
 
     With out(p) = sum over o of maps(p + o - padding) kernel(o), that of maps(q) is sum over o of gradient(q + padding - o) kernel(o), and
     that of kernel(o) the sum over p of maps(p + o - padding) gradient(p).
@@ -85,12 +83,12 @@ def _gradients(
 
 
 def disc_kernel(size: int, diameter_px: float) -> Tensor:
-    """(size, size): a disc with exact pixel coverage, sum 1."""
+    """Return (size, size): a disc with exact pixel coverage, sum 1."""
     return _kernel(Aperture.disc(sides=64), size, diameter_px)
 
 
 def fresh_kernels(n: int, knots_px: list[float], bases: int, initialisation: str) -> Tensor:
-    """(bins * bases, 2n+1, 2n+1), bases fastest: a kernel is their magnitude over its sum; a typical one is 1.
+    """Return (bins * bases, 2n+1, 2n+1), bases fastest: a kernel is their magnitude over its sum; a typical one is 1.
 
     knots_px: signed diameters of the bins that have this size. Discs, or by "default" flat squares.
     """
@@ -114,7 +112,7 @@ def _kernel(opening: Aperture, size: int, diameter_px: float) -> Tensor:
 
 
 def _sides(bases: int) -> list[tuple[float, float]]:
-    """Evenly spread directions, one for each base; none for a single one."""
+    """Return evenly spread directions, one for each base; none for a single one."""
     angles = [2.0 * math.pi * base / bases for base in range(bases)]
     return [(math.cos(angle), math.sin(angle)) for angle in angles] if bases > 1 else [(0.0, 0.0)]
 
@@ -125,6 +123,6 @@ def _openings(bases: int) -> list[Aperture]:
 
 
 def _floors(n: int, bases: int) -> list[Tensor]:
-    """Each (2n+1, 2n+1), sum 1, LEAN more at its own side than in the middle."""
+    """Return kernels (2n+1, 2n+1) with sum 1, each LEAN more at its own side than in the middle."""
     along = torch.arange(-n, n + 1) / n
     return [(1.0 + LEAN * (x * along + y * along[:, None]) / math.sqrt(2.0)) / (2 * n + 1) ** 2 for x, y in _sides(bases)]

@@ -1,14 +1,8 @@
-"""f-number and focal length as a network sees them: in stops and octaves, over the range it was trained on.
+"""The frame of all networks: a sharp picture and its circles of confusion in, a blurred picture out (Mandl et al. 2024, Section 3).
 
-Overlapping tiles: a picture as tiles stacked along the channels, and back with overlaps averaged (Neural Bokeh, Section 3.2).
-
-Annotations are plain tensors with shapes in words: exporting traces these functions with sizes that are symbols, which a
-shape check would freeze.
-
-What all networks share: a sharp picture and its circles of confusion in, a blurred picture out (Mandl et al. 2024, Section 3).
-
-Here are the ranges, the tiles and the inputs; the four forms are in published_tiles.py, gated_network.py, deepfocus_network.py and
-neural_camera_network.py. The circle of confusion enters as a fraction of the largest one, mapped to [-1, 1] as the colours are.
+Ranges, tiles and inputs are here; the four forms are in published_network.py, gated_network.py and baseline_networks.py. The circle
+of confusion enters as a fraction of the largest one, mapped to [-1, 1] as the colours are; f-number and focal length enter in stops
+and octaves over the range of training. Overlapping tiles are stacked along the channels, and overlaps averaged (Section 3.2).
 
 Shapes are in words here, not in annotations: exporting traces with sizes that are symbols, which a shape check would freeze.
 """
@@ -34,7 +28,7 @@ LEAST_RATIO = 2.0
 
 
 class LensScale(nn.Module):
-    """(B, 2) f-number and focal length in mm to (B, 2) in [-1, 1]: the logarithm of each, its trained range from -1 to 1.
+    """Map (B, 2) f-number and focal length in mm to (B, 2) in [-1, 1]: the logarithm of each, its trained range from -1 to 1.
 
     Logarithms, because blur follows ratios of both. A range narrower than a factor of 2 counts as that wide about its middle, so
     that what hardly varied in training is hardly amplified. The ranges belong to the run, not to the weights: they are not saved with them.
@@ -56,7 +50,7 @@ class LensScale(nn.Module):
 
 @dataclass(frozen=True)
 class TileGrid:
-    """Where the tiles of a picture lie.
+    """Positions of the tiles of a picture.
 
     Neighbouring tiles start tile_px - overlap_px apart; the last one is shifted back to end at the border, so that every tile
     is whole. A picture smaller than a tile has one tile of its own size along that side.
@@ -69,12 +63,12 @@ class TileGrid:
 
     @property
     def tile_size_px(self) -> tuple[int, int]:
-        """(height, width) of every tile."""
+        """Return (height, width) of every tile."""
         return min(self.tile_px, self.height_px), min(self.tile_px, self.width_px)
 
     @property
     def origins_px(self) -> tuple[tuple[int, int], ...]:
-        """(top, left) of the tiles, row by row."""
+        """Return (top, left) of the tiles, row by row."""
         rows, columns = (_starts(length, self.tile_px, self.overlap_px) for length in (self.height_px, self.width_px))
         return tuple((top, left) for top in rows for left in columns)
 
@@ -88,18 +82,18 @@ def _starts(length_px: int, tile_px: int, overlap_px: int) -> list[int]:
 
 
 def split(picture: Tensor, grid: TileGrid) -> Tensor:
-    """(B, C, H, W) to (B, tiles * C, t, t): the channels of the first tile, then those of the second, and so on."""
+    """Split (B, C, H, W) into (B, tiles * C, t, t): the channels of the first tile, then those of the second, and so on."""
     height, width = grid.tile_size_px
     return torch.cat([picture[:, :, top : top + height, left : left + width] for top, left in grid.origins_px], dim=1)
 
 
 def assemble(tiles: Tensor, grid: TileGrid) -> Tensor:
-    """(B, tiles * C, t, t) to (B, C, H, W): every tile at its place, the mean where they overlap."""
+    """Assemble (B, tiles * C, t, t) to (B, C, H, W): every tile at its place, the mean where they overlap."""
     return _sum_placed(tiles.chunk(len(grid), dim=1), grid) / tile_count(grid).to(tiles)
 
 
 def tile_count(grid: TileGrid) -> Tensor:
-    """(H, W): how many tiles cover each pixel."""
+    """Return (H, W): how many tiles cover each pixel."""
     return _sum_placed([torch.ones(1, 1, *grid.tile_size_px)] * len(grid), grid)[0, 0]
 
 
@@ -109,17 +103,17 @@ def _sum_placed(tiles: Sequence[Tensor], grid: TileGrid) -> Tensor:
 
 
 def _placed(tile: Tensor, origin_px: tuple[int, int], grid: TileGrid) -> Tensor:
-    """A tile in a picture that is 0 elsewhere."""
+    """Place a tile in a picture that is 0 elsewhere."""
     (top, left), (height, width) = origin_px, grid.tile_size_px
     return functional.pad(tile, (left, grid.width_px - left - width, top, grid.height_px - top - height))
 
 
 class BlurNetwork(nn.Module):
-    """Linear radiance and circles of confusion in, linear radiance out; tiling and the mapping to [-1, 1] are inside.
+    """A network from linear radiance and circles of confusion to linear radiance, with tiling and the mapping to [-1, 1] inside.
 
     radiance_scale: the largest radiance of the data; `headroom` times it becomes +1 inside, 0 becomes -1.
     grid: the tiles, for one size of picture; None takes the whole picture as one tile of any size.
-    lens_ranges: trained on, for a network that takes the lens as input.
+    lens_ranges: of training, for a network that takes the lens as input.
     linear_in_radiance: doubled light gives a doubled result. reach_px: how far from a pixel the network looks.
     """
 
@@ -142,19 +136,19 @@ class BlurNetwork(nn.Module):
         self.tiles: nn.Module = form
 
     def forward(self, rgb: Tensor, coc_px: Tensor, place: Tensor | None = None, lens: Tensor | None = None) -> Tensor:
-        """rgb (B, 3, H, W) linear; coc_px (B, 1, H, W) signed diameters; the result is (B, 3, H, W) linear.
+        """Blur rgb (B, 3, H, W) linear with coc_px (B, 1, H, W) signed diameters; the result is (B, 3, H, W) linear.
 
-        place (B, 2, H, W), field positions, and lens (B, 2), f-number and focal length in mm, are needed where the settings say so.
+        place (B, 2, H, W), field positions, and lens (B, 2), f-number and focal length in mm, are needed if the settings say so.
         """
         y = self._tiles(rgb, coc_px, place, lens)
         return self._radiance(y if self.grid is None else assemble(y, self.grid))
 
     def tile_outputs(self, rgb: Tensor, coc_px: Tensor, place: Tensor | None = None, lens: Tensor | None = None) -> Tensor:
-        """(B, 3 tiles, t, t) linear: what every tile makes of its part, before overlaps are averaged."""
+        """Return (B, 3 tiles, t, t) linear: the result of every tile, before overlaps are averaged."""
         return self._radiance(self._tiles(rgb, coc_px, place, lens))
 
     def encode(self, rgb: Tensor, coc_px: Tensor, place: Tensor | None = None, lens: Tensor | None = None) -> Tensor:
-        """The network's input (B, C, H, W), all in [-1, 1]: R, G, B, circle of confusion, then place and lens where they are used."""
+        """Return the network's input (B, C, H, W), all in [-1, 1]: R, G, B, circle of confusion, then place and lens if they are used."""
         fraction = coc_px / self.largest_coc_px
         coc = fraction.clamp(-1.0, 1.0) if self.signed_coc else 2.0 * fraction.abs().clamp(max=1.0) - 1.0
         planes = [rgb * (2.0 / self.top) - 1.0, coc]
@@ -176,14 +170,14 @@ class BlurNetwork(nn.Module):
 
 @runtime_checkable
 class Form(Protocol):
-    """What computes: x (B, C tiles, t, t) to y (B, 3 tiles, t, t), colours in [-1, 1] (an nn.Module)."""
+    """The computing part, an nn.Module: x (B, C tiles, t, t) to y (B, 3 tiles, t, t), colours in [-1, 1]."""
 
     linear_in_radiance: bool
     reach_px: int
 
 
 def form_of(settings: NetworkSettings, largest_coc_px: float, tiles: int) -> Form:
-    """A fresh network of that form; N follows from the largest circle of confusion unless the settings give it."""
+    """Build a fresh network of that form; N follows from the largest circle of confusion unless the settings give it."""
     if settings.form == "gated":
         from training.networks.gated_network import GatedTiles, blocks_for_gates
 

@@ -1,4 +1,4 @@
-"""The shape of a network: every choice of Neural Bokeh, of our improvements and of what it is compared with."""
+"""Settings of a network's shape: every choice of Neural Bokeh, of our improvements and of the networks it is compared with."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -12,7 +12,7 @@ class NetworkSettings:
 
     form: "published" stacks residual blocks one after the other; "gated" is our variant in which every kernel size
         serves the pixels whose circle of confusion it fits (training/networks/gated_network.py); "deepfocus" and "neural_camera" are the
-        networks that the paper compares itself with (training/networks/baseline_networks.py, neural_camera_network.py).
+        networks that the paper compares itself with (training/networks/baseline_networks.py).
     kernels: published form: "growing" as published, or "3x3" in as many blocks (Table 1, row 2).
     blocks: N; None takes the smallest N whose largest kernel, 2N+1 px, covers the largest circle of confusion of the data.
     width: published form: features per colour channel (the paper's three-channel tensor is 1);
@@ -26,7 +26,7 @@ class NetworkSettings:
     lens_inputs: f-number and focal length are inputs, so that one network serves a lens at all its settings (training/networks/network.py).
     field_bases: gated form: kernels per bin, between which place and lens choose; 1 is the same kernel everywhere.
     headroom: the top of the network's range over the largest radiance of the data; black stays its bottom. tanh never reaches its ends,
-        so with 1, as published, a light at the very top is cut: by 12 % when an identity starts to learn, by 0.3 to 3 % after 800
+        so with 1, as published, a highlight at the very top is cut: by 12 % when an identity starts to learn, by 0.3 to 3 % after 800
         steps of one block on made lights. With 1.5 it is not cut, but what is darker than white gets 1.5 times the error, because
         all of it moves nearer to the lower end, where tanh is flat too. So the presets keep 1; lights beyond the data's are no
         matter of the range (OnnxNetwork splits them off), and "identity" has no such ends.
@@ -86,5 +86,5 @@ class NetworkSettings:
 
     @property
     def input_channels(self) -> int:
-        """R, G, B and circle of confusion; two for the place and two for the lens where they are inputs."""
+        """Return the number of inputs: R, G, B and circle of confusion; two for the place and two for the lens if they are inputs."""
         return 4 + 2 * self.field_position + 2 * self.lens_inputs

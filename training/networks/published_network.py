@@ -4,7 +4,7 @@ Our reading of what the paper leaves open:
 - "Per-channel convolutions" are depthwise: C1 makes a three-channel tensor per tile, and each of its channels has its own kernels.
 - A block is the basic block of He et al. 2016, which the paper cites: R(x) = ReLU(x + conv(ReLU(conv(x)))).
 - Every convolution pads its input, so that a block keeps the size of a tile (replicated border unless set otherwise).
-- Place and lens, which the paper does not have, enter C1 beside the circle of confusion, where the settings ask for them.
+- Place and lens, which the paper does not have, enter C1 beside the circle of confusion, if the settings ask for them.
 """
 
 from typing import Literal
@@ -18,7 +18,7 @@ from training.networks.network_settings import NetworkSettings
 
 
 class PublishedTiles(nn.Module):
-    """F(x) = tanh(C2(R_N(... R_1(C1(x)) ...) + x_RGB)) of Eq. 2, "+" being concatenation, for all tiles at once.
+    """The published network for all tiles at once: F(x) = tanh(C2(R_N(... R_1(C1(x)) ...) + x_RGB)) of Eq. 2, "+" being concatenation.
 
     Input (B, C tiles, t, t), output (B, 3 tiles, t, t). All convolutions are grouped, so no tile sees another.
     """
@@ -50,7 +50,7 @@ class PublishedTiles(nn.Module):
 
     @torch.no_grad()
     def _start_as_identity(self, features: int) -> None:
-        """C1 copies the colours, lifted above the ReLU; C2 takes half of its answer from the blocks and half from the skip."""
+        """Let C1 copy the colours, lifted above the ReLU, and C2 take half of its answer from the blocks and half from the skip."""
         colour = torch.arange(features) % 3
         c1 = self.c1.weight.view(self.tile_count, features, -1)
         c1.mul_(0.1)
@@ -66,7 +66,7 @@ class PublishedTiles(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """R_n: two per-channel convolutions of size 2 radius + 1, each followed by a ReLU, the second after the residual sum.
+    """The block R_n: two per-channel convolutions of size 2 radius + 1, each followed by a ReLU, the second after the residual sum.
 
     radius: n as published; 1 in every block of the variant with 3x3 kernels (Table 1, row 2).
     """
