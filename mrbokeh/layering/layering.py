@@ -66,7 +66,7 @@ def render_layers(layers: Sequence[Layer], lens: Lens, kernel_sum: KernelSum | P
     margin = psf.margin_px(layers, coc_px)
     frame = Frame(layers[0].width_px, layers[0].height_px, -margin, -margin)
     with ThreadPoolExecutor(cores()) as pool:
-        slicing = Slicing(psf, layering.slices, frame, pool, _KEPT)
+        slicing = Slicing(psf=psf, slices=layering.slices, frame=frame, pool=pool, memory=_KEPT)
         groups = _groups([pad_layer(layer, each, margin, pool) for layer, each in zip(layers, coc_px, strict=True)])
         colour, taken = _rendered(groups[-1], layering, slicing)
         for group in reversed(groups[:-1]):

@@ -192,7 +192,13 @@ class AperturePsf:
     def of(cls, layers: Sequence[Layer], aperture: Aperture, kernel_sum: KernelSum, field_cells: tuple[int, int]) -> "AperturePsf":
         """Make one that knows the motion of these layers."""
         farthest = farthest_px(layers)
-        return cls(aperture, kernel_sum, field_cells, motion_channels(layers[0].extra) if farthest else None, farthest)
+        return cls(
+            aperture=aperture,
+            kernel_sum=kernel_sum,
+            field_cells=field_cells,
+            motion=motion_channels(layers[0].extra) if farthest else None,
+            farthest_px=farthest,
+        )
 
     @property
     def coverages(self) -> int:

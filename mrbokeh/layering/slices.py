@@ -19,88 +19,11 @@ from mrbokeh.layering.psf_over_field import Frame, PsfField
 from mrbokeh.system.resources import ZeroedMemory, ahead, bands, cores, in_bands
 
 _SORTED_PIXELS = 1 << 14
-
 Window = tuple[slice, slice]
-
-
-def sorted_slices(
-    layers: Sequence[Pixels], shares: Sequence[Shares], step_px: float, width: int, pool: Executor
-) -> list[tuple[int, list[Part]]]:
-    """Return number and parts of each slice that is not empty, front first; a slice holds circles of confusion nearest to its number times
-    the step.
-
-    width: of the frame that places are counted in.
-    """
-    used = [(layer, share) for layer, share in zip(layers, shares, strict=True) if share.any()]
-    runs = [_runs(*each, np.float32(step_px), width, pool) for each in used]
-    slices = np.unique(np.concatenate([np.empty(0, np.int32), *(of_runs for of_runs, _ in runs)]))
-    cuts = [np.split(of_layer, np.searchsorted(of_runs, slices[1:])) for of_runs, of_layer in runs]
-    parts = [[Part(*each, cut) for each, cut in zip(used, cut_of, strict=True) if len(cut) > 0] for cut_of in zip(*cuts, strict=True)]
-    return list(zip(slices.tolist(), parts, strict=True))
-
-
-def _runs(
-    layer: Pixels, shares: Shares, step_px: np.float32, width: int, pool: Executor
-) -> tuple[Int32[np.ndarray, " runs"], Int32[np.ndarray, "runs 2"]]:
-    """Return the slices of a layer's runs, ascending, and the runs, in order within each slice."""
-    from mrbokeh.layering._slices_numba import runs_of_slices
-
-    pixels = layer.places, layer.coc_px, shares, width, step_px
-    found = list(pool.map(lambda band: runs_of_slices(*pixels, *band), bands(len(shares), _SORTED_PIXELS)))
-    runs = np.concatenate([np.empty((0, 3), np.int32), *found])
-    runs = runs[np.argsort(runs[:, 0], kind="stable")]
-    return runs[:, 0].copy(), runs[:, 1:].copy()
-
-
-def window_of(parts: Sequence[Part], reach: int, frame: Frame) -> Window | None:
-    """Return the smallest window that holds these pixels, as far as they are seen, and where they are seen; None if nothing is.
-
-    reach: how many pixels their light travels at most. Rows and columns are those of an array that lies as the frame says.
-    """
-    from mrbokeh.layering._slices_numba import extent
-
-    width = frame.width_px - 2 * frame.left_px
-    tops, bottoms, lefts, rights = zip(*(extent(part.runs, part.pixels.places, width) for part in parts), strict=True)
-    rows = _span(min(tops), max(bottoms), reach, -frame.top_px, frame.height_px)
-    columns = _span(min(lefts), max(rights), reach, -frame.left_px, frame.width_px)
-    return None if rows is None or columns is None else (rows, columns)
-
-
-def _span(first: int, end: int, reach: int, inside: int, length: int) -> slice | None:
-    """Return the range of pixels first to end that reach the inside, together with the part of the inside that they reach; None if none
-    does.
-    """
-    first, end = max(first, inside - reach), min(end, inside + length + reach)
-    return slice(min(first, max(first - reach, inside)), max(end, min(end + reach, inside + length))) if first < end else None
-
-
 _LEAST_CELL_PX = 16
 _MOST_CELLS = 64
 _PIXELS_PER_SPREAD = 1 << 14
 """What it costs to spread once more, in pixels of a window."""
-
-
-def connected_components(parts: Sequence[Part], reach: int, size: tuple[int, int]) -> Iterator[list[Part]]:
-    """Yield the parts of a slice, component by component. reach: pixels that light travels at most. size: height and width of the frame
-    with its margin.
-    """
-    from mrbokeh.layering._slices_numba import components_of_runs, join_components, label_components, mark_cells
-
-    cell_px = max(_LEAST_CELL_PX, 2 * reach, -(-max(size) // _MOST_CELLS))
-    cells = np.zeros((-(-size[0] // cell_px), -(-size[1] // cell_px)), np.int32)
-    for part in parts:
-        mark_cells(cells, cell_px, part.runs, part.pixels.places, size[1])
-    boxes = np.tile(np.array([size[0], 0, size[1], 0]), (label_components(cells), 1))
-    own = [components_of_runs(boxes, cells, cell_px, part.runs, part.pixels.places, size[1]) for part in parts]
-    joined = join_components(boxes, reach, _PIXELS_PER_SPREAD)
-    if not joined.any():
-        yield list(parts)
-        return
-    for component in np.unique(joined):
-        cut = [replace(part, runs=part.runs[joined[of_runs] == component]) for part, of_runs in zip(parts, own, strict=True)]
-        yield [part for part in cut if len(part.runs) > 0]
-
-
 _LEAST_STEP_PX = 0.5
 _HALF_A_SLICE = 0.501  # and what rounding may add
 _BAND_PIXELS = 1 << 16
@@ -108,7 +31,6 @@ _FEWEST_PIXELS = 1 << 19
 _FEW_PIXELS = 1 << 20
 _MANY_PIXELS = 1 << 22
 _SHARP_PX = np.float32(6.0)  # up to this diameter what is seen is worth more than what may hide: measured on traced scenes
-
 Plane = Float32[np.ndarray, "height width"]
 Channels = Float32[np.ndarray, "height width _"]
 
@@ -266,3 +188,75 @@ def _shown_by_depth(layers: Sequence[Pixels], size: tuple[int, int]) -> tuple[li
                 shown[i] *= np.where(nearer, np.float32(1.0) - over, np.float32(1.0))
                 crossing[i][(over > 0) & (there_px < -_SHARP_PX) & (layer.coc_px > _SHARP_PX)] = 1.0
     return shown, [across * (np.float32(1.0) - each) for across, each in zip(crossing, shown, strict=True)]
+
+
+def sorted_slices(
+    layers: Sequence[Pixels], shares: Sequence[Shares], step_px: float, width: int, pool: Executor
+) -> list[tuple[int, list[Part]]]:
+    """Return number and parts of each slice that is not empty, front first; a slice holds circles of confusion nearest to its number times
+    the step.
+
+    width: of the frame that places are counted in.
+    """
+    used = [(layer, share) for layer, share in zip(layers, shares, strict=True) if share.any()]
+    runs = [_runs(*each, np.float32(step_px), width, pool) for each in used]
+    slices = np.unique(np.concatenate([np.empty(0, np.int32), *(of_runs for of_runs, _ in runs)]))
+    cuts = [np.split(of_layer, np.searchsorted(of_runs, slices[1:])) for of_runs, of_layer in runs]
+    parts = [[Part(*each, cut) for each, cut in zip(used, cut_of, strict=True) if len(cut) > 0] for cut_of in zip(*cuts, strict=True)]
+    return list(zip(slices.tolist(), parts, strict=True))
+
+
+def _runs(
+    layer: Pixels, shares: Shares, step_px: np.float32, width: int, pool: Executor
+) -> tuple[Int32[np.ndarray, " runs"], Int32[np.ndarray, "runs 2"]]:
+    """Return the slices of a layer's runs, ascending, and the runs, in order within each slice."""
+    from mrbokeh.layering._slices_numba import runs_of_slices
+
+    pixels = layer.places, layer.coc_px, shares, width, step_px
+    found = list(pool.map(lambda band: runs_of_slices(*pixels, *band), bands(len(shares), _SORTED_PIXELS)))
+    runs = np.concatenate([np.empty((0, 3), np.int32), *found])
+    runs = runs[np.argsort(runs[:, 0], kind="stable")]
+    return runs[:, 0].copy(), runs[:, 1:].copy()
+
+
+def window_of(parts: Sequence[Part], reach: int, frame: Frame) -> Window | None:
+    """Return the smallest window that holds these pixels, as far as they are seen, and where they are seen; None if nothing is.
+
+    reach: how many pixels their light travels at most. Rows and columns are those of an array that lies as the frame says.
+    """
+    from mrbokeh.layering._slices_numba import extent
+
+    width = frame.width_px - 2 * frame.left_px
+    tops, bottoms, lefts, rights = zip(*(extent(part.runs, part.pixels.places, width) for part in parts), strict=True)
+    rows = _span(min(tops), max(bottoms), reach, -frame.top_px, frame.height_px)
+    columns = _span(min(lefts), max(rights), reach, -frame.left_px, frame.width_px)
+    return None if rows is None or columns is None else (rows, columns)
+
+
+def _span(first: int, end: int, reach: int, inside: int, length: int) -> slice | None:
+    """Return the range of pixels first to end that reach the inside, together with the part of the inside that they reach; None if none
+    does.
+    """
+    first, end = max(first, inside - reach), min(end, inside + length + reach)
+    return slice(min(first, max(first - reach, inside)), max(end, min(end + reach, inside + length))) if first < end else None
+
+
+def connected_components(parts: Sequence[Part], reach: int, size: tuple[int, int]) -> Iterator[list[Part]]:
+    """Yield the parts of a slice, component by component. reach: pixels that light travels at most. size: height and width of the frame
+    with its margin.
+    """
+    from mrbokeh.layering._slices_numba import components_of_runs, join_components, label_components, mark_cells
+
+    cell_px = max(_LEAST_CELL_PX, 2 * reach, -(-max(size) // _MOST_CELLS))
+    cells = np.zeros((-(-size[0] // cell_px), -(-size[1] // cell_px)), np.int32)
+    for part in parts:
+        mark_cells(cells, cell_px, part.runs, part.pixels.places, size[1])
+    boxes = np.tile(np.array([size[0], 0, size[1], 0]), (label_components(cells), 1))
+    own = [components_of_runs(boxes, cells, cell_px, part.runs, part.pixels.places, size[1]) for part in parts]
+    joined = join_components(boxes, reach, _PIXELS_PER_SPREAD)
+    if not joined.any():
+        yield list(parts)
+        return
+    for component in np.unique(joined):
+        cut = [replace(part, runs=part.runs[joined[of_runs] == component]) for part, of_runs in zip(parts, own, strict=True)]
+        yield [part for part in cut if len(part.runs) > 0]

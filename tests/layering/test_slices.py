@@ -204,7 +204,7 @@ def test_a_spread_may_return_what_it_was_given() -> None:
 def test_slices_do_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bit for bit."""
     alone = composited(two_sheets(), slicing(DISC), by_depth=False)
-    for module in ("system.workers", "layering.slices"):
+    for module in ("system.resources", "layering.slices"):
         monkeypatch.setattr(f"mrbokeh.{module}.cores", lambda: 5)
     with ThreadPoolExecutor(5) as pool:
         together = composited(two_sheets(), replace(slicing(DISC), pool=pool), by_depth=False)

@@ -50,7 +50,14 @@ class BankPsf:
         cls, layers: Sequence[Layer], lens: Lens, tables: BankTables, sum_bank_kernels: Callable[[Channels, Plane, Place], Channels]
     ) -> "BankPsf":
         """Make one for these layers."""
-        return cls(tables, sum_bank_kernels, lens, layers[0].alpha.shape, motion_channels(layers[0].extra), farthest_px(layers))
+        return cls(
+            tables=tables,
+            sum_bank_kernels=sum_bank_kernels,
+            lens=lens,
+            size=layers[0].alpha.shape,
+            motion=motion_channels(layers[0].extra),
+            farthest_px=farthest_px(layers),
+        )
 
     @property
     def coverages(self) -> int:

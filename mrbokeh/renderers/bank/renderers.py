@@ -155,6 +155,7 @@ class _ByLowRank:
 
     def __call__(self, values: Channels, coc_px: Plane, side: int, channel: int, around: Around) -> Channels:
         shares = (
-            (share, KernelOpening(self.kernels, side, anchor, channel, self.terms, self.kept)) for anchor, share in around.by_anchor()
+            (share, KernelOpening(kernels=self.kernels, side=side, anchor=anchor, channel=channel, terms=self.terms, kept=self.kept))
+            for anchor, share in around.by_anchor()
         )
         return sum_openings(values, coc_px, shares, self.inner)

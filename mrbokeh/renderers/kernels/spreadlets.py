@@ -38,123 +38,6 @@ from mrbokeh.system.errors import InputError
 _DOMAIN = 4  # the table's domain over its reach: what the border adds to K is smooth, and polynomials up to degree 7 cancel
 _POINTS_PER_MOMENT = 3
 _LEAST_MOMENT = 1e-9
-
-
-@lru_cache(maxsize=8)
-def biharmonic_table(reach_px: int) -> Float64[np.ndarray, "side side"]:
-    """Return K by whole distances [|y|, |x|] from 0 to reach_px, up to terms that the moments cancel."""
-    half = fast_width(_DOMAIN // 2 * reach_px + 2)
-    source = np.zeros((2 * half + 1, 2 * half + 1, 1))
-    source[half, half] = 1.0
-    twice = integrate(integrate(source))[half : half + reach_px + 1, half : half + reach_px + 1, 0]
-    return np.ascontiguousarray(0.5 * (twice + twice.T))
-
-
-def potential_of(charges: Float64[np.ndarray, "size size channels"], table: Float64[np.ndarray, "side side"]) -> np.ndarray:
-    """Return K L on the pixels of L; the table must reach across."""
-    reach = charges.shape[0] - 1
-    quarter = table[: reach + 1, : reach + 1]
-    half = np.concatenate([quarter[:0:-1], quarter])
-    kernel = np.concatenate([half[:, :0:-1], half], axis=1)
-    # Here, for this import takes a second.
-    from scipy.signal import fftconvolve
-
-    return fftconvolve(charges, kernel[..., None], mode="same", axes=(0, 1)) if reach else charges * table[0, 0]
-
-
-def table_for(size: int) -> Float64[np.ndarray, "side side"]:
-    """Return a table for Laplacians of this many pixels across; sizes share tables."""
-    return biharmonic_table(1 << int(np.ceil(np.log2(max(size, 16)))))
-
-
-def moments(xy: np.ndarray, scale_px: float | np.ndarray, degree: int) -> Float64[np.ndarray, "points moments"]:
-    """Return monomials up to a degree at every point, in units of scale_px, one for both axes or one for each."""
-    x, y = (xy / scale_px).T
-    return np.stack([x ** (total - j) * y**j for total in range(degree + 1) for j in range(total + 1)], axis=1)
-
-
-def fitted_values(
-    points: Int64[np.ndarray, "points 2"],
-    xy: Int64[np.ndarray, "pixels 2"],
-    charges: Float64[np.ndarray, "pixels channels"],
-    potential: Float64[np.ndarray, "size size channels"],
-    table: Float64[np.ndarray, "side side"],
-) -> Float64[np.ndarray, "points channels"]:
-    """Return the values at the points with the least squared error that keep the moments of the charges."""
-    radius_px = potential.shape[0] // 2
-    return _solved(points, xy, charges, potential[points[:, 1] + radius_px, points[:, 0] + radius_px], table)
-
-
-def turned(
-    points: Int16[np.ndarray, "points 2"], values: Float64[np.ndarray, "points channels"], angle_rad: float
-) -> tuple[Int16[np.ndarray, "places 2"], Float64[np.ndarray, "places channels"]]:
-    """Turn a spreadlet from x towards y: points at the nearest whole pixels with values fitted to where they should be.
-
-    Rounding alone would give every point a dipole; as the moments are fitted, light and centroid stay exact here, too.
-    """
-    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
-    wanted = points @ np.array([[cosine, sine], [-sine, cosine]])
-    places = np.unique(np.rint(wanted).astype(np.int64), axis=0)
-    if abs(wanted - np.rint(wanted)).max() < 1e-9:
-        order = np.lexsort((np.rint(wanted[:, 1]), np.rint(wanted[:, 0])))
-        return places.astype(np.int16), values[order]
-    table = table_for(2 * int(np.abs(wanted).max() + 2.0) + 1)
-    apart = np.abs(places[:, None] - wanted)
-    between = map_coordinates(_spline(len(table)), [apart[..., 1], apart[..., 0]], order=3, mode="mirror", prefilter=False)
-    return places.astype(np.int16), _solved(places, wanted, values, between @ values, table)
-
-
-@lru_cache(maxsize=8)
-def _spline(side: int) -> Float64[np.ndarray, "side side"]:
-    """Return coefficients that make a table of this size smooth between whole distances."""
-    return spline_filter(biharmonic_table(side - 1), order=3, mode="mirror")
-
-
-def _solved(
-    points: Int64[np.ndarray, "points 2"],
-    xy: np.ndarray,
-    charges: Float64[np.ndarray, "pixels channels"],
-    potential: Float64[np.ndarray, "points channels"],
-    table: Float64[np.ndarray, "side side"],
-) -> Float64[np.ndarray, "points channels"]:
-    """Return values at points (N, 2) for charges at xy (M, 2), whose potential at the points is known.
-
-    Moments up to degree 3 are kept with at least 30 points; fewer points keep fewer moments, at least the charge. Points in few
-    rows, as those of a line, cannot have all of them on their own (y^3 = y in rows -1, 0 and 1): `_independent`.
-    """
-    from mrbokeh.renderers.kernels._spreadlets_numba import solve
-
-    scale_px = float(max(np.abs(xy).max(), 1.0))
-    degree = max(d for d in range(4) if d == 0 or (d + 1) * (d + 2) // 2 * _POINTS_PER_MOMENT <= len(points))
-    held, wanted = _independent(points, xy, charges, degree)
-    apart = np.abs(points[:, None] - points)
-    count, extra = len(points), held.shape[1]
-    matrix = np.zeros((count + extra, count + extra))
-    matrix[:count, :count] = table[apart[..., 1], apart[..., 0]] / scale_px**2
-    matrix[:count, count:], matrix[count:, :count] = held, held.T
-    values = np.concatenate([potential / scale_px**2, wanted])
-    if not solve(matrix, values):
-        raise np.linalg.LinAlgError(f"{count} points cannot hold {extra} moments")
-    return values[:count]
-
-
-def _independent(
-    points: Int64[np.ndarray, "points 2"], xy: np.ndarray, charges: Float64[np.ndarray, "pixels channels"], degree: int
-) -> tuple[Float64[np.ndarray, "points kept"], Float64[np.ndarray, "kept channels"]]:
-    """Return combinations of moments that the points can have independently, and the charges' share of them.
-
-    The degree is lowered if the charges have a moment that the points cannot have.
-    """
-    scale_px = np.maximum(np.abs(xy).max(axis=0), 1.0)
-    held, wanted = moments(points, scale_px, degree), moments(xy, scale_px, degree).T @ charges
-    basis, sizes, mix = np.linalg.svd(held, full_matrices=False)
-    kept = sizes > _LEAST_MOMENT * sizes[0]
-    wanted = mix @ wanted
-    if degree and np.abs(wanted[~kept]).max(initial=0.0) > _LEAST_MOMENT * np.abs(charges).sum():
-        return _independent(points, xy, charges, degree - 1)
-    return basis[:, kept], wanted[kept] / sizes[kept, None]
-
-
 _LEAST_CHARGE = 1e-9
 _DART_RADIUS = 1.75  # of the radius of a disc with the charge of one point: darts that keep that far apart come out about as many as wanted
 _MOVED_SHARE, _HEAT = 0.01, 0.01
@@ -271,3 +154,118 @@ def _charges(kernel: np.ndarray) -> tuple[Int64[np.ndarray, "pixels 2"], Float64
 def _self_cost(xy: np.ndarray, charges: np.ndarray, potential: np.ndarray) -> float:
     middle = potential.shape[0] // 2
     return float((charges * potential[xy[:, 1] + middle, xy[:, 0] + middle]).sum())
+
+
+@lru_cache(maxsize=8)
+def biharmonic_table(reach_px: int) -> Float64[np.ndarray, "side side"]:
+    """Return K by whole distances [|y|, |x|] from 0 to reach_px, up to terms that the moments cancel."""
+    half = fast_width(_DOMAIN // 2 * reach_px + 2)
+    source = np.zeros((2 * half + 1, 2 * half + 1, 1))
+    source[half, half] = 1.0
+    twice = integrate(integrate(source))[half : half + reach_px + 1, half : half + reach_px + 1, 0]
+    return np.ascontiguousarray(0.5 * (twice + twice.T))
+
+
+def potential_of(charges: Float64[np.ndarray, "size size channels"], table: Float64[np.ndarray, "side side"]) -> np.ndarray:
+    """Return K L on the pixels of L; the table must reach across."""
+    reach = charges.shape[0] - 1
+    quarter = table[: reach + 1, : reach + 1]
+    half = np.concatenate([quarter[:0:-1], quarter])
+    kernel = np.concatenate([half[:, :0:-1], half], axis=1)
+    # Here, for this import takes a second.
+    from scipy.signal import fftconvolve
+
+    return fftconvolve(charges, kernel[..., None], mode="same", axes=(0, 1)) if reach else charges * table[0, 0]
+
+
+def table_for(size: int) -> Float64[np.ndarray, "side side"]:
+    """Return a table for Laplacians of this many pixels across; sizes share tables."""
+    return biharmonic_table(1 << int(np.ceil(np.log2(max(size, 16)))))
+
+
+def moments(xy: np.ndarray, scale_px: float | np.ndarray, degree: int) -> Float64[np.ndarray, "points moments"]:
+    """Return monomials up to a degree at every point, in units of scale_px, one for both axes or one for each."""
+    x, y = (xy / scale_px).T
+    return np.stack([x ** (total - j) * y**j for total in range(degree + 1) for j in range(total + 1)], axis=1)
+
+
+def fitted_values(
+    points: Int64[np.ndarray, "points 2"],
+    xy: Int64[np.ndarray, "pixels 2"],
+    charges: Float64[np.ndarray, "pixels channels"],
+    potential: Float64[np.ndarray, "size size channels"],
+    table: Float64[np.ndarray, "side side"],
+) -> Float64[np.ndarray, "points channels"]:
+    """Return the values at the points with the least squared error that keep the moments of the charges."""
+    radius_px = potential.shape[0] // 2
+    return _solved(points, xy, charges, potential[points[:, 1] + radius_px, points[:, 0] + radius_px], table)
+
+
+def turned(
+    points: Int16[np.ndarray, "points 2"], values: Float64[np.ndarray, "points channels"], angle_rad: float
+) -> tuple[Int16[np.ndarray, "places 2"], Float64[np.ndarray, "places channels"]]:
+    """Turn a spreadlet from x towards y: points at the nearest whole pixels with values fitted to where they should be.
+
+    Rounding alone would give every point a dipole; as the moments are fitted, light and centroid stay exact here, too.
+    """
+    cosine, sine = np.cos(angle_rad), np.sin(angle_rad)
+    wanted = points @ np.array([[cosine, sine], [-sine, cosine]])
+    places = np.unique(np.rint(wanted).astype(np.int64), axis=0)
+    if abs(wanted - np.rint(wanted)).max() < 1e-9:
+        order = np.lexsort((np.rint(wanted[:, 1]), np.rint(wanted[:, 0])))
+        return places.astype(np.int16), values[order]
+    table = table_for(2 * int(np.abs(wanted).max() + 2.0) + 1)
+    apart = np.abs(places[:, None] - wanted)
+    between = map_coordinates(_spline(len(table)), [apart[..., 1], apart[..., 0]], order=3, mode="mirror", prefilter=False)
+    return places.astype(np.int16), _solved(places, wanted, values, between @ values, table)
+
+
+@lru_cache(maxsize=8)
+def _spline(side: int) -> Float64[np.ndarray, "side side"]:
+    """Return coefficients that make a table of this size smooth between whole distances."""
+    return spline_filter(biharmonic_table(side - 1), order=3, mode="mirror")
+
+
+def _solved(
+    points: Int64[np.ndarray, "points 2"],
+    xy: np.ndarray,
+    charges: Float64[np.ndarray, "pixels channels"],
+    potential: Float64[np.ndarray, "points channels"],
+    table: Float64[np.ndarray, "side side"],
+) -> Float64[np.ndarray, "points channels"]:
+    """Return values at points (N, 2) for charges at xy (M, 2), whose potential at the points is known.
+
+    Moments up to degree 3 are kept with at least 30 points; fewer points keep fewer moments, at least the charge. Points in few
+    rows, as those of a line, cannot have all of them on their own (y^3 = y in rows -1, 0 and 1): `_independent`.
+    """
+    from mrbokeh.renderers.kernels._spreadlets_numba import solve
+
+    scale_px = float(max(np.abs(xy).max(), 1.0))
+    degree = max(d for d in range(4) if d == 0 or (d + 1) * (d + 2) // 2 * _POINTS_PER_MOMENT <= len(points))
+    held, wanted = _independent(points, xy, charges, degree)
+    apart = np.abs(points[:, None] - points)
+    count, extra = len(points), held.shape[1]
+    matrix = np.zeros((count + extra, count + extra))
+    matrix[:count, :count] = table[apart[..., 1], apart[..., 0]] / scale_px**2
+    matrix[:count, count:], matrix[count:, :count] = held, held.T
+    values = np.concatenate([potential / scale_px**2, wanted])
+    if not solve(matrix, values):
+        raise np.linalg.LinAlgError(f"{count} points cannot hold {extra} moments")
+    return values[:count]
+
+
+def _independent(
+    points: Int64[np.ndarray, "points 2"], xy: np.ndarray, charges: Float64[np.ndarray, "pixels channels"], degree: int
+) -> tuple[Float64[np.ndarray, "points kept"], Float64[np.ndarray, "kept channels"]]:
+    """Return combinations of moments that the points can have independently, and the charges' share of them.
+
+    The degree is lowered if the charges have a moment that the points cannot have.
+    """
+    scale_px = np.maximum(np.abs(xy).max(axis=0), 1.0)
+    held, wanted = moments(points, scale_px, degree), moments(xy, scale_px, degree).T @ charges
+    basis, sizes, mix = np.linalg.svd(held, full_matrices=False)
+    kept = sizes > _LEAST_MOMENT * sizes[0]
+    wanted = mix @ wanted
+    if degree and np.abs(wanted[~kept]).max(initial=0.0) > _LEAST_MOMENT * np.abs(charges).sum():
+        return _independent(points, xy, charges, degree - 1)
+    return basis[:, kept], wanted[kept] / sizes[kept, None]

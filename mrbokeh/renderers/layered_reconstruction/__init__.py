@@ -131,12 +131,24 @@ class LayeredReconstruction:
     def _choice(self, per_pixel: float, shared_out: bool = True) -> Choice:
         chosen = self.settings
         every = max(1, round(3 * per_pixel)) if chosen.sparse_statistics else 1
-        alpha = footprint_sigmas(chosen.energy)
         return Choice(
-            every, self.seed, chosen.merge, chosen.merge_tolerance, chosen.sigma_x_px, chosen.bandwidth, _KINDS[chosen.screen_filter],
-            chosen.support, chosen.recursive_passes, alpha, chosen.tap_distance, chosen.enough, shared_out,
-            chosen.parts[1], *((chosen.part_tolerance, chosen.faint) if chosen.merge else (0.0, 0.0)),
-        )  # fmt: skip
+            every=every,
+            seed=self.seed,
+            merge=chosen.merge,
+            tolerance=chosen.merge_tolerance,
+            sigma_x_px=chosen.sigma_x_px,
+            bandwidth=chosen.bandwidth,
+            kind=_KINDS[chosen.screen_filter],
+            support=chosen.support,
+            passes=chosen.recursive_passes,
+            alpha=footprint_sigmas(chosen.energy),
+            tap_distance=chosen.tap_distance,
+            enough=chosen.enough,
+            shared_out=shared_out,
+            times=chosen.parts[1],
+            part_tolerance=chosen.part_tolerance if chosen.merge else 0.0,
+            faint=chosen.faint if chosen.merge else 0.0,
+        )
 
     def _each(self, run: Callable[[np.ndarray], None], tiles: int) -> None:
         """Run tiles in groups; none touches another's pixels, so that their order and the number of threads change nothing."""

@@ -13,6 +13,46 @@ from mrbokeh.renderers.layered_reconstruction._filter_numba import PIXEL_VARIANC
 from mrbokeh.renderers.layered_reconstruction._tile_data import Choice, Light, Partitions, Slope
 from mrbokeh.system.kernels import njit
 
+_LEAST_VARIANCE = 1e-3
+_MOST_PROBES = 16
+DIRECT, SHEARED, TEXTURE, TEXTURE_ONE_TAP, WINDOWS = 0, 1, 2, 3, 4
+_LEAST_GAUSSIAN_VARIANCE = 1e-4
+
+
+@njit(cache=True, nogil=True)
+def filter_layer(out: np.ndarray, planes: np.ndarray, guard_x: int, guard_y: int, v: tuple[float, float, float], choice: Choice) -> None:
+    kind = choice.kind
+    if guard_x == 0 and guard_y == 0:
+        out[:] = planes
+    elif kind == SHEARED:
+        sheared_gaussian(out, planes, guard_x, guard_y, v[0], v[1], v[2], choice.passes)
+    elif kind == DIRECT:
+        direct_gaussian(out, planes, guard_x, guard_y, v[0], v[1], v[2])
+    else:
+        sigma_u, sigma_v, theta = axes(v[0], v[1], v[2])
+        texture_gaussian(
+            out, planes, guard_x, guard_y, sigma_u, sigma_v, theta, choice.alpha, choice.tap_distance, 4 if kind == TEXTURE else 1
+        )
+
+
+@njit(cache=True, nogil=True)
+def guard_px(variance: float, support: float) -> int:
+    """Return the pixels around a tile that its filter needs; a Gaussian that ends within its pixel needs none."""
+    return int(math.ceil(support * math.sqrt(variance))) if variance > 0.04 else 0
+
+
+@njit(cache=True, nogil=True)
+def gaussian_layer(layer: np.ndarray, left: int, top: int, j: int, partitions: Partitions, light: Light, choice: Choice) -> None:
+    """Fill layer (h, w, C + 2), whose top left pixel is (left, top), with the filtered colour, opacity and weight of a partition."""
+    height, width, channels = layer.shape
+    a, b_x, b_y, v_xx, v_xy, v_yy = sheared_filter(partitions.sums[j], light.window, choice.sigma_x_px, choice.bandwidth)
+    v_xx, v_yy = max(v_xx - PIXEL_VARIANCE, _LEAST_GAUSSIAN_VARIANCE), max(v_yy - PIXEL_VARIANCE, _LEAST_GAUSSIAN_VARIANCE)
+    guard_x, guard_y = guard_px(v_xx, choice.support), guard_px(v_yy, choice.support)
+    planes = np.zeros((height + 2 * guard_y, width + 2 * guard_x, channels + 1), np.float32)
+    reproject(planes, left - guard_x, top - guard_y, Slope(a, b_x, b_y), j, partitions, light, choice.shared_out)
+    planes = evened_out(planes, choice.enough)
+    filter_layer(layer, planes, guard_x, guard_y, (v_xx, v_xy, v_yy), choice)
+
 
 @njit(cache=True, nogil=True)
 def direct_gaussian(out: np.ndarray, planes: np.ndarray, guard_x: int, guard_y: int, v_xx: float, v_xy: float, v_yy: float) -> None:
@@ -37,9 +77,6 @@ def direct_gaussian(out: np.ndarray, planes: np.ndarray, guard_x: int, guard_y: 
                     if weight > 0.0:
                         for c in range(channels):
                             out[y, x, c] += weight * planes[y + j, x + i, c]
-
-
-_LEAST_VARIANCE = 1e-3
 
 
 @njit(cache=True, nogil=True)
@@ -129,9 +166,6 @@ def sheared_gaussian(
                 elif at == last:
                     for c in range(channels):
                         out[y, x, c] += left * row[at, c]
-
-
-_MOST_PROBES = 16
 
 
 @njit(cache=True, nogil=True)
@@ -256,43 +290,3 @@ def texture_gaussian(
                 add_look_up(total, flat, places, at_x, at_y, size * u_px * cosine, size * u_px * sine, size * v_px, 1.0 / taps)
             for c in range(channels):
                 out[y, x, c] = total[c]
-
-
-DIRECT, SHEARED, TEXTURE, TEXTURE_ONE_TAP, WINDOWS = 0, 1, 2, 3, 4
-
-_LEAST_GAUSSIAN_VARIANCE = 1e-4
-
-
-@njit(cache=True, nogil=True)
-def filter_layer(out: np.ndarray, planes: np.ndarray, guard_x: int, guard_y: int, v: tuple[float, float, float], choice: Choice) -> None:
-    kind = choice.kind
-    if guard_x == 0 and guard_y == 0:
-        out[:] = planes
-    elif kind == SHEARED:
-        sheared_gaussian(out, planes, guard_x, guard_y, v[0], v[1], v[2], choice.passes)
-    elif kind == DIRECT:
-        direct_gaussian(out, planes, guard_x, guard_y, v[0], v[1], v[2])
-    else:
-        sigma_u, sigma_v, theta = axes(v[0], v[1], v[2])
-        texture_gaussian(
-            out, planes, guard_x, guard_y, sigma_u, sigma_v, theta, choice.alpha, choice.tap_distance, 4 if kind == TEXTURE else 1
-        )
-
-
-@njit(cache=True, nogil=True)
-def guard_px(variance: float, support: float) -> int:
-    """Return the pixels around a tile that its filter needs; a Gaussian that ends within its pixel needs none."""
-    return int(math.ceil(support * math.sqrt(variance))) if variance > 0.04 else 0
-
-
-@njit(cache=True, nogil=True)
-def gaussian_layer(layer: np.ndarray, left: int, top: int, j: int, partitions: Partitions, light: Light, choice: Choice) -> None:
-    """Fill layer (h, w, C + 2), whose top left pixel is (left, top), with the filtered colour, opacity and weight of a partition."""
-    height, width, channels = layer.shape
-    a, b_x, b_y, v_xx, v_xy, v_yy = sheared_filter(partitions.sums[j], light.window, choice.sigma_x_px, choice.bandwidth)
-    v_xx, v_yy = max(v_xx - PIXEL_VARIANCE, _LEAST_GAUSSIAN_VARIANCE), max(v_yy - PIXEL_VARIANCE, _LEAST_GAUSSIAN_VARIANCE)
-    guard_x, guard_y = guard_px(v_xx, choice.support), guard_px(v_yy, choice.support)
-    planes = np.zeros((height + 2 * guard_y, width + 2 * guard_x, channels + 1), np.float32)
-    reproject(planes, left - guard_x, top - guard_y, Slope(a, b_x, b_y), j, partitions, light, choice.shared_out)
-    planes = evened_out(planes, choice.enough)
-    filter_layer(layer, planes, guard_x, guard_y, (v_xx, v_xy, v_yy), choice)

@@ -73,7 +73,7 @@ def sample_layers(
         for layer, each, motion in zip(layers, coc_px, motions, strict=True)
     ]
     continued = np.stack([_continued(stack, margin, bool((stack[..., 3] == 1.0).all())) for stack in stacks])
-    rays = _Rays(continued, lens, per_pixel, seed, threads)
+    rays = _Rays(continued=continued, lens=lens, per_pixel=per_pixel, seed=seed, threads=threads)
     hit = rays.met[:, 0] >= 0
     met = np.zeros((len(hit), continued.shape[3]), np.float32)
     met[:, -4], met[:, -3] = lens.coc_px(np.inf, layers[0].width_px), np.inf
@@ -217,9 +217,20 @@ def prepared(
     gather(order, *rays, values, bucket, settings.motion, geometry, slopes, sorted_values, sorted_bucket)
     reach = float(np.abs(samples.lens_uv).max())
     return Light(
-        geometry, slopes, sorted_values, sorted_bucket, starts, columns, settings.tile_px, across, cells, buckets, _window(samples), reach,
-        samples.per_pixel,
-    )  # fmt: skip
+        geometry=geometry,
+        slopes=slopes,
+        values=sorted_values,
+        bucket=sorted_bucket,
+        starts=starts,
+        columns=columns,
+        tile_px=settings.tile_px,
+        cells_x=across,
+        cells=cells,
+        depths=buckets,
+        window=_window(samples),
+        pupil_radius=reach,
+        per_pixel=samples.per_pixel,
+    )
 
 
 def _window(samples: LightFieldSamples) -> Float64[np.ndarray, "4"]:

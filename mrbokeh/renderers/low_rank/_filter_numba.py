@@ -10,128 +10,6 @@ import numpy as np
 
 from mrbokeh.system.kernels import njit
 
-
-@njit(cache=True, nogil=True)
-def _blend(kernel: np.ndarray, taps: np.ndarray, starts: np.ndarray, radii_px: np.ndarray, lower: int, upper: float, channels: int) -> int:
-    """Write (1 - upper) of kernel `lower` and upper of the next into kernel, every tap once per channel; returns the radius."""
-    above = lower + 1 if upper > 0 else lower
-    radius_px = radii_px[above]
-    size, inset = 2 * radius_px + 1, radius_px - radii_px[lower]
-    below = 2 * radii_px[lower] + 1
-    for j in range(size):
-        for i in range(size):
-            tap = upper * taps[starts[above] + j * size + i] if upper > 0 else np.float32(0)
-            if 0 <= j - inset < below and 0 <= i - inset < below:
-                tap += (np.float32(1) - upper) * taps[starts[lower] + (j - inset) * below + i - inset]
-            at = (j * size + i) * channels
-            for c in range(channels):
-                kernel[at + c] = tap
-    return radius_px
-
-
-@njit(cache=True, nogil=True, fastmath={"contract"})
-def _add_row(out: np.ndarray, taps: np.ndarray, light: np.ndarray) -> None:
-    for i in range(out.shape[0]):
-        out[i] += taps[i] * light[i]
-
-
-@njit(cache=True, nogil=True)
-def splat_pixels(
-    out: np.ndarray,
-    values: np.ndarray,
-    shares: np.ndarray,
-    ys: np.ndarray,
-    xs: np.ndarray,
-    lowers: np.ndarray,
-    uppers: np.ndarray,
-    taps: np.ndarray,
-    starts: np.ndarray,
-    radii_px: np.ndarray,
-    top: int,
-    left: int,
-) -> None:
-    """Add share * value * kernel of every listed pixel to out (h, w * C), whose first pixel lies at row `top`, column `left`.
-
-    ys, xs, lowers, uppers: (N,). taps: of all kernels, (2 r + 1)^2 from starts[i] on for kernel i.
-    out must hold all the kernels. Pixels of equal diameter that follow one another share the blending of their kernel.
-    """
-    channels = values.shape[2]
-    longest = 2 * radii_px.max() + 1
-    kernel = np.empty(longest * longest * channels, np.float32)
-    light = np.empty(longest * channels, np.float32)
-    radius_px = 0
-    for n in range(ys.shape[0]):
-        if n == 0 or lowers[n] != lowers[n - 1] or uppers[n] != uppers[n - 1]:
-            radius_px = _blend(kernel, taps, starts, radii_px, lowers[n], uppers[n], channels)
-        size = 2 * radius_px + 1
-        for i in range(size):
-            for c in range(channels):
-                light[i * channels + c] = shares[n] * values[ys[n], xs[n], c]
-        length = size * channels
-        start = (xs[n] - left - radius_px) * channels
-        for j in range(size):
-            row = out[ys[n] - top - radius_px + j]
-            _add_row(row[start : start + length], kernel[j * length : (j + 1) * length], light[:length])
-
-
-@njit(cache=True, nogil=True)
-def _blended(taps: np.ndarray, table: np.ndarray, position: float) -> None:
-    """Set taps (K,) between two neighbouring rows of a table (levels, K)."""
-    level = min(int(position), table.shape[0] - 2)
-    upper = np.float32(position - level)
-    for j in range(taps.shape[0]):
-        taps[j] = (np.float32(1) - upper) * table[level, j] + upper * table[level + 1, j]
-
-
-@njit(cache=True, nogil=True)
-def _radius_px(radii_px: np.ndarray, position: float) -> int:
-    return radii_px[min(int(np.ceil(position)), radii_px.shape[0] - 1)]
-
-
-@njit(cache=True, nogil=True)
-def across(
-    middle: np.ndarray, values: np.ndarray, shares: np.ndarray, positions: np.ndarray, table: np.ndarray, radii_px: np.ndarray
-) -> None:
-    """Overwrite middle (h, W, C) with share * value of each pixel (h, W, C) thrown along its row by its own taps.
-
-    positions (h, W): level of each pixel's diameter, a fraction between two rows of table (levels, K), whose taps lie
-    around the middle of K, no farther than radii_px (levels,).
-    """
-    height, width, channels = values.shape
-    taps = np.empty(table.shape[1], np.float32)
-    centre = table.shape[1] // 2
-    middle[:] = np.float32(0)
-    for y in range(height):
-        for x in range(width):
-            if shares[y, x] > 0:
-                _blended(taps, table, positions[y, x])
-                radius_px = _radius_px(radii_px, positions[y, x])
-                for to in range(max(0, x - radius_px), min(width, x + radius_px + 1)):
-                    tap = shares[y, x] * taps[centre + to - x]
-                    for c in range(channels):
-                        middle[y, to, c] += tap * values[y, x, c]
-
-
-@njit(cache=True, nogil=True)
-def down(out: np.ndarray, middle: np.ndarray, positions: np.ndarray, table: np.ndarray, radii_px: np.ndarray) -> None:
-    """Add middle (H, w, C) to out, each pixel thrown along its column by the taps of the place where it is."""
-    height, width, channels = middle.shape
-    taps = np.empty(table.shape[1], np.float32)
-    centre = table.shape[1] // 2
-    for y in range(height):
-        for x in range(width):
-            lit = False
-            for c in range(channels):
-                lit = lit or middle[y, x, c] != 0
-            if lit:
-                _blended(taps, table, positions[y, x])
-                radius_px = _radius_px(radii_px, positions[y, x])
-                for to in range(max(0, y - radius_px), min(height, y + radius_px + 1)):
-                    tap = taps[centre + to - y]
-                    for c in range(channels):
-                        out[to, x, c] += tap * middle[y, x, c]
-
-
 TILE_FLOATS = 128
 _ROWS_AT_ONCE = 4
 
@@ -302,3 +180,124 @@ def scatter_piece(
             if terms > 0 and _stage_level(lines[:used], lit[:used], source, top, bottom, tile, tile_px, radii_px[level], level):
                 _level_on_tile(sums, lines[:used], lit[:used], across[:used], columns[level, :terms], rows[level, :terms, :count], channels)
         _add_tile(out[top:bottom, tile * tile_px : (tile + 1) * tile_px], sums)
+
+
+@njit(cache=True, nogil=True)
+def _blend(kernel: np.ndarray, taps: np.ndarray, starts: np.ndarray, radii_px: np.ndarray, lower: int, upper: float, channels: int) -> int:
+    """Write (1 - upper) of kernel `lower` and upper of the next into kernel, every tap once per channel; returns the radius."""
+    above = lower + 1 if upper > 0 else lower
+    radius_px = radii_px[above]
+    size, inset = 2 * radius_px + 1, radius_px - radii_px[lower]
+    below = 2 * radii_px[lower] + 1
+    for j in range(size):
+        for i in range(size):
+            tap = upper * taps[starts[above] + j * size + i] if upper > 0 else np.float32(0)
+            if 0 <= j - inset < below and 0 <= i - inset < below:
+                tap += (np.float32(1) - upper) * taps[starts[lower] + (j - inset) * below + i - inset]
+            at = (j * size + i) * channels
+            for c in range(channels):
+                kernel[at + c] = tap
+    return radius_px
+
+
+@njit(cache=True, nogil=True, fastmath={"contract"})
+def _add_row(out: np.ndarray, taps: np.ndarray, light: np.ndarray) -> None:
+    for i in range(out.shape[0]):
+        out[i] += taps[i] * light[i]
+
+
+@njit(cache=True, nogil=True)
+def splat_pixels(
+    out: np.ndarray,
+    values: np.ndarray,
+    shares: np.ndarray,
+    ys: np.ndarray,
+    xs: np.ndarray,
+    lowers: np.ndarray,
+    uppers: np.ndarray,
+    taps: np.ndarray,
+    starts: np.ndarray,
+    radii_px: np.ndarray,
+    top: int,
+    left: int,
+) -> None:
+    """Add share * value * kernel of every listed pixel to out (h, w * C), whose first pixel lies at row `top`, column `left`.
+
+    ys, xs, lowers, uppers: (N,). taps: of all kernels, (2 r + 1)^2 from starts[i] on for kernel i.
+    out must hold all the kernels. Pixels of equal diameter that follow one another share the blending of their kernel.
+    """
+    channels = values.shape[2]
+    longest = 2 * radii_px.max() + 1
+    kernel = np.empty(longest * longest * channels, np.float32)
+    light = np.empty(longest * channels, np.float32)
+    radius_px = 0
+    for n in range(ys.shape[0]):
+        if n == 0 or lowers[n] != lowers[n - 1] or uppers[n] != uppers[n - 1]:
+            radius_px = _blend(kernel, taps, starts, radii_px, lowers[n], uppers[n], channels)
+        size = 2 * radius_px + 1
+        for i in range(size):
+            for c in range(channels):
+                light[i * channels + c] = shares[n] * values[ys[n], xs[n], c]
+        length = size * channels
+        start = (xs[n] - left - radius_px) * channels
+        for j in range(size):
+            row = out[ys[n] - top - radius_px + j]
+            _add_row(row[start : start + length], kernel[j * length : (j + 1) * length], light[:length])
+
+
+@njit(cache=True, nogil=True)
+def _blended(taps: np.ndarray, table: np.ndarray, position: float) -> None:
+    """Set taps (K,) between two neighbouring rows of a table (levels, K)."""
+    level = min(int(position), table.shape[0] - 2)
+    upper = np.float32(position - level)
+    for j in range(taps.shape[0]):
+        taps[j] = (np.float32(1) - upper) * table[level, j] + upper * table[level + 1, j]
+
+
+@njit(cache=True, nogil=True)
+def _radius_px(radii_px: np.ndarray, position: float) -> int:
+    return radii_px[min(int(np.ceil(position)), radii_px.shape[0] - 1)]
+
+
+@njit(cache=True, nogil=True)
+def across(
+    middle: np.ndarray, values: np.ndarray, shares: np.ndarray, positions: np.ndarray, table: np.ndarray, radii_px: np.ndarray
+) -> None:
+    """Overwrite middle (h, W, C) with share * value of each pixel (h, W, C) thrown along its row by its own taps.
+
+    positions (h, W): level of each pixel's diameter, a fraction between two rows of table (levels, K), whose taps lie
+    around the middle of K, no farther than radii_px (levels,).
+    """
+    height, width, channels = values.shape
+    taps = np.empty(table.shape[1], np.float32)
+    centre = table.shape[1] // 2
+    middle[:] = np.float32(0)
+    for y in range(height):
+        for x in range(width):
+            if shares[y, x] > 0:
+                _blended(taps, table, positions[y, x])
+                radius_px = _radius_px(radii_px, positions[y, x])
+                for to in range(max(0, x - radius_px), min(width, x + radius_px + 1)):
+                    tap = shares[y, x] * taps[centre + to - x]
+                    for c in range(channels):
+                        middle[y, to, c] += tap * values[y, x, c]
+
+
+@njit(cache=True, nogil=True)
+def down(out: np.ndarray, middle: np.ndarray, positions: np.ndarray, table: np.ndarray, radii_px: np.ndarray) -> None:
+    """Add middle (H, w, C) to out, each pixel thrown along its column by the taps of the place where it is."""
+    height, width, channels = middle.shape
+    taps = np.empty(table.shape[1], np.float32)
+    centre = table.shape[1] // 2
+    for y in range(height):
+        for x in range(width):
+            lit = False
+            for c in range(channels):
+                lit = lit or middle[y, x, c] != 0
+            if lit:
+                _blended(taps, table, positions[y, x])
+                radius_px = _radius_px(radii_px, positions[y, x])
+                for to in range(max(0, y - radius_px), min(height, y + radius_px + 1)):
+                    tap = taps[centre + to - y]
+                    for c in range(channels):
+                        out[to, x, c] += tap * middle[y, x, c]

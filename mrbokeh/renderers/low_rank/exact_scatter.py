@@ -78,7 +78,7 @@ def _tables(diameters_px: Float32[np.ndarray, " pixels"], aperture: Aperture | K
     kernels = [aperture.rasterize(sign * float(step_px)) for step_px in steps_px]
     taps = np.concatenate([psf.kernel.ravel() for psf in kernels]).astype(np.float32)
     starts = np.cumsum([0, *(psf.kernel.size for psf in kernels[:-1])])
-    return _Tables(taps, starts, np.array([psf.radius_px for psf in kernels]), lowers, uppers)
+    return _Tables(taps=taps, starts=starts, radii_px=np.array([psf.radius_px for psf in kernels]), lowers=lowers, uppers=uppers)
 
 
 def _band(

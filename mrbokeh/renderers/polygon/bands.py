@@ -20,7 +20,15 @@ from mrbokeh.system.resources import ZeroedMemory
 def ring_of(tables: ApertureTables, margin: int, width: int, planes: np.ndarray) -> Ring:
     """Return a ring for parts of a picture of at most this width, in `planes`: at least `ring_elements` zeros."""
     rows, stride = 2 * margin + BLOCK_ROWS, width + 2 * margin
-    return Ring(planes, (rows + 2 * ALIASED_ROWS) * stride * 4, len(tables.planes), rows, stride, margin, 0)
+    return Ring(
+        planes=planes,
+        plane_elements=(rows + 2 * ALIASED_ROWS) * stride * 4,
+        light_plane=len(tables.planes),
+        rows=rows,
+        stride=stride,
+        margin=margin,
+        left=0,
+    )
 
 
 def ring_elements(tables: ApertureTables, margin: int, width: int) -> int:
@@ -143,13 +151,20 @@ class BandRunner:
         edges = [(band.top, band.bottom) for band in bands] if len(bands) > 1 else [(0, len(out))]
         strays = np.zeros((len(edges), 2, margin if len(bands) > 1 else 0, flat.shape[1]), np.float32)
         targets = [Target(flat, above, below, *rows) for (above, below), rows in zip(strays, edges, strict=True)]
-        picture = Picture(light.values, light.coc_px, highlights, halved, nonnegative, light.largest_of_tile_px)
+        picture = Picture(
+            values=light.values,
+            coc_px=light.coc_px,
+            share=highlights,
+            halved=halved,
+            nonnegative=nonnegative,
+            largest_px=light.largest_of_tile_px,
+        )
         self._run_bands(picture, list(zip(bands, targets, strict=False)), margin)
         starts = np.array([[top - margin, bottom] for top, bottom in edges]).reshape(-1)
         pieces = strays.reshape(2 * len(edges), *strays.shape[2:])
 
         def finish(top: int) -> None:
-            target = Target(flat, strays[0, 0], strays[0, 1], top, min(top + SETTLED_ROWS, len(out)))
+            target = Target(out=flat, above=strays[0, 0], below=strays[0, 1], top=top, bottom=min(top + SETTLED_ROWS, len(out)))
             settle(target, pieces, starts, half, np.empty(half.shape[1], np.float32), nonnegative)
 
         list(self.pool.map(finish, range(0, len(out), SETTLED_ROWS)))

@@ -167,7 +167,17 @@ def polygon_corners(aperture: Aperture, directions: Sequence[Direction]) -> Poly
         area += oriented * np.array([signed_area, shift @ form @ shift])
     slope, shift, curvature = (np.concatenate(each) for each in (slopes, shifts, curvatures))
     parts = (float(area[0]), float(area[1]))
-    return PolygonCorners(tuple(edges), slope, shift, curvature, tuple(befores), tuple(afters), np.array(weights), parts, shortest)
+    return PolygonCorners(
+        direction=tuple(edges),
+        slope=slope,
+        shift=shift,
+        curvature=curvature,
+        before=tuple(befores),
+        after=tuple(afters),
+        weight=np.array(weights),
+        area=parts,
+        shortest=shortest,
+    )
 
 
 def _walk(outline: Float64[np.ndarray, "_ 2"], known: Sequence[Direction]) -> list[tuple[Direction, tuple[float, float]]]:

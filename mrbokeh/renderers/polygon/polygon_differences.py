@@ -127,7 +127,9 @@ class PolygonDifferences:
                 self.precision == "auto" and light.tiles.contrast * light.pixels**0.5 > _SINGLE_PRECISION * 2e6**0.5
             )
             dtype = np.float64 if double else np.float32
-            runner = BandRunner(tables, dtype, pool, threads, self._memory, self.halve_from_px)
+            runner = BandRunner(
+                tables=tables, dtype=dtype, pool=pool, threads=threads, memory=self._memory, halve_from_px=self.halve_from_px
+            )
             spreads = [runner.sum_resolutions(light.group(first), share) for first in range(0, values.shape[2], 4)]
         return spreads[0] if values.shape[2] == 4 else np.ascontiguousarray(np.concatenate(spreads, axis=2)[..., : values.shape[2]])
 

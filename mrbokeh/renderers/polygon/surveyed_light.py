@@ -64,7 +64,9 @@ class SurveyedLight:
             survey(values.reshape(height, -1), coc_px, some, sums, peaks, largest_px, least, is_full, work)
 
         list(pool.map(look, each))
-        return cls(values, coc_px, sums, peaks, largest_px, least.min(axis=0), is_full)
+        return cls(
+            values=values, coc_px=coc_px, sums=sums, peaks=peaks, largest_of_tile_px=largest_px, least=least.min(axis=0), is_full=is_full
+        )
 
     @cached_property
     def tiles(self) -> Tiles:
@@ -74,7 +76,7 @@ class SurveyedLight:
         lit, first, end, largest_px, contrast = look_over(self.sums, self.peaks, self.largest_of_tile_px, occupied, *work)
         if not largest_px < np.inf:
             raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")
-        return Tiles(occupied, lit, first, end, largest_px, contrast)
+        return Tiles(occupied=occupied, lit=lit, first=first, end=end, largest_px=largest_px, contrast=contrast)
 
     @property
     def pixels(self) -> int:
@@ -107,7 +109,15 @@ class SurveyedLight:
         least = np.zeros(4, np.float32)
         count = self.values[..., channels].shape[2]
         values[..., :count], sums[..., :count], least[:count] = self.values[..., channels], self.sums[..., channels], self.least[channels]
-        return SurveyedLight(values, self.coc_px, sums, sums, self.largest_of_tile_px, least, self.is_full)
+        return SurveyedLight(
+            values=values,
+            coc_px=self.coc_px,
+            sums=sums,
+            peaks=sums,
+            largest_of_tile_px=self.largest_of_tile_px,
+            least=least,
+            is_full=self.is_full,
+        )
 
 
 TOLERANCE = 0.125

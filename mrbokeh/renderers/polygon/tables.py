@@ -98,7 +98,14 @@ def crossed_corners(corners: PolygonCorners, planes: dict[tuple[Direction, Direc
         det = int(first[0] * second[1] - first[1] * second[0])
         step, step_after = (det * second[0], det * second[1]), (-det * first[0], -det * first[1])
         pair = pair_of(corners, before, after)
-        corner = CrossedCorner(before, after, step, step_after, planes[pair], weight if pair == (first, second) else -weight)
+        corner = CrossedCorner(
+            before=before,
+            after=after,
+            step=step,
+            step_after=step_after,
+            plane=planes[pair],
+            weight=weight if pair == (first, second) else -weight,
+        )
         found.append(min(corner.variants, key=lambda each: each.kind))
     return CrossedCorners.of(sorted(found, key=lambda corner: corner.kind))
 
@@ -128,9 +135,24 @@ def whole_kernels(aperture: Aperture, below_px: float) -> Exact:
     kernels = np.stack([behind, behind[:, ::-1, ::-1]])
     low, high, radius = kernels[:, :-1], kernels[:, 1:], behind.shape[1] // 2
     groups, counts = _groups((np.abs(low) > _NOTHING) | (np.abs(high) > _NOTHING))
-    tables = _taps(low, groups), _taps(high - low, groups), *_laid(groups, radius)
-    start = np.cumsum([0, *counts])
-    return Exact(*tables, start, levels, radius, LEVELS_PER_PX, below_px, above_px, *aperture.packed(), aperture.unit_radius)
+    row, column = _laid(groups, radius)
+    vertices, starts, weights = aperture.packed()
+    return Exact(
+        lower=_taps(low, groups),
+        rise=_taps(high - low, groups),
+        row=row,
+        column=column,
+        start=np.cumsum([0, *counts]),
+        levels=levels,
+        radius=radius,
+        per_px=LEVELS_PER_PX,
+        from_px=below_px,
+        to_px=above_px,
+        vertices=vertices,
+        starts=starts,
+        weights=weights,
+        unit_radius=aperture.unit_radius,
+    )
 
 
 def _stacked(kernels: Sequence[Float32[np.ndarray, "_ _"]]) -> Float32[np.ndarray, "kernels size size"]:
@@ -229,7 +251,12 @@ def tables_of(aperture: Aperture, directions: tuple[Direction, ...], max_edges: 
         exact_below_px = float(np.clip(2.0 * EDGE_STEPS / corners.shortest, *EXACT_BELOW_PX))
     exact = whole_kernels(aperture, exact_below_px)
     return ApertureTables(
-        corners, crossed_corners(corners, planes), planes, _sums(planes), exact, max(aperture.unit_radius, rectified.unit_radius)
+        corners=corners,
+        crossed=crossed_corners(corners, planes),
+        planes=planes,
+        sums=_sums(planes),
+        exact=exact,
+        extent=max(aperture.unit_radius, rectified.unit_radius),
     )
 
 

@@ -8,93 +8,8 @@ import numpy as np
 from mrbokeh.renderers.spreadlets._points_numba import add_points, add_points_of_two
 from mrbokeh.system.kernels import njit
 
-
-@njit(cache=True, nogil=True)
-def largest_sum(points: np.ndarray, weights: np.ndarray, reach_px: int) -> float:
-    """Return a bound on the sum of points (N, 2) times light of at most 1, whichever cell every pixel around takes."""
-    side = 2 * reach_px + 1
-    most = np.zeros((side, side))
-    for n in range(len(weights)):
-        y, x = points[n, 1] + reach_px, points[n, 0] + reach_px
-        most[y, x] = max(most[y, x], abs(weights[n]))
-    return most.sum()
-
-
-@njit(cache=True, nogil=True)
-def to_reals(whole: np.ndarray, reals: np.ndarray, gains: np.ndarray) -> None:
-    """Set reals (h, w, LANES) to whole (h, w, LANES) over gains (LANES,), powers of two; they may lie in the same memory."""
-    height, width, lanes = whole.shape
-    row, unit = np.empty(width * lanes, np.float32), np.empty(width * lanes, np.float32)
-    for i in range(len(unit)):
-        unit[i] = 1.0 / gains[i % lanes]
-    for y in range(height):
-        source, target = whole[y].reshape(-1), reals[y].reshape(-1)
-        for i in range(len(row)):
-            row[i] = source[i]
-        for i in range(len(row)):
-            target[i] = row[i] * unit[i]
-
-
 NONE = -1
 _STRETCH_PX = 64
-
-
-@njit(cache=True, nogil=True)
-def add_up(sums: np.ndarray, values: np.ndarray, codes: np.ndarray, sparse: np.ndarray) -> int:
-    """Add the light, without sign, of pixels of values (H, W, C) whose code (H, W) is sparse to sums (C,), and return their number."""
-    height, width, channels = values.shape
-    count = 0
-    for y in range(height):
-        for x in range(width):
-            code = codes[y, x]
-            if code != NONE and sparse[code]:
-                count += 1
-                for c in range(channels):
-                    sums[c] += abs(values[y, x, c])
-    return count
-
-
-@njit(cache=True, nogil=True)
-def mark_highlights(
-    found: np.ndarray, most: np.ndarray, values: np.ndarray, codes: np.ndarray, sparse: np.ndarray, limits: np.ndarray
-) -> None:
-    """Mark the sparse pixels with a channel beyond its limit (C,); no other light is larger than most (C,), NaN if some is NaN.
-
-    Stretches without anything beyond the limits are passed in vectors, whatever their codes.
-    """
-    height, width, channels = values.shape
-    limit, highest = np.empty(_STRETCH_PX * channels, np.float32), np.zeros(_STRETCH_PX * channels, np.float32)
-    for i in range(len(limit)):
-        limit[i] = limits[i % channels]
-    for y in range(height):
-        row = values[y].reshape(-1)
-        for first in range(0, width, _STRETCH_PX):
-            end = min(first + _STRETCH_PX, width)
-            here, within = row[first * channels : end * channels], 0
-            for i in range(len(here)):
-                within += abs(here[i]) <= limit[i]
-            if within == len(here):
-                for i in range(len(here)):
-                    highest[i] = max(highest[i], abs(here[i]))
-            else:
-                for x in range(first, end):
-                    if codes[y, x] != NONE and sparse[codes[y, x]]:
-                        _look_at(found[y], most, values[y], x, limits)
-    for i in range(len(highest)):
-        most[i % channels] = max(most[i % channels], highest[i]) if most[i % channels] == most[i % channels] else most[i % channels]
-
-
-@njit(cache=True, nogil=True)
-def _look_at(found: np.ndarray, most: np.ndarray, values: np.ndarray, x: int, limits: np.ndarray) -> None:
-    for c in range(len(limits)):
-        found[x] |= abs(values[x, c]) > limits[c]
-    if not found[x]:
-        for c in range(len(limits)):
-            light = abs(values[x, c])
-            if light > most[c] or light != light:
-                most[c] = light
-
-
 LANES = 4
 """Channels that are added at once."""
 _MOST_BESIDE = 0.25
@@ -189,3 +104,85 @@ def add_and_clear(out: np.ndarray, sums: np.ndarray, origin: tuple[int, int], fi
                 for c in range(channels):
                     out[y + top, x, c] += sums[y, x - left, c]
         sums[y] = 0.0
+
+
+@njit(cache=True, nogil=True)
+def largest_sum(points: np.ndarray, weights: np.ndarray, reach_px: int) -> float:
+    """Return a bound on the sum of points (N, 2) times light of at most 1, whichever cell every pixel around takes."""
+    side = 2 * reach_px + 1
+    most = np.zeros((side, side))
+    for n in range(len(weights)):
+        y, x = points[n, 1] + reach_px, points[n, 0] + reach_px
+        most[y, x] = max(most[y, x], abs(weights[n]))
+    return most.sum()
+
+
+@njit(cache=True, nogil=True)
+def to_reals(whole: np.ndarray, reals: np.ndarray, gains: np.ndarray) -> None:
+    """Set reals (h, w, LANES) to whole (h, w, LANES) over gains (LANES,), powers of two; they may lie in the same memory."""
+    height, width, lanes = whole.shape
+    row, unit = np.empty(width * lanes, np.float32), np.empty(width * lanes, np.float32)
+    for i in range(len(unit)):
+        unit[i] = 1.0 / gains[i % lanes]
+    for y in range(height):
+        source, target = whole[y].reshape(-1), reals[y].reshape(-1)
+        for i in range(len(row)):
+            row[i] = source[i]
+        for i in range(len(row)):
+            target[i] = row[i] * unit[i]
+
+
+@njit(cache=True, nogil=True)
+def add_up(sums: np.ndarray, values: np.ndarray, codes: np.ndarray, sparse: np.ndarray) -> int:
+    """Add the light, without sign, of pixels of values (H, W, C) whose code (H, W) is sparse to sums (C,), and return their number."""
+    height, width, channels = values.shape
+    count = 0
+    for y in range(height):
+        for x in range(width):
+            code = codes[y, x]
+            if code != NONE and sparse[code]:
+                count += 1
+                for c in range(channels):
+                    sums[c] += abs(values[y, x, c])
+    return count
+
+
+@njit(cache=True, nogil=True)
+def mark_highlights(
+    found: np.ndarray, most: np.ndarray, values: np.ndarray, codes: np.ndarray, sparse: np.ndarray, limits: np.ndarray
+) -> None:
+    """Mark the sparse pixels with a channel beyond its limit (C,); no other light is larger than most (C,), NaN if some is NaN.
+
+    Stretches without anything beyond the limits are passed in vectors, whatever their codes.
+    """
+    height, width, channels = values.shape
+    limit, highest = np.empty(_STRETCH_PX * channels, np.float32), np.zeros(_STRETCH_PX * channels, np.float32)
+    for i in range(len(limit)):
+        limit[i] = limits[i % channels]
+    for y in range(height):
+        row = values[y].reshape(-1)
+        for first in range(0, width, _STRETCH_PX):
+            end = min(first + _STRETCH_PX, width)
+            here, within = row[first * channels : end * channels], 0
+            for i in range(len(here)):
+                within += abs(here[i]) <= limit[i]
+            if within == len(here):
+                for i in range(len(here)):
+                    highest[i] = max(highest[i], abs(here[i]))
+            else:
+                for x in range(first, end):
+                    if codes[y, x] != NONE and sparse[codes[y, x]]:
+                        _look_at(found[y], most, values[y], x, limits)
+    for i in range(len(highest)):
+        most[i % channels] = max(most[i % channels], highest[i]) if most[i % channels] == most[i % channels] else most[i % channels]
+
+
+@njit(cache=True, nogil=True)
+def _look_at(found: np.ndarray, most: np.ndarray, values: np.ndarray, x: int, limits: np.ndarray) -> None:
+    for c in range(len(limits)):
+        found[x] |= abs(values[x, c]) > limits[c]
+    if not found[x]:
+        for c in range(len(limits)):
+            light = abs(values[x, c])
+            if light > most[c] or light != light:
+                most[c] = light

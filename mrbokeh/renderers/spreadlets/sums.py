@@ -184,7 +184,13 @@ class _Splatting(NamedTuple):
         gains: Float32[np.ndarray, " lanes"] | None = None,
     ) -> "_Splatting":
         """Lay points out for splatting. precision: of the sums without gains."""
-        return cls(values, cells, Laid.out(points, window.width, precision if gains is None else np.int32), window, gains)
+        return cls(
+            values=values,
+            cells=cells,
+            laid=Laid.out(points, window.width, precision if gains is None else np.int32),
+            window=window,
+            gains=gains,
+        )
 
     def fill(self, sums: Sums, first: int, end: int) -> None:
         """Add what falls into rows first:end, which are zeros if there are gains."""

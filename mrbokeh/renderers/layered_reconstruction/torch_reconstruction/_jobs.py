@@ -78,7 +78,17 @@ def jobs_of(partitions: Partitions, slopes: Slopes, guard: Int64[Tensor, "jobs 2
     blocks = _blocks(corner, end, guard + reach_px + 1.0, light)
     known = torch.cat([guard, blocks[:, 3:]], dim=1).cpu().numpy()
     counts = partitions.counts.cpu().numpy()
-    return Jobs(partitions, slopes, slope.float(), guard, facts, blocks, known[:, :2], known[:, 2], counts)
+    return Jobs(
+        partitions=partitions,
+        slopes=slopes,
+        slope=slope.float(),
+        guard=guard,
+        facts=facts,
+        blocks=blocks,
+        host_guard=known[:, :2],
+        host_blocks=known[:, 2],
+        host_counts=counts,
+    )
 
 
 def _blocks(
@@ -103,7 +113,7 @@ def task_of(jobs: Jobs, light: TileLight, members: Int64[np.ndarray, " group"], 
     x, y = first_x[entry] + within % across[entry], first_y[entry] + within // across[entry]
     block = block_at(x, y, light.columns)
     moved = torch.tensor([-guard] * 2 + [guard] * 4 + [0] * 4, device=device)
-    return Task(job, jobs.facts[job] + moved, light.tile_px + 2 * guard, entry, block)
+    return Task(job=job, facts=jobs.facts[job] + moved, side=light.tile_px + 2 * guard, entry=entry, block=block)
 
 
 def batches(jobs: Jobs, jobs_at_once: int) -> Iterator[tuple[int, int]]:

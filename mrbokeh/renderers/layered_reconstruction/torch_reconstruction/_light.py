@@ -140,9 +140,23 @@ def tile_light(samples: DeviceSamples, settings: Settings) -> TileLight:
     geometry = torch.cat([samples.xy_px, samples.lens_uv, (samples.time - 0.5)[:, None]], dim=1)[order]
     slopes = torch.cat([0.5 * samples.coc_px[:, None], samples.motion_px * float(settings.motion)], dim=1)[order]
     return TileLight(
-        width_px, height_px, tile_px, geometry, slopes, samples.values[order], (code // per_block).long(), starts, bucket[order],
-        held_depth, beside, _window(samples), reach, samples.per_pixel, int(in_tile), int(in_block),
-    )  # fmt: skip
+        width_px=width_px,
+        height_px=height_px,
+        tile_px=tile_px,
+        geometry=geometry,
+        slopes=slopes,
+        values=samples.values[order],
+        block=(code // per_block).long(),
+        starts=starts,
+        bucket=bucket[order],
+        depth=held_depth,
+        beside=beside,
+        window=_window(samples),
+        pupil_radius=reach,
+        per_pixel=samples.per_pixel,
+        most_in_tile=int(in_tile),
+        most_in_block=int(in_block),
+    )
 
 
 @lru_cache(maxsize=4)

@@ -35,106 +35,13 @@ from mrbokeh.system.torch_device import device_named
 
 _LEAST_WEIGHT = 1e-6
 _LEAST_TAKEN = 1e-3
-
 Tiles = Float32[Tensor, "tiles channels side side"]
-
-
-def composited(
-    layers: Float32[Tensor, "jobs planes parts side side"], counts: Int64[np.ndarray, " tiles"], shares: list[float]
-) -> tuple[Tiles, Tensor]:
-    """Return e(x) = e_0(x) + sum_j e_j(x) prod_{k<j} (1 - alpha_k(x)), and the product over all that is left, (T, side, side).
-
-    Both are the mean over parts of pupil and shutter, by their shares, each of which is composited on its own.
-    layers: colour, opacity and weight, both of which the weight divides, of jobs tile by tile; a layer of no weight is not there.
-    counts: of jobs, of each tile. Tiles with most jobs go first, so that a step takes only those that still have one.
-    """
-    order = np.argsort(-counts, kind="stable")
-    starts, back = (torch.from_numpy(each).to(layers.device) for each in ((np.cumsum(counts) - counts)[order], np.argsort(order)))
-    out = layers.new_zeros((len(counts), layers.shape[1] - 2, *layers.shape[2:]))
-    left = torch.ones_like(out[:, 0])
-    for rank in range(int(counts.max())):
-        active = int((counts > rank).sum())
-        layer = layers[starts[:active] + rank]
-        weight = layer[:, -1]
-        is_there = weight > _LEAST_WEIGHT
-        out[:active] += torch.where(is_there, left[:active] / weight, 0.0)[:, None] * layer[:, :-2]
-        left[:active] *= torch.where(is_there, (1.0 - layer[:, -2] / weight).clamp(min=0.0), 1.0)
-    weights = torch.tensor(shares, dtype=out.dtype, device=out.device)[:, None, None]
-    out, left = (out * weights).sum(dim=2), (left * weights).sum(dim=1)
-    # Behind the last layer is nothing that was sampled: what no layer claims belongs to those that were seen.
-    taken = 1.0 - left
-    return torch.where((taken > _LEAST_TAKEN)[:, None], out / taken[:, None], out)[back], left[back]
-
-
-def put_together(tiles: Tiles, light: TileLight) -> Float32[Tensor, "height width channels"]:
-    """Return the picture of all tiles, in rows; the last may be cut."""
-    channels, side = tiles.shape[1], light.tile_px
-    picture = tiles.view(light.rows, light.columns, channels, side, side).permute(0, 3, 1, 4, 2)
-    return picture.reshape(light.rows * side, light.columns * side, channels)[: light.height_px, : light.width_px]
-
-
-def own_means(light: TileLight) -> Float32[Tensor, "height width channels"]:
-    """Return the mean of the samples of each pixel, 0 where it has none."""
-    x = light.geometry[:, 0].long().clamp(max=light.width_px - 1)
-    y = light.geometry[:, 1].long().clamp(max=light.height_px - 1)
-    sums = light.values.new_zeros((light.height_px * light.width_px, light.values.shape[1] + 1))
-    sums.index_add_(0, y * light.width_px + x, torch.cat([light.values, torch.ones_like(light.values[:, :1])], dim=1))
-    return (sums[:, :-1] / sums[:, -1:].clamp(min=1.0)).view(light.height_px, light.width_px, -1)
-
-
 FineTiles = Float32[Tensor, "tiles channels wide wide"]
 Coarse = Float32[Tensor, "tiles channels side side"]
-
-
-def coarse_inside(light: TileLight, tile: Int64[Tensor, " tiles"]) -> Bool[Tensor, "tiles side side"]:
-    """Return which coarse pixels of these tiles hold any of the picture."""
-    at = torch.arange(light.tile_px // COARSE_PX, device=tile.device) * COARSE_PX
-    x, y = (tile % light.columns * light.tile_px)[:, None] + at, (tile // light.columns * light.tile_px)[:, None] + at
-    return (y < light.height_px)[:, :, None] & (x < light.width_px)[:, None, :]
-
-
-def ratio_of(alike: Coarse, apart: Coarse) -> Coarse:
-    """Return parts over the whole, from 0 to MOST_RATIO, 1 where the whole is 0."""
-    return torch.where(alike == 0.0, 1.0, (apart / torch.where(alike == 0.0, 1.0, alike)).clamp(0.0, MOST_RATIO))
-
-
-def too_detailed(
-    alike: Coarse, apart: Coarse, inside: Bool[Tensor, "tiles side side"], tolerance: float
-) -> Bool[Tensor, "tiles side side"]:
-    """Return where coarse pixels cannot hold what parts add to the whole: the box around all that were found."""
-    mask = inside[:, None].float()
-    added = (apart - alike) * mask
-    mean = avg_pool2d(added, 3, 1, 1) / avg_pool2d(mask, 3, 1, 1).clamp(min=1e-6)
-    dark = DARK * (apart.abs() * mask).sum(dim=(2, 3), keepdim=True) / mask.sum(dim=(2, 3), keepdim=True)
-    value = torch.maximum(alike.abs(), apart.abs())
-    missed = apart - ratio_of(alike, apart) * alike
-    found = (torch.maximum((added - mean).abs(), missed.abs()) > tolerance * (value + dark)).any(dim=1) & inside
-    return _between_ends(found.any(dim=2))[:, :, None] & _between_ends(found.any(dim=1))[:, None, :]
-
-
-def _between_ends(found: Bool[Tensor, "tiles side"]) -> Bool[Tensor, "tiles side"]:
-    number = found.int()
-    return (torch.cumsum(number, 1) > 0) & (torch.cumsum(number.flip(1), 1).flip(1) > 0)
-
-
-def fine(box: Bool[Tensor, "tiles side side"]) -> Bool[Tensor, "tiles wide wide"]:
-    return box.repeat_interleave(COARSE_PX, dim=1).repeat_interleave(COARSE_PX, dim=2)
-
-
-def scaled_by_coarse(picture: FineTiles, ratio: Coarse, inside: Bool[Tensor, "tiles side side"]) -> FineTiles:
-    """Multiply pictures by coarse pixels, linear between their middles."""
-    side = torch.arange(ratio.shape[2], device=ratio.device)
-    tile = torch.arange(len(ratio), device=ratio.device)[:, None, None]
-    last_y, last_x = (inside.any(dim=axis).sum(dim=1)[:, None] - 1 for axis in (2, 1))
-    held = ratio.permute(0, 2, 3, 1)[tile, torch.minimum(side, last_y)[:, :, None], torch.minimum(side, last_x)[:, None, :]]
-    return picture * interpolate(held.permute(0, 3, 1, 2), scale_factor=COARSE_PX, mode="bilinear", align_corners=False)
-
-
 AT_ONCE = {"cpu": (1 << 15, 1 << 17, 1 << 22), "cuda": (1 << 22, 1 << 23, 1 << 26)}
 """What is in memory at a time: pairs of sample and job (300 bytes each; none where a kernel splats), pixels of windows (60 bytes for each
 of their planes, transforms among them) and pixels of finished jobs (4 bytes for each plane). Besides, a sample takes 150 bytes, and each
 bucket that anything lies in 80 bytes for every tile."""
-
 _UNSEEN = 0.999
 
 
@@ -259,3 +166,90 @@ def _nearest_depth_m(samples: DeviceSamples) -> Float32[Tensor, "height width"]:
     depth_m = torch.full((samples.height_px * samples.width_px,), torch.inf, device=x.device)
     depth_m.scatter_reduce_(0, y * samples.width_px + x, samples.depth_m, "amin")
     return depth_m.view(samples.height_px, samples.width_px)
+
+
+def composited(
+    layers: Float32[Tensor, "jobs planes parts side side"], counts: Int64[np.ndarray, " tiles"], shares: list[float]
+) -> tuple[Tiles, Tensor]:
+    """Return e(x) = e_0(x) + sum_j e_j(x) prod_{k<j} (1 - alpha_k(x)), and the product over all that is left, (T, side, side).
+
+    Both are the mean over parts of pupil and shutter, by their shares, each of which is composited on its own.
+    layers: colour, opacity and weight, both of which the weight divides, of jobs tile by tile; a layer of no weight is not there.
+    counts: of jobs, of each tile. Tiles with most jobs go first, so that a step takes only those that still have one.
+    """
+    order = np.argsort(-counts, kind="stable")
+    starts, back = (torch.from_numpy(each).to(layers.device) for each in ((np.cumsum(counts) - counts)[order], np.argsort(order)))
+    out = layers.new_zeros((len(counts), layers.shape[1] - 2, *layers.shape[2:]))
+    left = torch.ones_like(out[:, 0])
+    for rank in range(int(counts.max())):
+        active = int((counts > rank).sum())
+        layer = layers[starts[:active] + rank]
+        weight = layer[:, -1]
+        is_there = weight > _LEAST_WEIGHT
+        out[:active] += torch.where(is_there, left[:active] / weight, 0.0)[:, None] * layer[:, :-2]
+        left[:active] *= torch.where(is_there, (1.0 - layer[:, -2] / weight).clamp(min=0.0), 1.0)
+    weights = torch.tensor(shares, dtype=out.dtype, device=out.device)[:, None, None]
+    out, left = (out * weights).sum(dim=2), (left * weights).sum(dim=1)
+    # Behind the last layer is nothing that was sampled: what no layer claims belongs to those that were seen.
+    taken = 1.0 - left
+    return torch.where((taken > _LEAST_TAKEN)[:, None], out / taken[:, None], out)[back], left[back]
+
+
+def put_together(tiles: Tiles, light: TileLight) -> Float32[Tensor, "height width channels"]:
+    """Return the picture of all tiles, in rows; the last may be cut."""
+    channels, side = tiles.shape[1], light.tile_px
+    picture = tiles.view(light.rows, light.columns, channels, side, side).permute(0, 3, 1, 4, 2)
+    return picture.reshape(light.rows * side, light.columns * side, channels)[: light.height_px, : light.width_px]
+
+
+def own_means(light: TileLight) -> Float32[Tensor, "height width channels"]:
+    """Return the mean of the samples of each pixel, 0 where it has none."""
+    x = light.geometry[:, 0].long().clamp(max=light.width_px - 1)
+    y = light.geometry[:, 1].long().clamp(max=light.height_px - 1)
+    sums = light.values.new_zeros((light.height_px * light.width_px, light.values.shape[1] + 1))
+    sums.index_add_(0, y * light.width_px + x, torch.cat([light.values, torch.ones_like(light.values[:, :1])], dim=1))
+    return (sums[:, :-1] / sums[:, -1:].clamp(min=1.0)).view(light.height_px, light.width_px, -1)
+
+
+def coarse_inside(light: TileLight, tile: Int64[Tensor, " tiles"]) -> Bool[Tensor, "tiles side side"]:
+    """Return which coarse pixels of these tiles hold any of the picture."""
+    at = torch.arange(light.tile_px // COARSE_PX, device=tile.device) * COARSE_PX
+    x, y = (tile % light.columns * light.tile_px)[:, None] + at, (tile // light.columns * light.tile_px)[:, None] + at
+    return (y < light.height_px)[:, :, None] & (x < light.width_px)[:, None, :]
+
+
+def ratio_of(alike: Coarse, apart: Coarse) -> Coarse:
+    """Return parts over the whole, from 0 to MOST_RATIO, 1 where the whole is 0."""
+    return torch.where(alike == 0.0, 1.0, (apart / torch.where(alike == 0.0, 1.0, alike)).clamp(0.0, MOST_RATIO))
+
+
+def too_detailed(
+    alike: Coarse, apart: Coarse, inside: Bool[Tensor, "tiles side side"], tolerance: float
+) -> Bool[Tensor, "tiles side side"]:
+    """Return where coarse pixels cannot hold what parts add to the whole: the box around all that were found."""
+    mask = inside[:, None].float()
+    added = (apart - alike) * mask
+    mean = avg_pool2d(added, 3, 1, 1) / avg_pool2d(mask, 3, 1, 1).clamp(min=1e-6)
+    dark = DARK * (apart.abs() * mask).sum(dim=(2, 3), keepdim=True) / mask.sum(dim=(2, 3), keepdim=True)
+    value = torch.maximum(alike.abs(), apart.abs())
+    missed = apart - ratio_of(alike, apart) * alike
+    found = (torch.maximum((added - mean).abs(), missed.abs()) > tolerance * (value + dark)).any(dim=1) & inside
+    return _between_ends(found.any(dim=2))[:, :, None] & _between_ends(found.any(dim=1))[:, None, :]
+
+
+def _between_ends(found: Bool[Tensor, "tiles side"]) -> Bool[Tensor, "tiles side"]:
+    number = found.int()
+    return (torch.cumsum(number, 1) > 0) & (torch.cumsum(number.flip(1), 1).flip(1) > 0)
+
+
+def fine(box: Bool[Tensor, "tiles side side"]) -> Bool[Tensor, "tiles wide wide"]:
+    return box.repeat_interleave(COARSE_PX, dim=1).repeat_interleave(COARSE_PX, dim=2)
+
+
+def scaled_by_coarse(picture: FineTiles, ratio: Coarse, inside: Bool[Tensor, "tiles side side"]) -> FineTiles:
+    """Multiply pictures by coarse pixels, linear between their middles."""
+    side = torch.arange(ratio.shape[2], device=ratio.device)
+    tile = torch.arange(len(ratio), device=ratio.device)[:, None, None]
+    last_y, last_x = (inside.any(dim=axis).sum(dim=1)[:, None] - 1 for axis in (2, 1))
+    held = ratio.permute(0, 2, 3, 1)[tile, torch.minimum(side, last_y)[:, :, None], torch.minimum(side, last_x)[:, None, :]]
+    return picture * interpolate(held.permute(0, 3, 1, 2), scale_factor=COARSE_PX, mode="bilinear", align_corners=False)

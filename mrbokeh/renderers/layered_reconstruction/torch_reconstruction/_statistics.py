@@ -57,7 +57,7 @@ def sheared_slopes(sums: Sums, window: Window, sigma_x_px: float, bandwidth: flo
     largest = half + torch.sqrt((half * half - (d_uu * d_vv - d_uv * d_uv) / det).clamp(min=0.0))
     trace_m = (out.yy * var_xx - 2.0 * out.xy * var_xy + out.xx * var_yy) / det
     kappa_u = 1.0 / (1.0 + bandwidth**2 * var_r * largest)
-    return Slopes(r, m_x, m_y, kappa_u, 1.0 / (1.0 + bandwidth**2 * d_tt * trace_m))
+    return Slopes(r=r, m_x=m_x, m_y=m_y, kappa_u=kappa_u, kappa_t=1.0 / (1.0 + bandwidth**2 * d_tt * trace_m))
 
 
 def screen_covariance(slopes: Slopes, window: Window, sigma_x_px: float) -> Covariance:
@@ -162,7 +162,7 @@ def tile_rows(light: TileLight, every: int, seed: int) -> Rows:
     sums /= torch.where(kind.view(-1)[held] == _CHOSEN, 1, every)[:, None]
     tile = held // buckets
     first = torch.searchsorted(tile, torch.arange(tiles + 1, device=cell.device))
-    return Rows(sums, _light_of_rows(light, place, len(held)), tile, held % buckets, first, place)
+    return Rows(sums=sums, light=_light_of_rows(light, place, len(held)), tile=tile, bucket=held % buckets, first=first, place=place)
 
 
 def _light_of_rows(light: TileLight, place: Int64[Tensor, "tiles buckets"], rows: int) -> Float64[Tensor, "rows 3"]:

@@ -139,7 +139,9 @@ def table_of(points: Points, device: torch.device) -> PointTable:
     count, weights = np.diff(points.starts), points.weights[:, None]
     largest = _largest_at(np.zeros((2 * points.reach_px + 1,) * 2), points.xy, weights)
     xy, values, first, counts = _on(device, points.xy, weights, points.starts[:-1].astype(np.int32), count.astype(np.int32))
-    return PointTable(xy, values, first, counts, int(count.max()), points.reach_px, float(largest.sum()))
+    return PointTable(
+        xy=xy, weights=values, first=first, count=counts, most=int(count.max()), reach_px=points.reach_px, largest_sum=float(largest.sum())
+    )
 
 
 @dataclass
@@ -173,7 +175,15 @@ class BankPoints:
         reach_px = -(-int(self._reach_px[codes].max()) // _REACH_STEP_PX) * _REACH_STEP_PX
         first, count = self._on_device
         largest_sum = max(_LARGEST_SUM, float(self._largest.sum()))
-        return PointTable(self._xy, self._weights, first, count, int(self._count[codes].max()), reach_px, largest_sum)
+        return PointTable(
+            xy=self._xy,
+            weights=self._weights,
+            first=first,
+            count=count,
+            most=int(self._count[codes].max()),
+            reach_px=reach_px,
+            largest_sum=largest_sum,
+        )
 
     def _add(self, codes: Int64[np.ndarray, " codes"]) -> None:
         parts = [self.tables.points(codes.tolist(), self.dense, channel) for channel in range(self._weights.shape[1])]
