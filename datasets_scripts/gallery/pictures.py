@@ -19,7 +19,7 @@ from mrbokeh.system.errors import InputError
 WIDEST_PX = 960
 _QUALITY = 82
 _TALLEST = 0.9
-"""Of the width: sheets go on below."""
+"""Share of the width: sheets go on below."""
 _FRAMES = 3
 _VIDEO_SUFFIXES = (".mp4", ".mov", ".mkv")
 _WINDOW_PX = (960, 640)

@@ -1,4 +1,4 @@
-"""The scripts that repeat the analysis and the tables of Leimkuehler et al. 2018: their parts against known answers, and tiny runs."""
+"""The benches that repeat the analysis and the tables of Leimkuehler et al. 2018: their parts against known answers, and tiny runs."""
 
 from pathlib import Path
 
@@ -102,7 +102,7 @@ def test_only_the_filter_cuts_blur_off_at_what_is_sharp() -> None:
 
 
 def test_a_layer_in_front_hides_what_is_behind() -> None:
-    """In focus and opaque on the left half: there nothing of the layer behind is seen, on the right half nothing else."""
+    """The front is in focus and opaque on the left half: there nothing of the layer behind is seen, on the right half nothing else."""
     methods, margin_px = BlurMethods(disc_bank()), 24
     front = flat_layer(0.0)
     alpha = np.zeros(SIZE, np.float32)

@@ -9,9 +9,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from datasets_scripts.bokeh_stacks import main, make_bokeh_stacks, make_pull
+from datasets_scripts.bokeh_stacks import StackView, main, make_bokeh_stacks, make_pull
 from datasets_scripts.made_sets.bokeh_plan import SHAPES, SIZES, StackSize, StacksPlan, bokeh_shape
-from datasets_scripts.made_sets.bokeh_view import StackView
 from datasets_scripts.scenes.bokeh_scenes import KINDS, bokeh_scene
 from datasets_scripts.tracers.pupil import FieldStop, OpenShares, polygon_share
 from datasets_scripts.tracers.traced_scene import plain_texture
@@ -96,7 +95,7 @@ def test_the_ring_changes_over_the_frame_as_its_stop_says(place: str) -> None:
 @pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize(("depth_m", "focus_m"), [(4.0, NEAR_FOCUS_M), (0.95, FAR_FOCUS_M)])
 def test_discs_are_what_the_lens_file_says(shape: str, place: str, depth_m: float, focus_m: float) -> None:
-    """Behind the focus and in front of it, where openings are mirrored."""
+    """Discs lie behind the focus and in front of it, where openings are mirrored."""
     require_likeness(shape, place, depth_m, focus_m)
 
 

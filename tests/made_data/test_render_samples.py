@@ -184,7 +184,7 @@ def test_the_mean_of_samples_converges_to_the_reference() -> None:
 
 
 def test_samples_of_a_pixel_are_stratified() -> None:
-    """Of 16 points of a (0, 2)-sequence pair one falls in every cell of 4 x 4; in time one in every 16th of the exposure."""
+    """Every cell of 4 x 4 holds one of 16 points of a (0, 2)-sequence pair; every 16th of the exposure holds one in time."""
     s = tracer(STAGE.backdrop(0.05, GREY)).samples(16)
     cells = np.floor((s.xy_px % 1.0) * 4).astype(int)
     assert (np.sort(cells[..., 0] * 4 + cells[..., 1], axis=-1) == np.arange(16)).all()
@@ -361,7 +361,7 @@ def test_mistakes_are_told_in_a_sentence(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["fence_1", "whirl_1"])
 def test_the_shipped_samples_are_what_the_sampler_makes(name: str) -> None:
-    """Up to rounding, which may turn a ray at the edge of a body to the other side."""
+    """Rounding may turn a ray at the edge of a body to the other side."""
     folder = DATA / name
     from mrbokeh.system.atomic_files import read_json
 
