@@ -84,10 +84,25 @@ def test_messages_to_people_are_sentences_of_the_house() -> None:
     assert not [f"{where}{text}" for where, text in texts if len(text.split()) < 5 and "{}" not in text]
 
 
-@pytest.mark.parametrize("name", ["README.md", "ARCHITECTURE.md", "CONVENTIONS.md"])
-def test_pages_name_files_that_exist(name: str) -> None:
-    """Paths of modules in backquotes, such as `mrbokeh/images/color.py`."""
-    found = re.findall(
-        r"`((?:mrbokeh|capture|training|viewfinder|datasets_scripts|tests)/[\w/.]+)`", (ROOT / name).read_text(encoding="utf-8")
-    )
-    assert not [each for each in found if not (ROOT / each).exists()]
+PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_pages_name_files_that_exist(page: Path) -> None:
+    """Paths in backquotes, with suffix or without: `mrbokeh/images/color.py`, `capture/merging/lights`."""
+    packages = "|".join((*PACKAGES, "tests"))
+    found = re.findall(rf"`((?:{packages})/[\w/.]+)`", page.read_text(encoding="utf-8"))
+    assert not [each for each in found if not (ROOT / each).exists() and not (ROOT / f"{each}.py").exists()]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_pages_name_modules_that_exist(page: Path) -> None:
+    """Dotted names, such as mrbokeh.layering.motion or `python -m tests.bench.bench_real`; the last word may be a name in the module."""
+    packages = "|".join((*PACKAGES, "tests"))
+    found = set(re.findall(rf"(?<![\w/.\[-])(?:{packages})(?:\.[A-Za-z_]\w*)+\b(?!<|_)", page.read_text(encoding="utf-8")))
+    assert not sorted(each for each in found if not is_module(each) and not is_module(each.rpartition(".")[0]))
+
+
+def is_module(name: str) -> bool:
+    path = ROOT.joinpath(*name.split("."))
+    return path.with_suffix(".py").is_file() or path.is_dir()
