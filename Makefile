@@ -15,7 +15,7 @@ gallery: $(READY)
 	$(RUN)/python -m datasets_scripts.gallery gallery_out --demo $(OUT)
 
 test: $(READY)
-	$(RUN)/python -m pytest -n 2 --dist loadfile -m "not slow and not browser"
+	$(RUN)/python -m pytest -n 2 --dist worksteal -m "not slow and not browser" --durations 30 --durations-min 1
 
 test-slow: $(READY)
 	$(RUN)/python -m pip install --quiet --constraint constraints.txt --editable ".[all,dev,datasets]"

@@ -28,8 +28,7 @@ from tests.scenes.scalar_truth_tracer import require_mitsuba
 PLAN = TruthPlan(width_px=64, height_px=36, samples=4, scenes=("fence",), shapes=("disc",))
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-@pytest.mark.parametrize("name", OBJECT_DISTANCES_M)
+@pytest.mark.parametrize(("name", "seed"), [*zip(OBJECT_DISTANCES_M, (1, 2), strict=True)])
 def test_the_object_lies_behind_all_near_things_and_before_the_rest(name: str, seed: int) -> None:
     """Of the rest, what lies in the picture counts; the ground reaches below it to the camera."""
     scene, virtual = scene_around(name, seed), virtual_object(name, seed)

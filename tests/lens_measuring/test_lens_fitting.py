@@ -136,10 +136,10 @@ def test_projection_on_the_simplex_is_the_nearest_point() -> None:
 @pytest.mark.parametrize(
     ("aperture", "least"),
     [
-        pytest.param(HEPTAGON, 0.99, id="heptagon"),
-        pytest.param(Aperture.ring(0.5), 0.99, id="ring"),
+        pytest.param(HEPTAGON, 0.99, id="heptagon", marks=pytest.mark.slow),
+        pytest.param(Aperture.ring(0.5), 0.99, id="ring", marks=pytest.mark.slow),
         pytest.param(Aperture.heart(), 0.98, id="heart", marks=pytest.mark.slow),
-        pytest.param(replace(Aperture.disc(), spherical_aberration=0.7), 0.985, id="bright rim"),
+        pytest.param(replace(Aperture.disc(), spherical_aberration=0.7), 0.985, id="bright rim", marks=pytest.mark.slow),
         pytest.param(replace(HEPTAGON, axial_chromatic=(0.08, 0.0, -0.08)), 0.99, id="colours"),
     ],
 )

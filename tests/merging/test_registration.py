@@ -41,7 +41,7 @@ def prior_errors_px(stack: JitteredStack) -> list[float]:
     return stack.errors_px(0, tuple(about_centre(scales[0] / each, WIDTH_PX, HEIGHT_PX) for each in scales))
 
 
-@pytest.mark.parametrize("lens_is_known", [True, False])
+@pytest.mark.parametrize("lens_is_known", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_a_camera_that_moved_between_slices(moved: JitteredStack, lens_is_known: bool) -> None:
     registration = register_stack(moved.slices.__getitem__, SLICES, moved.image_distances if lens_is_known else None)
     assert registration.reference == 0, "the nearest focus sees the narrowest field"
@@ -53,7 +53,7 @@ def test_a_camera_that_moved_between_slices(moved: JitteredStack, lens_is_known:
     assert registration.breathing.source == ("lens" if lens_is_known else "pictures")
 
 
-@pytest.mark.parametrize("lens_is_known", [True, False])
+@pytest.mark.parametrize("lens_is_known", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_a_camera_that_turned_in_the_hand(lens_is_known: bool) -> None:
     """0.8 degrees from slice to slice, 4 in all: similarities leave a corner of the picture more than 2 px off."""
     turned = jittered_stack(turn_rad=np.deg2rad(0.8))

@@ -1,5 +1,7 @@
 """Drawn kernels blur as much as a lens does, so that slices whose focus is right are not called wrong."""
 
+from functools import cache
+
 import cv2
 import numpy as np
 import pytest
@@ -100,9 +102,14 @@ def test_a_slice_at_its_focus_is_found_there(aperture: Aperture, monkeypatch: py
     assert abs(wrong.focus_px.value) > 0.2 and abs(wrong.blur_gain.value) > 0.03
 
 
+@cache
+def through_a_disc() -> tuple[np.ndarray, np.ndarray]:
+    return fine_and_coarse(Aperture.disc())
+
+
 @pytest.mark.parametrize("name", ["scatter", "polygon", "low-rank", "laplacian", pytest.param("lrdm", marks=pytest.mark.slow)])
 def test_every_renderer_blurs_a_picture_of_pixels_as_the_lens_does(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    coc_px, photographed = fine_and_coarse(Aperture.disc())
+    coc_px, photographed = through_a_disc()
     reblur = Reblur(make_renderer(name))
     right = psnr(reblur(picture(1), coc_px, Aperture.disc())[INNER], photographed[INNER])
     for module in ("mrbokeh.layering.psf_over_field", "mrbokeh.renderers.layered_reconstruction._samples"):

@@ -222,7 +222,7 @@ def test_blender_5_writes_a_part_for_each_layer() -> None:
     assert rest.alpha.max() < 1e-6
 
 
-@pytest.mark.parametrize("name", ["multi", "single"])
+@pytest.mark.parametrize("name", ["multi", pytest.param("single", marks=pytest.mark.slow)])
 def test_eyes_of_stereo_files(shared_data: Path, name: str) -> None:
     """The same frame as 10 parts with data windows of their own and as one part whose channels name the eye; the default eye is right."""
     path = shared_data / "rgbd" / f"beachball_{name}.0001.exr"

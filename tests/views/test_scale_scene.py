@@ -42,7 +42,16 @@ def pictures() -> Traced:
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, pictures: Traced) -> Path:
     scene = tmp_path_factory.mktemp("scene")
+    write_views(scene, pictures)
+    return scene
+
+
+@pytest.fixture(scope="module")
+def focused(tmp_path_factory: pytest.TempPathFactory, pictures: Traced) -> Path:
+    """The scene with the slices of view 0, ten times as long to trace, and its poses."""
+    scene = tmp_path_factory.mktemp("focused")
     write_views(scene, pictures, registered_slices())
+    find_scene_poses(scene)
     return scene
 
 
@@ -58,9 +67,9 @@ def truth(model: SparseModel) -> Similarity:
 
 
 @pytest.fixture(scope="module")
-def scaled(folder: Path, model: SparseModel) -> ScaledScene:
-    assert len(model.views) == len(POSITIONS_M)
-    return scale_scene(folder, ScaleRequest(BOARD, ("view_0", "view_5", DISTANCE_M)))
+def scaled(focused: Path) -> ScaledScene:
+    assert len(read_sparse_model(focused / "reconstruction").views) == len(POSITIONS_M)
+    return scale_scene(focused, ScaleRequest(BOARD, ("view_0", "view_5", DISTANCE_M)))
 
 
 def test_corners_of_the_board_are_where_they_are(pictures: Traced) -> None:
@@ -92,6 +101,7 @@ def test_sparse_depth_is_the_true_depth(model: SparseModel, truth: Similarity, p
         assert np.median(np.abs(depth * truth.scale / true_m - 1.0)) < 2e-3
 
 
+@pytest.mark.slow
 def test_finding_poses_again_changes_nothing(folder: Path, model: SparseModel, tmp_path: Path, pictures: Traced) -> None:
     """Kept where they are; and from the start, with the same seed, the same cameras.
 
@@ -109,6 +119,7 @@ def test_finding_poses_again_changes_nothing(folder: Path, model: SparseModel, t
     assert again.views[0].camera.focal_px[0] == pytest.approx(model.views[0].camera.focal_px[0], rel=2e-4)
 
 
+@pytest.mark.slow
 def test_an_interrupted_run_goes_on_with_its_matches(folder: Path, model: SparseModel, tmp_path: Path, pictures: Traced) -> None:
     """Without the poses but with the database, features and matches are not found again: their rows stay as they are."""
     write_views(tmp_path, pictures)
@@ -123,16 +134,21 @@ def test_an_interrupted_run_goes_on_with_its_matches(folder: Path, model: Sparse
     assert len(read_sparse_model(tmp_path / "reconstruction").views) == len(model.views)
 
 
-def test_three_scales_agree_with_the_truth(scaled: ScaledScene, truth: Similarity) -> None:
+@pytest.mark.slow
+def test_three_scales_agree_with_the_truth(focused: Path, scaled: ScaledScene) -> None:
     """At 400 px the board's squares have 25 px and a point's focus is known to 0.006 dioptres; larger pictures do better."""
+    views = read_sparse_model(focused / "reconstruction").views
+    truth = umeyama(np.array([view.centre for view in views]), np.array(POSITIONS_M))
     off = {each.method: each.metres_per_unit / truth.scale - 1.0 for each in scaled.result.answers}
     assert list(off) == ["board", "distance", "focus"]
     assert abs(off["board"]) < 2e-3 and abs(off["distance"]) < 1e-3 and abs(off["focus"]) < 5e-3
     assert scaled.result.contradictions == ()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("scaled")
-def test_scale_and_calibration_are_written(folder: Path) -> None:
+def test_scale_and_calibration_are_written(focused: Path) -> None:
+    folder = focused
     document = json.loads((folder / "reconstruction" / "scale.json").read_text())
     assert document["used"] == "board" and set(document["disagreement"]) == {"distance", "focus"}
     metric = read_sparse_model(folder / "reconstruction").scaled()
@@ -146,22 +162,25 @@ def test_scale_and_calibration_are_written(folder: Path) -> None:
     assert stated_distances_m(stack) == pytest.approx(FOCUS_M)
 
 
-def test_focus_and_growth_of_blur_are_found(folder: Path, scaled: ScaledScene) -> None:
+@pytest.mark.slow
+def test_focus_and_growth_of_blur_are_found(focused: Path, scaled: ScaledScene) -> None:
     """Within a tenth of a pixel of blur: 0.02 dioptres at 7 px each, where the slices are 0.15 apart; the growth within 4 %."""
     fit = scaled.calibrated["view_0"].fit
     np.testing.assert_allclose(fit.dioptres, 1.0 / np.array(FOCUS_M), atol=0.02)
-    stack = read_focal_stack(folder / "view_0")
+    stack = read_focal_stack(focused / "view_0")
     thin = [LENS.focused_at(d).coc_px_per_dioptre(WIDTH_PX) * each.scale for d, each in zip(FOCUS_M, stack.slices, strict=True)]
     np.testing.assert_allclose(fit.px_per_dioptre, thin, rtol=0.04)
 
 
+@pytest.mark.slow
 def test_the_answers_are_told(scaled: ScaledScene) -> None:
     told = "\n".join(scale_lines(scaled))
     assert "board: " in told and "% from the one used" in told and "px per dioptre" in told
 
 
-def test_a_scale_that_is_there_is_kept(folder: Path, scaled: ScaledScene) -> None:
-    kept = scale_scene(folder, ScaleRequest())
+@pytest.mark.slow
+def test_a_scale_that_is_there_is_kept(focused: Path, scaled: ScaledScene) -> None:
+    kept = scale_scene(focused, ScaleRequest())
     assert kept.result.used.metres_per_unit == scaled.result.used.metres_per_unit
 
 
