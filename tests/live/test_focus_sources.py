@@ -7,7 +7,7 @@ import pytest
 
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
-from viewfinder.app.lenses import LensBook
+from viewfinder.app.opening import LensBook
 from viewfinder.focus.sources import FirstKnown, FrameFocus, ManualFocus
 from viewfinder.frames import CameraFrame, LensState
 from viewfinder.tracking.tracker import TrackedPose

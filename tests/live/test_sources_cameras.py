@@ -21,9 +21,9 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.video.color import linear_from_code
 from mrbokeh.video.writer import VideoWriter
 from viewfinder.frames import LensState
+from viewfinder.sources.attached_camera import WebcamSource
 from viewfinder.sources.frame_source import CameraAwayError, SizeLimit, reconnecting
 from viewfinder.sources.network_stream import newest_of
-from viewfinder.sources.webcam import WebcamSource
 
 WIDTH, HEIGHT = 160, 112
 
@@ -148,7 +148,7 @@ import json, sys, threading, warnings
 warnings.simplefilter("error")
 from mrbokeh.system.errors import InputError
 from viewfinder.sources.choose import open_source
-from viewfinder.sources.gphoto2_preview import lens_state
+from viewfinder.sources.attached_camera import lens_state
 
 def sentence(what):
     try:
@@ -225,7 +225,7 @@ def jpeg(level: int) -> bytes:
 @pytest.fixture
 def preview_source() -> Callable[..., Any]:
     pytest.importorskip("gphoto2", reason="the extra 'tether' is not installed")
-    from viewfinder.sources.gphoto2_preview import Gphoto2PreviewSource
+    from viewfinder.sources.attached_camera import Gphoto2PreviewSource
 
     return Gphoto2PreviewSource
 

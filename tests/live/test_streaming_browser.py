@@ -15,7 +15,7 @@ from mrbokeh.compositing.overlay import Overlay
 from mrbokeh.video.color import code_from_linear
 from tests.scenes.streaming_viewers import BARS, Feed, bars, output, streaming
 from tests.scenes.waiting import in_time
-from viewfinder.streaming.alpha_stream import AlphaStream, obs_routes
+from viewfinder.streaming.other_programs import AlphaStream, obs_routes
 from viewfinder.streaming.whep import Whep
 
 pytestmark = [

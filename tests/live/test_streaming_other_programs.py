@@ -22,8 +22,7 @@ from viewfinder.app.running import opened as serving
 from viewfinder.frames import FrameStatus, OutputFrame
 from viewfinder.options import ViewfinderOptions
 from viewfinder.server.access import Access
-from viewfinder.streaming.alpha_stream import AlphaStream, color_over_alpha
-from viewfinder.streaming.virtual_webcam import VirtualWebcam, fitted
+from viewfinder.streaming.other_programs import AlphaStream, VirtualWebcam, color_over_alpha, fitted
 
 
 def overlay(light: list[float], alpha: float, rows: int = 4, top_px: int = 2) -> Overlay:

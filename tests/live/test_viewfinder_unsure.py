@@ -15,10 +15,9 @@ from mrbokeh.system.errors import InputError
 from tests.scenes.layer_viewfinder import HEIGHT, LENS, WIDTH, bright_square
 from tests.scenes.stage_scenes import LENS as SCENE_LENS
 from tests.scenes.stage_scenes import ONE_CARD, backend, camera, scene_file
-from viewfinder.app.lenses import LensBook
 from viewfinder.app.live_compositor import LiveCompositor
 from viewfinder.app.live_controls import Captures
-from viewfinder.app.opening import Parts
+from viewfinder.app.opening import LensBook, Parts
 from viewfinder.focus.sources import ManualFocus
 from viewfinder.frames import CameraFrame, frame_header
 from viewfinder.options import ViewfinderOptions

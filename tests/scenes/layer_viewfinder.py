@@ -19,8 +19,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.video.color import linear_from_code
 from mrbokeh.video.writer import VideoWriter
-from viewfinder.app.lenses import LensBook
-from viewfinder.app.opening import Parts
+from viewfinder.app.opening import LensBook, Parts
 from viewfinder.app.running import Viewfinder
 from viewfinder.app.running import running as parts_running
 from viewfinder.options import ViewfinderOptions

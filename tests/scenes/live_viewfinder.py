@@ -21,9 +21,8 @@ from mrbokeh.video.frames import display_bgr
 from tests.scenes.live_clip import LiveClip, board_tracker
 from tests.scenes.streaming_viewers import Viewer, watching
 from tests.scenes.traced_board_clip import LENS
-from viewfinder.app.lenses import LensBook
 from viewfinder.app.live_compositor import CompositedFrame
-from viewfinder.app.opening import Parts, open_overlays, renderers_of
+from viewfinder.app.opening import LensBook, Parts, open_overlays, renderers_of
 from viewfinder.app.running import Viewfinder, running
 from viewfinder.options import ViewfinderOptions
 from viewfinder.server.endpoint import serving_site

@@ -25,10 +25,9 @@ from viewfinder.server.access import Access
 from viewfinder.server.endpoint import Endpoint, on_stop, open_endpoint, serving_site
 from viewfinder.server.jpeg_stream import JpegStream
 from viewfinder.server.site import Part, Site
-from viewfinder.streaming.alpha_stream import AlphaStream, ObsPart
 from viewfinder.streaming.encoded_stream import EncodedStream
+from viewfinder.streaming.other_programs import AlphaStream, ObsPart, VirtualWebcam
 from viewfinder.streaming.recording import Recorder
-from viewfinder.streaming.virtual_webcam import VirtualWebcam
 from viewfinder.streaming.whep import Whep
 from viewfinder.tracking.smoothing import SmoothedTracker
 

@@ -20,7 +20,7 @@ def open_source(text: str, limit: SizeLimit = UNLIMITED, fps: float | None = Non
     if fps is not None and fps <= 0:
         raise InputError(f"--fps: expected a positive number of frames per second, got {fps}")
     if text.isdigit():
-        from viewfinder.sources.webcam import WebcamSource
+        from viewfinder.sources.attached_camera import WebcamSource
 
         return WebcamSource(int(text), limit, fps)
     kind, colon, rest = text.partition(":")
@@ -44,7 +44,7 @@ def _named(kind: str, rest: str | None, limit: SizeLimit, fps: float | None) -> 
 
         return PatternSource(limit.width_px or _PATTERN_SIZE_PX[0], limit.height_px or _PATTERN_SIZE_PX[1], fps or DEFAULT_FPS)
     if kind == "gphoto2":
-        from viewfinder.sources.gphoto2_preview import Gphoto2PreviewSource
+        from viewfinder.sources.attached_camera import Gphoto2PreviewSource
 
         return Gphoto2PreviewSource(rest or None, limit)
     if kind == "folder":
