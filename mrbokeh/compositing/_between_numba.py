@@ -23,10 +23,8 @@ def gather(
     far_rgb: np.ndarray,
     coc_px: np.ndarray,
     pupil: np.ndarray,
-    first: int,
-    end: int,
 ) -> None:
-    """Means over the pupil for the pixels places[which[first:end]], at the same rows of sums.
+    """Means over the pupil for the pixels places[which], at the same rows of sums.
 
     All numbers are single precision. sums (N, 16): f (past the near), a (virtual coverage), f a, virtual light v (3), f v (3), f s (3:
     of the far), f (1 - a) s (3), f (1 - a). near_in_reach (H, W): whether any ray may meet something near. coc_px (3, H, W): near,
@@ -35,7 +33,7 @@ def gather(
     width = near_alpha.shape[1]
     free, past, mean = np.empty(len(pupil), np.float32), np.empty(len(pupil), np.float32), np.empty(16, np.float32)
     rays = np.ascontiguousarray(pupil.T)
-    for i in which[first:end]:
+    for i in which:
         row, column = places[i] // width, places[i] % width
         free[:] = rays[2]
         if near_in_reach[row, column]:

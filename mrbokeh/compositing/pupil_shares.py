@@ -102,7 +102,7 @@ class Rays:
         for which, aperture in self.cells(places):
             pupil = pupil_points(aperture, self.points).astype(np.float32)
             with workers(len(which) * self.points) as pool:
-                work = lambda first, end: gather(sums, places, which, near, in_reach, dark, far, self.coc_px, pupil, first, end)  # noqa: B023, E731
+                work = lambda first, end: gather(sums, places, which[first:end], near, in_reach, dark, far, self.coc_px, pupil)  # noqa: B023, E731
                 in_bands(pool, len(which), _BAND_PLACES, work)
         f, a, f_a, past = (sums[:, c] for c in (0, 1, 2, 15))
         return PupilMeans(
