@@ -100,7 +100,7 @@ def gathered(
 def gathered_reference(
     values: Float32[np.ndarray, "rows columns channels"], cells: Int32[np.ndarray, "height width"], taps: Points, margin_px: int
 ) -> Float[np.ndarray, "height width channels"]:
-    """Return the slow and obvious twin of `gathered`, in double precision."""
+    """Gather as `gathered` does, slowly and obviously, in double precision."""
     out = np.zeros((*cells.shape, values.shape[2]))
     for y, x in np.ndindex(*cells.shape):
         part = slice(taps.starts[cells[y, x]], taps.starts[cells[y, x] + 1])

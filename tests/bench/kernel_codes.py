@@ -189,7 +189,7 @@ def is_line(kernel: Kernel) -> bool:
 
 
 def likeness_of(sparse: Spreadlet | QuadTree, kernel: Kernel, window_px: int) -> Likeness:
-    """Return a sparse form against its kernel."""
+    """Compare a sparse form with its kernel."""
     points = len(sparse.values)
     taps = int(np.count_nonzero(kernel))
     if points >= taps:

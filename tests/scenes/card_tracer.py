@@ -143,7 +143,7 @@ def _trace_cards(
     reach: Int8[np.ndarray, "height width cards"],
     coverage: Float64[np.ndarray, "_ _ _"],
 ) -> Float64[np.ndarray, "height width 4"]:
-    """Return the cards with black lamps, in pieces of rows; each pixel has its own samples, so threads change nothing."""
+    """Trace the cards with black lamps, in pieces of rows; each pixel has its own samples, so threads change nothing."""
     from tests.scenes._card_tracer_numba import trace_rows
 
     samples, starts = lens_samples(aperture, positions, _BLOCKS)
@@ -166,7 +166,7 @@ def _trace_lamps(
     positions: int,
     reach: Int8[np.ndarray, "height width cards"],
 ) -> Float64[np.ndarray, "height width 4"]:
-    """Return the light of the lamps, one after the other: rays in proportion to the area over which a lamp spreads."""
+    """Trace the light of the lamps, one after the other: rays in proportion to the area over which a lamp spreads."""
     from tests.scenes._card_tracer_numba import add_lamp
 
     arrays = (planes, packed.solid, packed.cells, packed.lamps, reach, (grid.margin_px, grid.density))
