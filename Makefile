@@ -14,6 +14,8 @@ gallery: $(READY)
 	$(RUN)/mrbokeh demo --out $(OUT)
 	$(RUN)/python -m datasets_scripts.gallery gallery_out --demo $(OUT)
 
+# Two workers and many processes start from the same sources: what Python compiles of them is kept, whatever the environment says.
+test: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)
 	$(RUN)/python -m pytest -n 2 --dist worksteal -m "not slow and not browser" --durations 30 --durations-min 1
 

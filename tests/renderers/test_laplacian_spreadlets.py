@@ -442,7 +442,7 @@ def samples_of_a_plane(coc_px: float, count: int, motion_px: tuple[float, float]
     return LightFieldSamples(width, height, *(np.ascontiguousarray(each, np.float32) for each in arrays)), sharp
 
 
-@pytest.mark.parametrize(("coc_px", "motion_px"), [(20.0, (0.0, 0.0)), (-20.0, (0.0, 0.0)), (30.0, (0.0, 0.0)), (12.0, (15.0, 6.0))])
+@pytest.mark.parametrize(("coc_px", "motion_px"), [(20.0, (0.0, 0.0)), (-20.0, (0.0, 0.0)), (12.0, (15.0, 6.0))])
 def test_reconstruction_puts_each_kernel_once_and_where_it_belongs(coc_px: float, motion_px: tuple[float, float]) -> None:
     """Of 4 noisy samples per pixel, the blur of the sharp square; splatted at the samples' own places it would be blurred twice."""
     lens = replace(LENS, aperture=DISC)

@@ -46,8 +46,7 @@ def plainly_halved(values: np.ndarray, diameter_px: float, name: str) -> np.ndar
     return result
 
 
-@pytest.mark.parametrize("name", ["octagon", "heart"])
-@pytest.mark.parametrize("diameter_px", [73.0, -80.4])
+@pytest.mark.parametrize(("name", "diameter_px"), [("octagon", 73.0), ("heart", -80.4)])
 def test_the_plain_twin_agrees(name: str, diameter_px: float) -> None:
     values = picture(20, 26)
     aperture = {"octagon": OCTAGON, "heart": HEART}[name]
