@@ -24,7 +24,7 @@ def gather(
     coc_px: np.ndarray,
     pupil: np.ndarray,
 ) -> None:
-    """Means over the pupil for the pixels places[which], at the same rows of sums.
+    """Compute means over the pupil for the pixels places[which], at the same rows of sums.
 
     All numbers are single precision. sums (N, 16): f (past the near), a (virtual coverage), f a, virtual light v (3), f v (3), f s (3:
     of the far), f (1 - a) s (3), f (1 - a). near_in_reach (H, W): whether any ray may meet something near. coc_px (3, H, W): near,

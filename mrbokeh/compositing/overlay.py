@@ -23,7 +23,7 @@ class CodeTables(NamedTuple):
 
 @lru_cache(maxsize=8)
 def code_tables(transfer: str) -> CodeTables:
-    """Tables of a transfer of `video_color`; every code survives the way to linear light and back."""
+    """Return the tables of a transfer of `video.color`; every code survives the way to linear light and back."""
     codes = code_from_linear(np.linspace(0.0, 1.0, _LINEAR_STEPS + 1), transfer)
     return CodeTables(linear_from_code(np.arange(256) / 255.0, transfer), np.rint(codes * 255.0).astype(np.uint8))
 

@@ -9,17 +9,15 @@
     scene = scene.with_environment(Environment(panorama)).with_lights(sun((0.3, 1.0, 0.5), irradiance=3.0))
     layer = EmbreeRaycaster().render(scene, camera)
 
-What lies where:
-    virtual_scene      Scene; WORLD_FROM_GLTF (y up, z back -> y down, z forward); world_from_scene_placing
-    mesh, material     Mesh, Material, Texture, matte, emitter: glTF 2.0 metallic-roughness in linear light
-    light, environment Light (KHR_lights_punctual), sun; Environment (linear HDR panorama), split_sun, neutral_environment
-    shapes             sphere, rectangle, shadow_catcher
-    gltf_loader        load_glb(path, time_s, animation) -> Scene; GltfAsset for many moments of one file (needs pygltflib)
-    base               SceneRenderer: render(scene, camera) -> Layer, render_shadow_mask(scene, camera, catcher)
-    shadow_layer       shadow_layer: the shadow on a level catcher as a Layer
-    embree_raycaster   EmbreeRaycaster, the backend for any CPU (needs embreex and numba)
-    wgpu_rasterizer    WgpuRasterizer, the backend for graphics cards (needs wgpu)
-    choose             scene_renderer("auto"): the card where there is one, else the ray caster
+    virtual_scene   Scene; WORLD_FROM_GLTF (y up, z back -> y down, z forward); world_from_scene_placing; SceneRenderer; shadow_layer
+    mesh, material  Mesh, Material, Texture, matte, emitter: glTF 2.0 metallic-roughness in linear light; sphere, rectangle, shadow_catcher
+    light           Light (KHR_lights_punctual), sun; Environment (linear HDR panorama), split_sun, neutral_environment
+    light_change    light_change: shadow and reflection of objects on a real surface
+    gltf/           load_glb(path, time_s, animation) -> Scene; GltfAsset for many moments of one file (needs pygltflib)
+    embree/         EmbreeRaycaster, the backend for any CPU (needs embreex and numba)
+    wgpu/           WgpuRasterizer, the backend for graphics cards (needs wgpu)
+    mitsuba/        MitsubaTracer, path tracing (needs mitsuba)
+    choose          scene_renderer("auto"): the card if there is one, else the ray caster
 
 Only light modules are imported here; the loader and the backends are imported by their own names.
 """

@@ -37,7 +37,9 @@ def render_shot(shot: Shot, executor: Executor, *, overwrite: bool = False, prog
 
 @dataclass(frozen=True, eq=False)
 class PartsFolder:
-    """OUT.parts, from the first segment until the result is whole."""
+    """Folder OUT.parts of finished segments, from the first segment until the result is whole; its manifest says what they were made
+    with.
+    """
 
     path: Path
     shot: Shot

@@ -46,7 +46,7 @@ FORMAT, VERSION = "mrbokeh-grain", 1
 
 
 def grain_texture(correlation: Correlation, seed: int) -> Float32[np.ndarray, "side side 3"]:
-    """White noise, filtered by the root of the spectrum that belongs to the correlation (Wiener-Khinchin); mean 0, variance 1."""
+    """Filter white noise by the root of the spectrum that belongs to the correlation (Wiener-Khinchin); mean 0, variance 1."""
     kernels = np.fft.irfft2(_root_of_spectrum(correlation), (_GRID_PX, _GRID_PX), axes=(0, 1))
     noise = np.random.default_rng(seed).standard_normal((SIDE_PX, SIDE_PX, 3), np.float32)
     drawn = np.fft.rfft2(noise, axes=(0, 1))

@@ -17,7 +17,7 @@ _Pair = tuple[Any, Any]
 
 
 class TextureTables:
-    """`PackedTextures` on the device; the compiled twin is `_texture_numba`."""
+    """Packed textures on the device; the compiled twin is in `_surface_numba`."""
 
     def __init__(self, textures: PackedTextures) -> None:
         self._texels = mi.Float(textures.texels.ravel())

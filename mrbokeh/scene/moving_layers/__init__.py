@@ -1,18 +1,13 @@
 """Motion blur of virtual objects from their own and the camera's motion, with shutter angle and rolling shutter.
 
-    from mrbokeh.scene.moving_layers import FilmedScene, ShutterTiming, moving_layer, moving_shadow_layer
+from mrbokeh.scene.moving_layers import FilmedScene, ShutterTiming, moving_layer, moving_shadow_layer
 
-    filmed = FilmedScene(staged.scene_at, track.camera_at, ShutterTiming(frame_rate=24.0, angle_deg=180.0, readout_s=0.02))
-    layer = moving_layer(renderer, filmed, time_s)
+filmed = FilmedScene(staged.scene_at, track.camera_at, ShutterTiming(frame_rate=24.0, angle_deg=180.0, readout_s=0.02))
+layer = moving_layer(renderer, filmed, time_s)
 
-What lies where:
-    shutter         ShutterTiming: when which row is exposed
-    filmed_scene    FilmedScene: scene and camera by time, with their shutter
-    paths           Paths: where the surfaces seen at every pixel are while the shutter is open
-    moving_layer    moving_layer: one picture with motion channels, or an accumulation where paths are bent
-    rolling         rolled: rows seen at their own times
-    accumulation    accumulated: the plain slow way, many pictures averaged
-    moving_shadow   moving_shadow_layer: the shadow on a catcher
+filmed_scene    FilmedScene: scene and camera by time; ShutterTiming: when which row is exposed
+paths           Paths of the surfaces seen at every pixel while the shutter is open
+moving_layer    one picture with motion channels, or an accumulation if paths are bent; shadows; rolling shutter
 """
 
 from mrbokeh.scene.moving_layers.filmed_scene import FilmedScene, ShutterTiming
