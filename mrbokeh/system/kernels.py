@@ -70,7 +70,7 @@ def forget_unused(folder: Path) -> None:
 
 
 class _KernelLocator(_CacheLocator):  # type: ignore[misc]
-    """Tells numba where the kernels of a module lie; what they depend on is in the name of the folder."""
+    """Place of the kernels of a module, for numba; what they depend on is in the name of the folder."""
 
     def __init__(self, folder: Path, line: int) -> None:
         self._folder, self._line = folder, line
