@@ -45,8 +45,10 @@ def point(value: float = 1.0, size_px: int = 81) -> np.ndarray:
     return values
 
 
-@pytest.mark.parametrize("name", MAPS)
-@pytest.mark.parametrize("aperture", APERTURES)
+@pytest.mark.parametrize(
+    ("name", "aperture"),
+    [*((name, "5 blades") for name in MAPS), ("through the focus", "ring"), ("any", "ring"), ("two planes", "disc"), ("slope", "disc")],
+)
 def test_it_agrees_with_the_exact_scatter(name: str, aperture: str) -> None:
     """48 dB on white noise of range 1; with the default error of 0.1 theory says 0.1 * 0.29 / (0.44 d) for a disc: 53 dB at 20 px."""
     result = LowRankFilter().sum_kernels(noise(), MAPS[name], APERTURES[aperture])
@@ -152,8 +154,7 @@ def test_a_lamp_leaves_the_dark_beside_it_alone(contrast: float) -> None:
     np.testing.assert_allclose(result[inside], truth[inside], rtol=0.1)
 
 
-@pytest.mark.parametrize("angle_rad", [0.0, 0.4, np.pi / 4])
-@pytest.mark.parametrize("diameter_px", [12.0, 33.0])
+@pytest.mark.parametrize(("angle_rad", "diameter_px"), [(0.0, 12.0), (0.4, 33.0), (np.pi / 4, 12.0)])
 @pytest.mark.parametrize("aperture", APERTURES)
 def test_an_edge_is_right_to_three_thousandths(angle_rad: float, diameter_px: float, aperture: str) -> None:
     y, x = np.mgrid[:HEIGHT_PX, :WIDTH_PX]
