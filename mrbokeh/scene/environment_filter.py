@@ -85,7 +85,7 @@ def filtered(radiance: Float32[np.ndarray, "height width 3"]) -> LightingMaps:
     """The maps of a panorama in its own axes.
 
     Matte light is the exact cosine convolution (`cosine_convolved`), not spherical harmonics of order 2 (Ramamoorthi and
-    Hanrahan 2001): measured over all normals those are 2 % off on average under a smooth sky with two wide lamps, but 10 %
+    Hanrahan 2001): measured over all normals those are 2 % off on average under a smooth sky with two wide lights, but 10 %
     on average and by a factor of 2 in the shade under a photographed sky with its sun. The brightest blocks are kept apart,
     as interpolating in a map would round off the terminator of a small sun.
     """

@@ -48,7 +48,7 @@ class Light:
     def transformed(self, world_from_light: Float[np.ndarray, "4 4"]) -> "Light":
         """The light moved, turned and resized together with its scene.
 
-        A lamp in a scene twice as large needs four times the intensity for the same picture; so it gets it.
+        A light in a scene twice as large gets four times the intensity, for the same picture.
         """
         linear = world_from_light[:3, :3]
         scale = float(abs(np.linalg.det(linear)) ** (1 / 3))

@@ -68,7 +68,7 @@ def cast_light_change(renderer: SceneRenderer, scene: Scene, camera: Camera, cat
     total, taken = nothing.copy(), nothing.copy()
     if lights:
         shadow = 1.0 - renderer.render_shadow_mask(scene, camera, catcher).reshape(-1)[pixels]
-        total += _lamp_light(lights, surfaces, centre_m)
+        total += _direct_light(lights, surfaces, centre_m)
         taken += total * shadow[:, None]
     if environment is not None:
         maps = lighting_maps(environment)
@@ -94,7 +94,7 @@ def _met_surfaces(camera: Camera, catcher: Mesh) -> tuple[Surfaces, Float64[np.n
     return surfaces, ground.centre_m, pixels
 
 
-def _lamp_light(lights: Sequence[Light], surfaces: Surfaces, centre_m: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "points 3"]:
+def _direct_light(lights: Sequence[Light], surfaces: Surfaces, centre_m: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "points 3"]:
     """Return the radiance of a white surface under the lights alone."""
     rgb = np.zeros((len(surfaces.alpha), 3))
     for light in lights:

@@ -44,13 +44,13 @@ class Guides:
 
 
 class MitsubaTracer:
-    """A SceneRenderer for pictures that may take their time: light that objects pass on to each other, soft shadows of the
-    environment, emissive surfaces that light what is around them. Needs `mitsuba` and an LLVM library.
+    """SceneRenderer for pictures that may take their time: light that objects pass on to each other, soft shadows of the environment,
+    emissive surfaces that light their surroundings. Needs `mitsuba` and an LLVM library.
 
-    Coverage and depth are the ray caster's, which are exact and free of noise; paths give the colour of what is covered.
-    The reflection is the ray caster's too (glTF 2.0, appendix B), so under lamps alone and with most_bounces = 1 both backends
-    show the same but for rough metals, whose lost light is given back here. Occlusion textures are not read: here light itself is
-    occluded. Emissive surfaces are area lights; unlit ones show their base colour, also in reflections. Use it from one thread.
+    Coverage and depth are the ray caster's, which are exact and free of noise; paths give the colour of what is covered. The reflection
+    is the ray caster's too (glTF 2.0, appendix B), so under lights without extent alone and with most_bounces = 1 both backends show
+    the same but for rough metals, whose lost light is given back here. Occlusion textures are not read: here light itself is occluded.
+    Emissive surfaces are area lights; unlit ones show their base colour, also in reflections. Use it from one thread.
     """
 
     def __init__(

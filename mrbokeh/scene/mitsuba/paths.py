@@ -170,7 +170,7 @@ def _stepped(world: World, rays: Rays, most: Any, path: _Path) -> _Path:
     path = _lit_from_afar(world, rays, path, path.active & ~meets.met)
     path = _glowed_upon(world, _first_noted(path, meets), meets)
     reflects, reflects_on = reflection(meets.surface, world.shares), _reflects_on(path, meets, most)
-    light = world.lamps(reflects, reflects_on) + drawn_lights(world, reflects, path.sampler, reflects_on)
+    light = world.point_lights(reflects, reflects_on) + drawn_lights(world, reflects, path.sampler, reflects_on)
     return _gone_on(world, path.lit(path.carried * light, reflects_on), meets, reflects, reflects_on)
 
 

@@ -89,16 +89,16 @@ class _Table:
         met = hit.is_valid()
         point = self._real.surfaces.point(hit, direction, mi.Float(0.0), met)
         reflects = reflection(self._real.surfaces.surface(point, direction, met), self._real.shares)
-        parts = [self._lamps(reflects, sampler, met)]
+        parts = [self._point_lights(reflects, sampler, met)]
         for way in range(3):
             if way != 1 or self._real.environment is not None:
                 parts.append(self._one_way(way, reflects, sampler, met, most_bounces))
         return parts
 
-    def _lamps(self, reflects: Reflection, sampler: Any, met: Any) -> tuple[Any, ...]:
+    def _point_lights(self, reflects: Reflection, sampler: Any, met: Any) -> tuple[Any, ...]:
         total, taken, added = mi.Color3f(0.0), mi.Color3f(0.0), mi.Color3f(0.0)
         for number in range(len(self._real.lights)):
-            without, beside = (world.lamp(number, reflects, met) for world in (self._real, self._both))
+            without, beside = (world.point_light(number, reflects, met) for world in (self._real, self._both))
             total, taken = total + without, taken + dr.maximum(without - beside, 0.0)
         if self._both.shining.any:
             added = shining_light(self._both, reflects.surface.origin, lambda towards: self._value(reflects, towards), sampler, met)

@@ -1,4 +1,4 @@
-"""World: meshes, lamps and environment on the device, with the answers that paths ask of them."""
+"""World: meshes, lights and environment on the device, with the queries of path tracing."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -97,14 +97,14 @@ class World:
         )
         return going[2]
 
-    def lamps(self, reflects: Reflection, active: Any) -> Any:
+    def point_lights(self, reflects: Reflection, active: Any) -> Any:
         """Radiance reflected from the lights without extent."""
         result = mi.Color3f(0.0)
         for number in range(len(self.lights)):
-            result += self.lamp(number, reflects, active)
+            result += self.point_light(number, reflects, active)
         return result
 
-    def lamp(self, number: int, reflects: Reflection, active: Any) -> Any:
+    def point_light(self, number: int, reflects: Reflection, active: Any) -> Any:
         surface = reflects.surface
         towards, distance, irradiance = self.lights.arriving(number, surface.origin)
         value, _density = reflects.value(towards)

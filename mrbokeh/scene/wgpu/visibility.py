@@ -89,7 +89,7 @@ def nearest_m(camera: Camera, centre_m: Float[np.ndarray, "3"], box_m: Float[np.
 
 
 def light_views(light: Light, box_m: Float[np.ndarray, "8 3"], size_px: int) -> list[View]:
-    """One view that takes in all of the box, or six around a lamp that is too near or inside.
+    """One view that takes in all of the box, or six around a point light that is too near or inside.
 
     box_m and the light's position are relative to the geometry's centre.
     """
@@ -98,15 +98,15 @@ def light_views(light: Light, box_m: Float[np.ndarray, "8 3"], size_px: int) -> 
     position = np.asarray(light.position_m)
     if light.kind == "spot" and np.tan(light.outer_cone_rad) < _WIDEST_TANGENT:
         half = 1.02 * max(float(np.tan(light.outer_cone_rad)), 1e-3)
-        return [_lamp_view(position, _axes_along(np.asarray(light.direction)), half, box_m, size_px)]
+        return [_point_view(position, _axes_along(np.asarray(light.direction)), half, box_m, size_px)]
     middle = box_m.mean(0) - position
     axes = _axes_along(middle / max(float(np.linalg.norm(middle)), 1e-12))
     across, depth = (box_m - position) @ axes[:2].T, (box_m - position) @ axes[2]
     half = 1.02 * float(np.abs(across / depth[:, None]).max()) if depth.min() > 0 else np.inf
     if half < _WIDEST_TANGENT:
-        return [_lamp_view(position, axes, max(half, 1e-6), box_m, size_px)]
+        return [_point_view(position, axes, max(half, 1e-6), box_m, size_px)]
     ways = [sign * np.eye(3)[axis] for axis in range(3) for sign in (1.0, -1.0)]
-    return [_lamp_view(position, _axes_along(way), 1.0, box_m, size_px) for way in ways]
+    return [_point_view(position, _axes_along(way), 1.0, box_m, size_px) for way in ways]
 
 
 def _axes_along(forward: Float[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
@@ -117,7 +117,7 @@ def _axes_along(forward: Float[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
     return np.stack([right, np.cross(forward, right), forward])
 
 
-def _lamp_view(
+def _point_view(
     position: Float[np.ndarray, "3"], axes: Float[np.ndarray, "3 3"], half: float, box_m: Float[np.ndarray, "8 3"], size_px: int
 ) -> View:
     """Return the view of a point or spot light. half: tangent of half the field of view."""
