@@ -139,7 +139,7 @@ def coc(
     from mrbokeh.optics.lens_file import read_lens
 
     if not min(depths) > 0:
-        raise InputError(f"depths must be positive metres, got {depths}")
+        raise InputError(f"expected depths above 0 in metres, got {depths}")
     read = read_lens(lens)
     for depth_m in depths:
         typer.echo(f"{depth_m:g} m: {float(read.coc_px(depth_m, width)):+.2f} px")

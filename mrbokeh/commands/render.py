@@ -65,7 +65,7 @@ def render(
     require_suffix(out, (".exr", *INTEGER_SUFFIXES), "--out")
     require_safe_outputs((out,), (lens, *given.files), result.overwrite)
     if result.alpha_out and out.suffix.lower() != ".exr":
-        raise InputError(f"--alpha-out needs an .exr to write to, got {out}")
+        raise InputError(f"--alpha-out needs an .exr to write to, got {out}: write .exr, or leave --alpha-out out")
     if given.samples is not None and (given.shows_pictures or focus.is_given):
         raise InputError("--samples holds all there is to see, with its focus and its motion: leave out pictures, layers, motion and focus")
     sharp = {} if given.samples is not None else read_sharp(given)

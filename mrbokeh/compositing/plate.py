@@ -71,7 +71,7 @@ class Plate:
             )
         height, width = self.depth_m.shape
         if not (0 <= x_px < width and 0 <= y_px < height):
-            raise InputError(f"pixel {x_px:g},{y_px:g} lies outside the photograph of {width}x{height} px")
+            raise InputError(f"pixel {x_px:g},{y_px:g} lies outside the photograph of {width}x{height} px: choose one within")
         depth_m = float(self.depth_m[int(y_px), int(x_px)])
         x_m, y_m, z_m = self.camera.unproject(np.array([x_px, y_px]), np.array(depth_m))
         return float(x_m), float(y_m), float(z_m)
@@ -94,7 +94,7 @@ def open_plate(photo: Path, slice_index: int | None = None, lens: Lens | None = 
     if photo.is_dir():
         return _stack_plate(photo, slice_index, lens, focus_m)
     if slice_index is not None:
-        raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}")
+        raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}: leave it out")
     photograph = read_photograph(photo)
     lens = photograph.lens(photo, focus_m) if lens is None else lens_for_photograph(lens, photograph, photo)
     focused = lens if focus_m is None else lens.focused_at(focus_m)

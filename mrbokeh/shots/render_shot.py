@@ -102,6 +102,6 @@ def _stamps(paths: Iterable[Path]) -> str:
             try:
                 status = file.stat()
             except OSError:
-                raise InputError(f"expected a file at {file}, but there is none") from None
+                raise InputError(f"expected a file at {file}, but there is none: check the name") from None
             digest.update(f"{file}|{status.st_size}|{status.st_mtime_ns}\n".encode())
     return f"{', '.join(path.name for path in paths)} {digest.hexdigest()[:16]}"

@@ -27,14 +27,14 @@ def opened(path: Path, threads: int = 0) -> Iterator[tuple[Any, Any]]:
     import av
 
     if not Path(path).is_file():
-        raise InputError(f"expected a video at {path}, but there is no such file")
+        raise InputError(f"expected a video at {path}, but there is no such file: check the name")
     try:
         container = av.open(str(path))
     except av.FFmpegError as error:
         raise InputError(f"{path} cannot be read as a video: {error.strerror}") from None
     with container:
         if not container.streams.video:
-            raise InputError(f"{path} holds no video stream")
+            raise InputError(f"{path} holds no video stream: expected a video")
         stream = container.streams.video[0]
         if stream.sample_aspect_ratio not in (None, 0, 1):
             raise InputError(f"{path} has pixels that are not square ({stream.sample_aspect_ratio}): scale it to square pixels first")

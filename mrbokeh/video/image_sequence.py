@@ -54,7 +54,7 @@ class NumberedFiles:
         matches = (named.fullmatch(file.name) for file in folder.iterdir()) if folder.is_dir() else ()
         numbers = sorted({int(match.group(1)) for match in matches if match})
         if not numbers:
-            raise InputError(f"expected files named {pattern}, but there is none")
+            raise InputError(f"expected files named {pattern}, but there is none: check the folder and the number of digits")
         files = cls(pattern, numbers[0], numbers[-1] - numbers[0] + 1)
         missing = sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers))
         if missing:
@@ -67,7 +67,7 @@ class NumberedFiles:
         """The file of a frame, counted from the first. Raises InputError beyond the end."""
         if not 0 <= index < self.count:
             last = numbered(self.pattern, self.first + self.count - 1)
-            raise InputError(f"frame {index} needs {numbered(self.pattern, self.first + index)}, but the sequence ends with {last}")
+            raise InputError(f"frame {index} needs {numbered(self.pattern, self.first + index)}, but the sequence ends with {last}: take fewer frames")
         return numbered(self.pattern, self.first + index)
 
     @property

@@ -103,7 +103,7 @@ def stated_exposure(path: Path) -> Exposure:
     import OpenEXR
 
     if not path.is_file():
-        raise InputError(f"expected an EXR file at {path}, but there is none")
+        raise InputError(f"expected an EXR file at {path}, but there is none: check the name")
     try:
         header = OpenEXR.File(str(path), header_only=True).header()
     except (RuntimeError, OSError, ValueError) as error:

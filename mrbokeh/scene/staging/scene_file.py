@@ -136,7 +136,7 @@ def _document(path: Path) -> object:
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError:
-        raise InputError(f"expected a scene file (TOML) at {path}, but there is none that can be read") from None
+        raise InputError(f"expected a scene file (TOML) at {path}, but there is none that can be read: check the name") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"expected a scene file (TOML) at {path}, but it cannot be read as such: {error}") from None
 
