@@ -21,7 +21,8 @@ import typer
 from datasets_scripts.made_sets.bokeh_plan import SHAPES, SIZES, StacksPlan
 from datasets_scripts.made_sets.set_files import LICENCE, Job, claim_folder, focus_index, slice_name, stack_record
 from datasets_scripts.scenes.bokeh_scenes import bokeh_scene
-from datasets_scripts.tracers.truth import Opening, Picture, TruthTracer, make_tracer, sharp_layer
+from datasets_scripts.tracers.truth import Opening, Picture, TruthTracer
+from datasets_scripts.tracers.truth_layer import make_tracer, sharp_layer
 from datasets_scripts.tracers.truth_scene import pack
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.images.exr_io import read_exr

@@ -23,7 +23,8 @@ from datasets_scripts.made_sets.truth_plan import TruthPlan, truth_name, view_do
 from datasets_scripts.made_sets.truth_set import ViewFiles, make_missing, truth_command
 from datasets_scripts.scenes.textures import checks, spots
 from datasets_scripts.scenes.truth_scenes import colour, fine, make_scene
-from datasets_scripts.tracers.truth import TruthTracer, make_tracer, sharp_layer
+from datasets_scripts.tracers.truth import TruthTracer
+from datasets_scripts.tracers.truth_layer import make_tracer, sharp_layer
 from datasets_scripts.tracers.truth_scene import Body, PackedScene, TruthScene, ball, box, leaf, pack, wire
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.image_io import SheetRow, read_image, read_layer, write_contact_sheet, write_image, write_layer

@@ -12,7 +12,8 @@ import typer
 from datasets_scripts.made_sets.set_files import Job, claim_folder
 from datasets_scripts.made_sets.truth_plan import SHAPE_NAMES, TruthPlan, truth_name, view_document
 from datasets_scripts.scenes.truth_scenes import make_scene
-from datasets_scripts.tracers.truth import Part, Picture, TruthTracer, make_tracer, sharp_layer
+from datasets_scripts.tracers.truth import Part, Picture, TruthTracer
+from datasets_scripts.tracers.truth_layer import make_tracer, sharp_layer
 from datasets_scripts.tracers.truth_scene import PackedScene, TruthScene, pack
 from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
 from mrbokeh.images.image_io import SheetRow, read_image, read_layer, write_contact_sheet, write_image, write_layer

@@ -14,7 +14,8 @@ from datasets_scripts.made_sets.bokeh_plan import SHAPES, SIZES, StackSize, Stac
 from datasets_scripts.scenes.bokeh_scenes import KINDS, bokeh_scene
 from datasets_scripts.tracers.pupil import FieldStop, OpenShares, polygon_share
 from datasets_scripts.tracers.traced_scene import plain_texture
-from datasets_scripts.tracers.truth import Opening, make_tracer
+from datasets_scripts.tracers.truth import Opening
+from datasets_scripts.tracers.truth_layer import make_tracer
 from datasets_scripts.tracers.truth_scene import Lamp, PackedScene, TruthScene, pack, quad
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.optics.aperture import Aperture

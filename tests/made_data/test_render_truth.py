@@ -14,7 +14,8 @@ from datasets_scripts.scenes.truth_scenes import SCENES, make_scene
 from datasets_scripts.tracers.pupil import pupil_table, two_disc_overlap
 from datasets_scripts.tracers.sobol import owen_scrambled, reversed_bits, scramble_seed, sobol_table
 from datasets_scripts.tracers.traced_scene import Vector, plain_texture
-from datasets_scripts.tracers.truth import Opening, Part, TruthTracer, lamp_flux, make_tracer, sharp_layer
+from datasets_scripts.tracers.truth import Opening, Part, TruthTracer, lamp_flux
+from datasets_scripts.tracers.truth_layer import make_tracer, sharp_layer
 from datasets_scripts.tracers.truth_scene import Body, Lamp, TruthScene, pack, quad
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import read_image, read_layer
