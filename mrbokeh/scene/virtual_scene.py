@@ -86,7 +86,8 @@ def world_from_scene_placing(
     scale = 1.0
     if height_m is not None:
         if height_m <= 0 or high[1] <= low[1]:
-            raise InputError(f"expected a height above 0 for a scene with extent, got {height_m} m for one of {high[1] - low[1]} m: give another height")
+            extent_m = high[1] - low[1]
+            raise InputError(f"expected a height above 0 for a scene with extent, got {height_m} m for one of {extent_m} m: give another")
         scale = height_m / float(high[1] - low[1])
     underside = np.array([(low[0] + high[0]) / 2, high[1], (low[2] + high[2]) / 2])
     cosine, sine = np.cos(turn_rad), np.sin(turn_rad)

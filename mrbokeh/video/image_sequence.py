@@ -67,7 +67,8 @@ class NumberedFiles:
         """The file of a frame, counted from the first. Raises InputError beyond the end."""
         if not 0 <= index < self.count:
             last = numbered(self.pattern, self.first + self.count - 1)
-            raise InputError(f"frame {index} needs {numbered(self.pattern, self.first + index)}, but the sequence ends with {last}: take fewer frames")
+            wanted = numbered(self.pattern, self.first + index)
+            raise InputError(f"frame {index} needs {wanted}, but the sequence ends with {last}: take fewer frames")
         return numbered(self.pattern, self.first + index)
 
     @property
