@@ -67,8 +67,7 @@ def shoot_command(
 ) -> None:
     from capture.tether.camera_driver import CameraSettings, read_focus_steps
     from capture.tether.focus_plan import read_plan
-    from capture.tether.shoot import ShootOptions, Surroundings, shoot
-    from capture.tether.shoot_arguments import open_named, parse_seconds, parse_spot, parse_target, steps_between
+    from capture.tether.shoot import ShootOptions, Surroundings, open_named, parse_seconds, parse_spot, parse_target, shoot, steps_between
     from mrbokeh.system.console import kept_when_interrupted
 
     planned = read_plan(plan)
@@ -113,7 +112,7 @@ def measured(
     """Sweep the focus over targets; the scale is kept in OUT/focus_steps.json and taken from there when a shoot goes on."""
     from capture.tether.camera_driver import read_focus_steps, write_focus_steps
     from capture.tether.focus_motor import FocusAxis, measure_focus_steps
-    from capture.tether.shoot_arguments import parse_stop
+    from capture.tether.shoot import parse_stop
     from mrbokeh.system.console import working
 
     path = out / "focus_steps.json"

@@ -20,15 +20,28 @@ from typing import Any
 
 from capture.report.picture_sharpness import KEPT_DETAIL
 
-
-def exact(value: float | None) -> float | str | None:
-    """Write a number for JSON, which has neither nan nor infinity: what is not finite becomes a word that `float` reads."""
-    return value if value is None or abs(value) < float("inf") else str(float(value))
-
-
-def finite(value: float | None) -> float | None:
-    """Write a number for JSON: null for what is not finite."""
-    return value if value is not None and abs(value) < float("inf") else None
+LARGEST_LOST = 0.002
+LARGEST_FLAT = 1.1
+LARGEST_TOP = 1.5
+LARGEST_APART_PX = 1.0
+LARGEST_APART = 5e-4
+LARGEST_PAIR_RESIDUAL = 3e-3
+LEAST_DB = 30.0
+LARGEST_FOCUS_PX = 0.6
+LARGEST_BLUR_GAIN = 0.07
+LARGEST_SHIFT_PX = 0.3
+LARGEST_EXPOSURE = 0.01
+LARGEST_GAIN_DRIFT = 0.02
+DEPTH_OFF_PX = 1.0
+LARGEST_DEPTH_SHARE = 0.05
+LARGEST_MOVING = 0.02
+LARGEST_SATURATED = 0.02
+LARGEST_BEYOND = 0.25
+LEAST_CORRELATION = 0.8
+LARGEST_JUMP = 0.01
+LEAST_TRUSTED = 0.2
+NO_BLOCKS = "the pictures are too small or too even to have blocks that tell: merge larger ones"
+NO_PREDICTION = "needs a merged stack with lens and focus distances: add them to lens.toml, ingest and merge again"
 
 
 class Verdict(StrEnum):
@@ -134,29 +147,15 @@ def counts(gates: Sequence[Gate]) -> str:
     return f"{len(gates) - missing} of {len(gates)} gates judged, {len(failed(gates))} failed, {missing} absent"
 
 
-LARGEST_LOST = 0.002
-LARGEST_FLAT = 1.1
-LARGEST_TOP = 1.5
-LARGEST_APART_PX = 1.0
-LARGEST_APART = 5e-4
-LARGEST_PAIR_RESIDUAL = 3e-3
-LEAST_DB = 30.0
-LARGEST_FOCUS_PX = 0.6
-LARGEST_BLUR_GAIN = 0.07
-LARGEST_SHIFT_PX = 0.3
-LARGEST_EXPOSURE = 0.01
-LARGEST_GAIN_DRIFT = 0.02
-DEPTH_OFF_PX = 1.0
-LARGEST_DEPTH_SHARE = 0.05
-LARGEST_MOVING = 0.02
-LARGEST_SATURATED = 0.02
-LARGEST_BEYOND = 0.25
-LEAST_CORRELATION = 0.8
-LARGEST_JUMP = 0.01
-LEAST_TRUSTED = 0.2
+def exact(value: float | None) -> float | str | None:
+    """Write a number for JSON, which has neither nan nor infinity: what is not finite becomes a word that `float` reads."""
+    return value if value is None or abs(value) < float("inf") else str(float(value))
 
-NO_BLOCKS = "the pictures are too small or too even to have blocks that tell: merge larger ones"
-NO_PREDICTION = "needs a merged stack with lens and focus distances: add them to lens.toml, ingest and merge again"
+
+def finite(value: float | None) -> float | None:
+    """Write a number for JSON: null for what is not finite."""
+    return value if value is not None and abs(value) < float("inf") else None
+
 
 SHARP = Rule(
     "as sharp as its slices",
@@ -165,6 +164,8 @@ SHARP = Rule(
     "Look at the crops. Where slices do not match there (movement, wind), leave out the slice; where one slice shows the place as it "
     "should be, put it in by hand (`mrbokeh capture merge STACK --from-slice K --mask FILE`); else merge again with --overwrite.",
 )
+
+
 SEAMS = Rule(
     "no seams",
     f"95% of the flat blocks with at most {LARGEST_FLAT:g} times the detail of their sharpest slice",
@@ -172,12 +173,16 @@ SEAMS = Rule(
     "Look at the crops. Lock exposure and white balance, avoid flickering lamps; merge again with --overwrite, or put one slice over a "
     "seam by hand (`mrbokeh capture merge STACK --from-slice K --mask FILE`).",
 )
+
+
 LIGHT = Rule(
     "no invented light",
     f"nothing brighter than {LARGEST_TOP:g} times the largest value of the slices, or than the measured flux of a disc supports",
     "A lamp that no slice shows becomes a bright disc in every picture that is blurred anew.",
     "Look at the crops: a lamp whose discs are clipped in all slices needs a shorter exposure; else merge again with --overwrite.",
 )
+
+
 PLACES = Rule(
     "registration residual",
     f"neighbouring slices within {LARGEST_APART_PX:g} px ({LARGEST_APART:.2%} of widths beyond {LARGEST_APART_PX / LARGEST_APART:.0f} px) "
@@ -185,72 +190,96 @@ PLACES = Rule(
     "Where slices do not lie on one another, edges are doubled and depth is wrong.",
     "Look at the two slices: a camera that moved sideways shows another view; use a tripod, or leave out the slice and merge again.",
 )
+
+
 SPACING = Rule(
     "no slice missing",
     "even steps in dioptres, each once and in order",
     "What lies in focus between two distant slices is sharp in neither: the all-in-focus picture keeps blur there.",
     "Photograph the missing distances again, or correct focus_distances_m in lens.toml if the photographs are there.",
 )
+
+
 RANGE = Rule(
     "focus reaches the whole scene",
     f"at most {LARGEST_BEYOND:.0%} of the picture sharpest at either end of the stack",
     "What lies beyond the first or last focus is never sharp, and its depth is cut off there.",
     "Add slices at the near or far end (`mrbokeh capture plan` says where).",
 )
+
+
 TEXTURE = Rule(
     "depth is known",
     f"at least {LEAST_TRUSTED:.0%} of the picture with confidence 0.3 or more",
     "Where nothing has texture, depth is a guess from its neighbours and teaches nothing.",
     "Choose scenes with texture, or add viewpoints and run `mrbokeh capture depth`.",
 )
+
+
 REGISTRATION = Rule(
     "registration held",
     f"correlation of neighbours at least {LEAST_CORRELATION:g}, no jump beyond {LARGEST_JUMP:.0%} of the width",
     "A pair of slices that does not correlate was placed by the lens model alone, or wrongly; a camera that was pushed sees another view.",
     "Look at the two slices: smaller focus steps, a tripod, no wind; merge again with --overwrite.",
 )
+
+
 EXPOSURE = Rule(
     "exposure is constant",
     f"slices within {LARGEST_EXPOSURE:.0%} of the prediction ({LARGEST_GAIN_DRIFT:.0%} where there is none)",
     "A slice that is brighter teaches the lens to make light.",
     "Lock exposure and white balance, avoid flickering lamps; leave the slice out or photograph it again.",
 )
+
+
 RESIDUAL = Rule(
     "re-blurred picture is the slice",
     f"PSNR at least {LEAST_DB:g} dB in every slice",
     "The all-in-focus picture, blurred by the circles of confusion, must give each photograph: this proves depth, focus and lens at once.",
     "Read the gates below, which say what is wrong with the worst slices; the difference pictures show where.",
 )
+
+
 FOCUS = Rule(
     "focus distances are right",
     f"circles of confusion within {LARGEST_FOCUS_PX:g} px in every slice",
     "A focus distance that is off, or a slice at another's place, gives the network blur of the wrong size.",
     "Correct focus_distances_m (or the order of the slices); `mrbokeh capture depth` calibrates them.",
 )
+
+
 BLUR = Rule(
     "blur has the right size",
     f"within {LARGEST_BLUR_GAIN:.0%} over the stack",
     "Focal length, f-number, sensor width or the scale of depth are off when all blur is too small or too large.",
     "Check f_number, focal_length_mm and sensor_width_mm in lens.toml, and the scale (`mrbokeh capture scale`).",
 )
+
+
 PLACE = Rule(
     "slices lie on the picture",
     f"within {LARGEST_SHIFT_PX:g} px, also in the corners",
     "A shift looks like blur to the one side, and training learns it.",
     "Merge again with --overwrite; check that nothing shook the tripod.",
 )
+
+
 DEPTH = Rule(
     "depth agrees with the slices",
     f"at most {LARGEST_DEPTH_SHARE:.0%} of the picture off by more than {DEPTH_OFF_PX:g} px of blur",
     "Wrong depth gives blur of the wrong size there, whatever the lens.",
     "Run `mrbokeh capture depth` over several viewpoints, or leave it to the exclusion masks if it is little.",
 )
+
+
 MOTION = Rule(
     "nothing moved",
     f"at most {LARGEST_MOVING:.0%} of the picture",
     "What moved is at one place in the all-in-focus picture and at another in the slice.",
     "Photograph again without wind and people, or train with exclusion masks (`mrbokeh capture dataset` writes them).",
 )
+
+
 SATURATION = Rule(
     "highlights are not clipped",
     f"at most {LARGEST_SATURATED:.0%} of any slice saturated",
@@ -258,16 +287,20 @@ SATURATION = Rule(
     "Expose so that the brightest lights just fit where they are out of focus.",
 )
 
+
 SOLVED_FOCUS = replace(
     FOCUS,
     advice="Focus was solved from the slices, as not all of it is stated: it errs where blur is large or texture is missing. "
     "Refocus between slices that are right, or state focus_distances_m in lens.toml and merge again.",
 )
+
+
 SOLVED_BLUR = replace(
     BLUR,
     why="Blur was solved from the slices; all of it is too small or too large where the all-in-focus picture is not sharp.",
     advice="Look at the crops of the first gates; smaller focus steps make the all-in-focus picture sharper.",
 )
+
 
 STACK_RULES = (
     SHARP,
@@ -287,6 +320,8 @@ STACK_RULES = (
     DEPTH,
     MOTION,
 )
+
+
 PICTURE_RULES = (SHARP, SEAMS, LIGHT)
 """Rules of the all-in-focus picture: a report that lacks a verdict on one of them is not passed."""
 
