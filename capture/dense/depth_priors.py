@@ -60,15 +60,8 @@ def focus_vote_of_map(focus_index: Plane, confidence: Plane, slice_dioptres: Flo
     interior = (focus_index > 0.5) & (focus_index < len(slice_dioptres) - 1.5)
     curvature = np.full_like(focus_index, _USUAL_CURVATURE)
     trust = np.where(interior, confidence, 0.0).astype(np.float32)
-    return FocusVote(_between(focus_index, slice_dioptres), trust, curvature, _step(slice_dioptres))
-
-
-def _between(index: Float[np.ndarray, "height width"], slice_dioptres: Float[np.ndarray, " slices"]) -> Plane:
-    return np.interp(index, np.arange(len(slice_dioptres)), slice_dioptres).astype(np.float32)
-
-
-def _step(slice_dioptres: Float[np.ndarray, " slices"]) -> float:
-    return float(np.abs(np.diff(slice_dioptres)).mean())
+    dioptre = np.interp(focus_index, np.arange(len(slice_dioptres)), slice_dioptres).astype(np.float32)
+    return FocusVote(dioptre, trust, curvature, float(np.abs(np.diff(slice_dioptres)).mean()))
 
 
 def near_highlights(rgb: Float32[np.ndarray, "height width 3"], largest_coc_px: float) -> Mask:

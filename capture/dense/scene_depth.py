@@ -180,13 +180,9 @@ def focus_prior(stack: FocalStack, rgb: Rgb) -> FocusVote | None:
         return None
     channels = read_exr(first_pass_path(stack, stack.depth_path))[0].channels
     optics = SliceOptics.of_stack(stack, rgb.shape[1])
-    confidence = np.where(near_highlights(rgb, _largest_coc_px(optics)), 0.0, channels["confidence"])
+    largest_coc_px = float(max(optics.px_per_dioptre) * np.ptp(optics.focus_dioptres))
+    confidence = np.where(near_highlights(rgb, largest_coc_px), 0.0, channels["confidence"])
     return focus_vote_of_map(channels["focus_index"].astype(np.float32), confidence.astype(np.float32), np.array(optics.focus_dioptres))
-
-
-def _largest_coc_px(optics: SliceOptics) -> float:
-    """Return the largest blur of anything within the range of the stack's focus."""
-    return float(max(optics.px_per_dioptre) * np.ptp(optics.focus_dioptres))
 
 
 def depth_record(stack: FocalStack, known: SceneKnowledge, neighbours: Sequence[str]) -> dict[str, object]:

@@ -21,7 +21,6 @@ from capture.scale.answer import distance_scale
 from capture.scale.board import board_scale
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.console import track
-from mrbokeh.system.console import track as with_progress
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
 from mrbokeh.tracking.charuco.board import CharucoBoard
@@ -194,9 +193,7 @@ def _with_all_frames(clip: Path, info: VideoInfo, model: SparseModel) -> Matchmo
     times_s: list[float] = []
     stretch: list[Grey] = []
     first = 0
-    for number, frame in enumerate(
-        with_progress(read_display_frames(clip, info.width_px, info.height_px), "frames", info.frame_count or 0)
-    ):
+    for number, frame in enumerate(track(read_display_frames(clip, info.width_px, info.height_px), "frames", info.frame_count or 0)):
         times_s.append(frame.time_s)
         stretch.append(cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY))
         if number in views:

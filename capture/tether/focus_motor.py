@@ -115,7 +115,6 @@ def measure_focus_steps(
     *,
     step: int,
     frames: int = 3,
-    advance: Callable[[], None] = lambda: None,
 ) -> FocusSteps:
     """Return the scale of a motor from two or more targets at different distances. step: steps between two readings of the sweep.
 
@@ -125,14 +124,12 @@ def measure_focus_steps(
         raise InputError(f"measuring the steps of a motor needs targets at two distances or more, got {len(targets)}: add a target")
     if not all(target.distance_m > 0.0 for target in targets) or step < 1:
         raise InputError(f"expected targets at positive distances and a positive step, got {[t.distance_m for t in targets]} m, {step}")
-    sweep = sweep_focus(axis, camera, targets, step=step, frames=frames, advance=advance)
+    sweep = sweep_focus(axis, camera, targets, step=step, frames=frames)
     found = [(peak_steps(sweep, index, target), 1.0 / target.distance_m) for index, target in enumerate(targets)]
     return FocusSteps(axis.stop, tuple(sorted(found)))
 
 
-def sweep_focus(
-    axis: FocusAxis, camera: CameraDriver, targets: Sequence[Target], *, step: int, frames: int, advance: Callable[[], None]
-) -> FocusSweep:
+def sweep_focus(axis: FocusAxis, camera: CameraDriver, targets: Sequence[Target], *, step: int, frames: int) -> FocusSweep:
     """Read the sharpness from the stop to the other end of the travel, in the direction in which slices are approached."""
     axis.home()
     steps, values = [], []
@@ -146,7 +143,6 @@ def sweep_focus(
         previews = [camera.preview() for _ in range(frames)]
         steps.append(float(position * step))
         values.append([np.mean([sharpness(target.spot.cut(each)) for each in previews]) for target in targets])
-        advance()
     return FocusSweep(np.array(steps), np.array(values, np.float64).T.reshape(len(targets), len(steps)))
 
 

@@ -55,7 +55,7 @@ class SavedShot:
             "steps": self.shot.steps,
             "stated": {
                 "focus": focus_record(metadata),
-                "focus_dioptre": _dioptre(metadata.focus_distance_m),
+                "focus_dioptre": None if metadata.focus_distance_m is None else 1.0 / metadata.focus_distance_m,
                 "focal_length_mm": metadata.focal_length_mm,
                 "f_number": metadata.f_number,
                 "exposure_time_s": metadata.exposure_time_s,
@@ -89,10 +89,6 @@ def require_same_exposure(first: dict[str, Any], now: dict[str, Any]) -> None:
                 f"{now['camera_name']} was exposed otherwise than the first slice ({name} {new:g}, not {kept:g}) and is not taken: "
                 f"set the camera to manual exposure with a fixed ISO and run the same command again"
             )
-
-
-def _dioptre(distance_m: float | None) -> float | None:
-    return None if distance_m is None else 1.0 / distance_m
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,9 @@ from mrbokeh.renderers.onnx_network import OnnxNetwork
 from mrbokeh.system.errors import InputError
 from tests.scenes.made_networks import GATED, PARITY, PUBLISHED, SIZE, TOP, blurred, pictures, session_of, twin, untrained
 from training.commands.export import export_command
-from training.export.fast_onnx import ASSUMED_PSNR_DB, export_fast_network, loss_db, made_up_sample
-from training.export.graph_builder import coarse_kernel, seen_kernel, tent
+from training.export.fast_onnx import ASSUMED_PSNR_DB, export_fast_network, loss_db, made_up_sample, model_of, plans
+from training.export.graph_builder import coarse_kernel, place_responses, tent
 from training.export.onnx_export import network_facts_of, record_path
-from training.export.plans import model_of, plans
 from training.export.published_graph import BlockPlan, PublishedGraph, separable_kernels
 from training.fitting.run_folder import RunFacts, save_network, write_facts
 from training.fitting.settings import TrainSettings, write_settings
@@ -57,7 +56,8 @@ def test_coarse_taps_spread_like_the_kernel_and_keep_its_sum(factor: int) -> Non
     disc = Aperture.disc(sides=64).rasterize(41.0).kernel.astype(np.float64)
     taps = coarse_kernel(disc, factor)
     assert taps.sum() == pytest.approx(disc.sum(), abs=1e-9)
-    seen = seen_kernel(taps, factor, disc.shape[0] // 2)
+    mean = place_responses(disc.shape[0] // 2, factor).mean(axis=0)
+    seen = mean @ taps @ mean.T
     margin = (seen.shape[0] - disc.shape[0]) // 2
     assert np.linalg.norm(seen - np.pad(disc, margin)) < 0.05 * factor * np.linalg.norm(disc)
     assert tent(factor).sum() == pytest.approx(1.0)
@@ -68,8 +68,8 @@ def test_the_budget_holds_for_pictures_it_was_not_chosen_on() -> None:
     largest_px = 21.0
     network = untrained(GATED, largest_px)
     facts = network_facts_of(network, GATED, _facts(largest_px))
-    look = made_up_sample(network, facts, (96, 160))
-    plan = next(each for each in plans(network) if loss_db(session_of(model_of(network, each)), [look]) <= 0.2)
+    sample = made_up_sample(network, facts, (96, 160))
+    plan = next(each for each in plans(network) if loss_db(session_of(model_of(network, each)), [sample]) <= 0.2)
     assert plan.factors[0] == 1
     assert max(plan.factors) > 1
     assert plan.bins < len(network.tiles.knots)

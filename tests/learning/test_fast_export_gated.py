@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from tests.scenes.made_networks import GATED, PARITY, SIZE, blurred, coarser_model, pictures, session_of, twin, untrained
+from training.export.fast_onnx import plans
 from training.export.gated_graph import gated_model
 from training.export.gated_groups import cost, groups_of, reach_px, shared
 from training.export.gated_weights import fewer_knots, hats, thinned, weights_of, widened, with_knots
-from training.export.plans import plans
 from training.networks.gated_network import bins_px
 from training.networks.network import BlurNetwork
 

@@ -21,7 +21,7 @@ from capture.tether.focus_plan import FocusPlan, FocusRange, plan_focus, write_p
 from capture.tether.saved_shot import save_shot
 from capture.tether.shoot import ShootOptions, Surroundings, shoot
 from capture.tether.shoot_log import read_log
-from capture.tether.simulated_camera import SimulatedCamera, unstated
+from capture.tether.simulated_camera import SimulatedCamera
 from datasets_scripts.made_sets.simulated_camera import SensorModel, ShotMetadata, write_dng
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import read_focal_stack
@@ -285,7 +285,7 @@ def test_planned_distances_where_the_camera_is_silent(tmp_path: Path) -> None:
     """lens.toml counts from the lens and names the files; ingest reads it."""
     plan = small_plan(96, 2.0)
     camera = camera_for(plan, lambda _: None)
-    camera.quantum = unstated
+    camera.quantum = lambda _: None
     taken(plan, camera, tmp_path / "view", check=False)
     written = tomllib.loads((tmp_path / "view" / "lens.toml").read_text())
     assert set(written) == {"focus_origin", "focus_distances_m"} and written["focus_origin"] == "lens"

@@ -11,8 +11,7 @@ from jaxtyping import Float32
 from capture.photos.metadata import read_metadata
 from capture.tether.camera_driver import Ability, CameraSettings, Stop
 from capture.tether.focus_plan import FocusRange, plan_focus
-from capture.tether.simulated_camera import SimulatedCamera, nikon_code, to_centimetre, unstated
-from capture.tether.simulated_scene import Card, SimulatedScene
+from capture.tether.simulated_camera import Card, SimulatedCamera, SimulatedScene, nikon_code
 from mrbokeh.images.image_io import read_image
 from mrbokeh.optics.lens import Lens, film_plane_m
 
@@ -32,6 +31,11 @@ def written(camera: SimulatedCamera, folder: Path) -> Path:
     path = folder / shot.name
     path.write_bytes(shot.data)
     return path
+
+
+def to_centimetre(distance_m: float) -> float | None:
+    """Round to whole centimetres; infinity is not stated."""
+    return None if math.isinf(distance_m) else round(distance_m, 2)
 
 
 def test_an_edge_is_blurred_over_its_circle_of_confusion() -> None:
@@ -120,7 +124,7 @@ def test_the_stated_distance_is_within_its_quantum(tmp_path: Path, dioptre: floa
     camera.quantum = to_centimetre
     stated = read_metadata(written(camera, tmp_path)).focus
     assert stated is not None and abs(stated.distance_m - true_m) <= 0.005001
-    camera.quantum = unstated
+    camera.quantum = lambda _: None
     assert read_metadata(written(camera, tmp_path)).focus is None
     assert to_centimetre(math.inf) is None
 

@@ -19,7 +19,6 @@ from training.data.batches import draw_batch
 from training.data.dataset import PairSet
 from training.data.pairs import counting_of
 from training.data.stacks import stack_name
-from training.data.training_data import DataFacts
 from training.evaluation.comparison import Extras, Unseen, focus_pull, scored
 from training.evaluation.methods import blur_of, network_method
 from training.evaluation.report import write_numbers
@@ -115,7 +114,7 @@ def step_seconds(planned: PlannedRun) -> float:
     settings, pairs = planned.settings, _pairs(planned)
     facts = planned.data_set.data.facts(pairs, settings.network.lens_inputs)
     device = torch.device(device_of(settings.device))
-    network = build_network(settings, _run_facts(facts)).to(device)
+    network = build_network(settings, RunFacts(**vars(facts), trained_on=(), held_out=(), commit=None)).to(device)
     rng = np.random.default_rng(0)
     seconds = 0.0
     for _ in range(2):
@@ -134,8 +133,3 @@ def _pairs(planned: PlannedRun) -> PairSet:
 
 def _steps(planned: PlannedRun) -> float:
     return (planned.settings.epochs or 0) * len(_pairs(planned)) / planned.settings.batch
-
-
-def _run_facts(facts: DataFacts) -> RunFacts:
-    """Return the facts from which a network is built; provenance is left empty."""
-    return RunFacts(**vars(facts), trained_on=(), held_out=(), commit=None)

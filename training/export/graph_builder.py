@@ -28,17 +28,11 @@ def taps_radius(radius_px: int, factor: int) -> int:
 
 def coarse_kernel(kernel: Float[np.ndarray, "size size"], factor: int) -> Float64[np.ndarray, "taps taps"]:
     """Return the taps of a kernel (size odd, values >= 0) at 1/factor of the resolution."""
-    responses = _responses(kernel.shape[0] // 2, factor)
+    responses = place_responses(kernel.shape[0] // 2, factor)
     gram, mean = np.einsum("pdi,pdj->ij", responses, responses), responses.sum(axis=0)
     solved = np.linalg.inv(gram + _RIDGE * gram.max() * np.eye(len(gram)))
     taps = solved @ (mean.T @ _padded(kernel, mean.shape[0]) @ mean) @ solved
     return taps * (kernel.sum(dtype=np.float64) / taps.sum())
-
-
-def seen_kernel(taps: Float64[np.ndarray, "taps taps"], factor: int, radius_px: int) -> Float64[np.ndarray, "size size"]:
-    """Return the effective spread of a pixel, the mean over its places in a cell."""
-    mean = _responses(radius_px, factor).mean(axis=0)
-    return mean @ taps @ mean.T
 
 
 def binned(kernels: Float[np.ndarray, "maps size size"], factor: int) -> Float[np.ndarray, "maps taps taps"]:
@@ -56,7 +50,7 @@ def tent(factor: int) -> Float64[np.ndarray, " pixels"]:
     return (1.0 - np.abs(away)) / factor
 
 
-def _responses(radius_px: int, factor: int) -> Float64[np.ndarray, "factor reach taps"]:
+def place_responses(radius_px: int, factor: int) -> Float64[np.ndarray, "factor reach taps"]:
     """Return E_p for every place p; the reach in pixels covers everything that the taps can touch."""
     taps = taps_radius(radius_px, factor)
     reach = factor * (taps + 3)
