@@ -25,29 +25,6 @@ Rgb = Float32[np.ndarray, "height width 3"]
 _LEAST_DIOPTRE = np.float32(1e-4)  # 10 km: nothing lies beyond infinity
 
 
-def level_sizes(width_px: int, height_px: int, planes: int, most_cells: int) -> list[tuple[int, int]]:
-    """Return (width, height) of the levels from the coarsest, of at most `most_cells` pixels times planes, to the full picture.
-
-    Each finer level has at most twice the pixels a side.
-    """
-    shrink = max(1.0, np.sqrt(width_px * height_px * planes / most_cells))
-    steps = int(np.ceil(np.log(shrink) / np.log(_FACTOR) - 1e-9))
-    scales = [shrink ** (-(steps - k) / steps) for k in range(steps)] + [1.0] if steps else [1.0]
-    widths = [max(int(width_px * scale), 1) if scale < 1.0 else width_px for scale in scales]
-    return [scaled_size((width_px, height_px), width / width_px) for width in widths]
-
-
-def scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
-    """Return (width, height) in whole pixels."""
-    return max(round(size[0] * scale), 1), max(round(size[1] * scale), 1)
-
-
-def halvings(step: float, finest: float) -> list[float]:
-    """Halve the step repeatedly down to `finest` or a little below; return at least one."""
-    count = max(int(np.ceil(np.log2(step / finest) - 1e-9)), 1)
-    return [step * 0.5 ** (k + 1) for k in range(count)]
-
-
 @dataclass(frozen=True)
 class DenseSettings:
     """Settings of dense depth.
@@ -143,3 +120,26 @@ def _refined(reference: SweepView, neighbours: Sequence[SweepView], dioptre: Pla
     """Sweep finely around the surface; it stays as it was where views agree on nothing."""
     fine = refine(reference, neighbours, dioptre, step, matching=settings.fine_matching)
     return replace(fine, dioptre=np.maximum(np.where(fine.score > 0.0, fine.dioptre, dioptre), _LEAST_DIOPTRE))
+
+
+def level_sizes(width_px: int, height_px: int, planes: int, most_cells: int) -> list[tuple[int, int]]:
+    """Return (width, height) of the levels from the coarsest, of at most `most_cells` pixels times planes, to the full picture.
+
+    Each finer level has at most twice the pixels a side.
+    """
+    shrink = max(1.0, np.sqrt(width_px * height_px * planes / most_cells))
+    steps = int(np.ceil(np.log(shrink) / np.log(_FACTOR) - 1e-9))
+    scales = [shrink ** (-(steps - k) / steps) for k in range(steps)] + [1.0] if steps else [1.0]
+    widths = [max(int(width_px * scale), 1) if scale < 1.0 else width_px for scale in scales]
+    return [scaled_size((width_px, height_px), width / width_px) for width in widths]
+
+
+def scaled_size(size: tuple[int, int], scale: float) -> tuple[int, int]:
+    """Return (width, height) in whole pixels."""
+    return max(round(size[0] * scale), 1), max(round(size[1] * scale), 1)
+
+
+def halvings(step: float, finest: float) -> list[float]:
+    """Halve the step repeatedly down to `finest` or a little below; return at least one."""
+    count = max(int(np.ceil(np.log2(step / finest) - 1e-9)), 1)
+    return [step * 0.5 ** (k + 1) for k in range(count)]

@@ -30,26 +30,6 @@ _SAY_OF_FOCUS = 0.01
 _OTHER_SLICE, _SURE_OF_ANOTHER, _BEYOND_DOUBT = 1.5, 0.15, 0.95
 
 
-def sweep_trust(score: Plane, margin: Plane) -> Plane:
-    """Return trust from 0 to 1. score: correlation of the windows; margin: lead of the plane over all others, as in `Labels`.
-
-    Measured on traced scenes: with a margin below 50 one pixel in four is wrong, above it one in a hundred.
-    """
-    agreeing = np.clip((score - _LEAST_SCORE) / (_FULL_SCORE - _LEAST_SCORE), 0.0, 1.0)
-    return (agreeing * margin / (margin + _MARGIN_OF_HALF)).astype(np.float32)
-
-
-def either(a: Plane, b: Plane) -> Plane:
-    """Combine the trust of two independent sources."""
-    return (1.0 - (1.0 - a) * (1.0 - b)).astype(np.float32)
-
-
-def with_consistency(trust: Plane, seen: Consistency) -> Plane:
-    """Raise the trust if another view has the same surface, and lower it if more views see through it than have it."""
-    supported = np.where(seen.supports > 0, 1.0 - 0.5 * (1.0 - trust), trust)
-    return np.where(seen.contradictions > seen.supports, _CONTRADICTED * trust, supported).astype(np.float32)
-
-
 @dataclass(frozen=True)
 class FinishSettings:
     """Settings of the last step.
@@ -128,3 +108,23 @@ def _filled(dioptre: Plane, trust: Plane, margin: Plane, guide: Rgb, priors: Dep
         row, column, chosen = priors.sparse.pixels(dioptre.shape)
         known[row, column], weights[row, column] = 1.0 / priors.sparse.depth_m[chosen], 1.0
     return interpolate(known, weights.astype(np.float32), guide, fill_px**2, 0.03)
+
+
+def sweep_trust(score: Plane, margin: Plane) -> Plane:
+    """Return trust from 0 to 1. score: correlation of the windows; margin: lead of the plane over all others, as in `Labels`.
+
+    Measured on traced scenes: with a margin below 50 one pixel in four is wrong, above it one in a hundred.
+    """
+    agreeing = np.clip((score - _LEAST_SCORE) / (_FULL_SCORE - _LEAST_SCORE), 0.0, 1.0)
+    return (agreeing * margin / (margin + _MARGIN_OF_HALF)).astype(np.float32)
+
+
+def either(a: Plane, b: Plane) -> Plane:
+    """Combine the trust of two independent sources."""
+    return (1.0 - (1.0 - a) * (1.0 - b)).astype(np.float32)
+
+
+def with_consistency(trust: Plane, seen: Consistency) -> Plane:
+    """Raise the trust if another view has the same surface, and lower it if more views see through it than have it."""
+    supported = np.where(seen.supports > 0, 1.0 - 0.5 * (1.0 - trust), trust)
+    return np.where(seen.contradictions > seen.supports, _CONTRADICTED * trust, supported).astype(np.float32)

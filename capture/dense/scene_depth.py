@@ -39,49 +39,6 @@ _SEAM_PX = 1.5
 _FEWEST_POINTS = 20
 
 
-def write_deepened(stack: FocalStack, found: DenseDepth, record: dict[str, object]) -> FocalStack:
-    """Write the pictures first, stack.json last, without retouches and the preferred side, which belong to the first picture.
-
-    record: what the depth was made from.
-    """
-    kept = {key: value for key, value in stack.metadata.items() if key not in (RETOUCHES, PREFERRED)}
-    deepened = replace(stack, metadata=kept | {DEPTH_SOURCE: record})
-    write_merged(
-        stack.folder,
-        _picture(deepened, found),
-        _focus_index(stack, found.depth_m),
-        found.confidence,
-        found.depth_m,
-        stack.rec709_from_camera,
-    )
-    write_readable_pictures(deepened)
-    write_focal_stack(deepened)
-    write_merge_sheet(deepened)
-    return deepened
-
-
-def _picture(stack: FocalStack, found: DenseDepth) -> Rgb:
-    """Return the second pass where its depth is trusted, else the first: a wrong depth selects slices in which a pixel is blurred.
-
-    On traced stacks the mixture is 0 to 2 dB above the second pass and 0.1 to 0.9 dB above the first.
-    """
-    first = read_camera_rgb(first_pass_path(stack, stack.all_in_focus_path))
-    if not stack.is_metric:
-        return first
-    trusted = np.clip((found.confidence - _DOUBTED) / (_TRUSTED - _DOUBTED), 0.0, 1.0)
-    share = cv2.GaussianBlur(trusted.astype(np.float32), (0, 0), _SEAM_PX)[..., None]
-    return share * second_pass(stack, found.depth_m) + (1.0 - share) * first
-
-
-def _focus_index(stack: FocalStack, depth_m: Float[np.ndarray, "height width"]) -> Plane:
-    """Return the fractional index of the slice focused at each depth; the first pass's if focus distances are unknown."""
-    if not stack.is_metric:
-        return read_exr(first_pass_path(stack, stack.depth_path))[0].channels["focus_index"].astype(np.float32)
-    dioptres = np.array([1.0 / distance for distance in stack.focus_distances_m if distance is not None])
-    order = np.argsort(dioptres)
-    return np.interp(1.0 / depth_m, dioptres[order], np.arange(len(dioptres))[order].astype(np.float64)).astype(np.float32)
-
-
 @dataclass(frozen=True)
 class SceneDepthSettings:
     """Settings of a scene's depth.
@@ -206,3 +163,46 @@ def is_depth_stale(stack: FocalStack) -> bool:
 
 def _focus_of(stack: FocalStack) -> list[float | None]:
     return [None if each is None else round(each, 9) for each in stack.focus_distances_m]
+
+
+def write_deepened(stack: FocalStack, found: DenseDepth, record: dict[str, object]) -> FocalStack:
+    """Write the pictures first, stack.json last, without retouches and the preferred side, which belong to the first picture.
+
+    record: what the depth was made from.
+    """
+    kept = {key: value for key, value in stack.metadata.items() if key not in (RETOUCHES, PREFERRED)}
+    deepened = replace(stack, metadata=kept | {DEPTH_SOURCE: record})
+    write_merged(
+        stack.folder,
+        _picture(deepened, found),
+        _focus_index(stack, found.depth_m),
+        found.confidence,
+        found.depth_m,
+        stack.rec709_from_camera,
+    )
+    write_readable_pictures(deepened)
+    write_focal_stack(deepened)
+    write_merge_sheet(deepened)
+    return deepened
+
+
+def _picture(stack: FocalStack, found: DenseDepth) -> Rgb:
+    """Return the second pass where its depth is trusted, else the first: a wrong depth selects slices in which a pixel is blurred.
+
+    On traced stacks the mixture is 0 to 2 dB above the second pass and 0.1 to 0.9 dB above the first.
+    """
+    first = read_camera_rgb(first_pass_path(stack, stack.all_in_focus_path))
+    if not stack.is_metric:
+        return first
+    trusted = np.clip((found.confidence - _DOUBTED) / (_TRUSTED - _DOUBTED), 0.0, 1.0)
+    share = cv2.GaussianBlur(trusted.astype(np.float32), (0, 0), _SEAM_PX)[..., None]
+    return share * second_pass(stack, found.depth_m) + (1.0 - share) * first
+
+
+def _focus_index(stack: FocalStack, depth_m: Float[np.ndarray, "height width"]) -> Plane:
+    """Return the fractional index of the slice focused at each depth; the first pass's if focus distances are unknown."""
+    if not stack.is_metric:
+        return read_exr(first_pass_path(stack, stack.depth_path))[0].channels["focus_index"].astype(np.float32)
+    dioptres = np.array([1.0 / distance for distance in stack.focus_distances_m if distance is not None])
+    order = np.argsort(dioptres)
+    return np.interp(1.0 / depth_m, dioptres[order], np.arange(len(dioptres))[order].astype(np.float64)).astype(np.float32)

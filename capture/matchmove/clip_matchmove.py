@@ -38,59 +38,6 @@ _LOST_SHARE = 0.1
 _STILL_SHARE = 0.02
 
 
-def motion_of_clip(clip: Path, info: VideoInfo) -> Float64[np.ndarray, " frames"]:
-    """Return how far the picture has moved by each frame: the sum of median displacements since the first, in picture widths."""
-    width_px = min(_SEARCH_WIDTH_PX, info.width_px)
-    height_px = max(16, round(info.height_px * width_px / info.width_px))
-    moved: list[float] = []
-    before: Grey | None = None
-    for frame in track(read_display_frames(clip, width_px, height_px), "motion", info.frame_count or 0):
-        grey = cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY)
-        moved.append(0.0 if before is None else _step(before, grey) / width_px)
-        before = grey
-    return np.cumsum(np.array(moved, np.float64))
-
-
-def chosen_keyframes(motion: Float64[np.ndarray, " frames"], most: int) -> list[int]:
-    """Choose frame numbers; the first and the last are always among them."""
-    count = int(np.clip(motion[-1] / _APART_SHARE + 1, _FEWEST, most))
-    if count >= len(motion):
-        return list(range(len(motion)))
-    # A little of plain time keeps places apart where nothing moves.
-    along = motion + 1e-3 * np.arange(len(motion)) / len(motion)
-    wanted = np.linspace(along[0], along[-1], count)
-    return sorted({int(each) for each in np.abs(along[:, None] - wanted).argmin(axis=0)} | {0, len(motion) - 1})
-
-
-def write_keyframes(clip: Path, info: VideoInfo, numbers: Sequence[int], folder: Path) -> None:
-    """Write frame_000012.png, with the video's code values at its full size; existing ones are kept."""
-    folder.mkdir(parents=True, exist_ok=True)
-    wanted = {number: folder / f"{view_name(number)}.png" for number in numbers}
-    for stale in set(folder.glob("frame_*.png")) - set(wanted.values()):
-        stale.unlink()
-    if all(path.exists() for path in wanted.values()):
-        return
-    for number, frame in enumerate(track(read_display_frames(clip, info.width_px, info.height_px), "keyframes", info.frame_count or 0)):
-        if number in wanted:
-            cv2.imwrite(str(wanted[number]), frame.bgr)
-
-
-def view_name(number: int) -> str:
-    return f"frame_{number:06d}"
-
-
-def _step(before: Grey, grey: Grey) -> float:
-    """Return the median displacement in pixels."""
-    places = cv2.goodFeaturesToTrack(before, _FEATURES, 0.01, 8.0)
-    if places is None:
-        return 0.0
-    start = places.reshape(-1, 2).astype(np.float64) + 0.5
-    there, good = flow(before, grey, start)
-    if np.count_nonzero(good) < 0.1 * len(start):
-        return _LOST_SHARE * grey.shape[1]
-    return float(np.median(np.linalg.norm(there[good] - start[good], axis=1)))
-
-
 @dataclass(frozen=True)
 class MatchmoveSettings:
     """Settings of a match-move. keyframes: at most so many, plus those of the picks. overwrite: restart COLMAP from nothing.
@@ -230,3 +177,56 @@ def _tracked(camera: Camera, distortion: tuple[float, float], time_s: float) -> 
     k1, k2 = distortion
     told = {name: value for name, value in (("k1", k1), ("k2", k2)) if value}
     return TrackedFrame(camera, time_s=time_s, distortion=told or None)
+
+
+def motion_of_clip(clip: Path, info: VideoInfo) -> Float64[np.ndarray, " frames"]:
+    """Return how far the picture has moved by each frame: the sum of median displacements since the first, in picture widths."""
+    width_px = min(_SEARCH_WIDTH_PX, info.width_px)
+    height_px = max(16, round(info.height_px * width_px / info.width_px))
+    moved: list[float] = []
+    before: Grey | None = None
+    for frame in track(read_display_frames(clip, width_px, height_px), "motion", info.frame_count or 0):
+        grey = cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY)
+        moved.append(0.0 if before is None else _step(before, grey) / width_px)
+        before = grey
+    return np.cumsum(np.array(moved, np.float64))
+
+
+def chosen_keyframes(motion: Float64[np.ndarray, " frames"], most: int) -> list[int]:
+    """Choose frame numbers; the first and the last are always among them."""
+    count = int(np.clip(motion[-1] / _APART_SHARE + 1, _FEWEST, most))
+    if count >= len(motion):
+        return list(range(len(motion)))
+    # A little of plain time keeps places apart where nothing moves.
+    along = motion + 1e-3 * np.arange(len(motion)) / len(motion)
+    wanted = np.linspace(along[0], along[-1], count)
+    return sorted({int(each) for each in np.abs(along[:, None] - wanted).argmin(axis=0)} | {0, len(motion) - 1})
+
+
+def write_keyframes(clip: Path, info: VideoInfo, numbers: Sequence[int], folder: Path) -> None:
+    """Write frame_000012.png, with the video's code values at its full size; existing ones are kept."""
+    folder.mkdir(parents=True, exist_ok=True)
+    wanted = {number: folder / f"{view_name(number)}.png" for number in numbers}
+    for stale in set(folder.glob("frame_*.png")) - set(wanted.values()):
+        stale.unlink()
+    if all(path.exists() for path in wanted.values()):
+        return
+    for number, frame in enumerate(track(read_display_frames(clip, info.width_px, info.height_px), "keyframes", info.frame_count or 0)):
+        if number in wanted:
+            cv2.imwrite(str(wanted[number]), frame.bgr)
+
+
+def view_name(number: int) -> str:
+    return f"frame_{number:06d}"
+
+
+def _step(before: Grey, grey: Grey) -> float:
+    """Return the median displacement in pixels."""
+    places = cv2.goodFeaturesToTrack(before, _FEATURES, 0.01, 8.0)
+    if places is None:
+        return 0.0
+    start = places.reshape(-1, 2).astype(np.float64) + 0.5
+    there, good = flow(before, grey, start)
+    if np.count_nonzero(good) < 0.1 * len(start):
+        return _LOST_SHARE * grey.shape[1]
+    return float(np.median(np.linalg.norm(there[good] - start[good], axis=1)))

@@ -30,6 +30,40 @@ _SMALL_PARALLAX_DEG = 4.0
 _FEW_INLIERS = 0.8
 
 
+def _points_of_keyframe(model: SparseModel) -> float:
+    """Return the median number of points that a keyframe sees."""
+    return float(np.median(np.bincount(model.observations[:, 0], minlength=len(model.views))))
+
+
+def require_translation(clip: Path, model: SparseModel) -> None:
+    """Raise InputError if the camera seems to have stayed at one place."""
+    if (points := _points_of_keyframe(model)) < _TOO_FEW_POINTS:
+        raise InputError(
+            f"{clip}: COLMAP placed {len(model.views)} keyframes by {points:.0f} points each, too few to trust: film more texture with the "
+            f"camera moving sideways (one that only rotates gives no points), or track a printed board"
+        )
+    rotating_px, model_px = rotation_only_residual_px(model), model_residual_px(model)
+    if rotating_px < max(_ROTATES_AS_WELL * model_px, _ROTATES_PX):
+        raise InputError(
+            f"{clip}: the camera seems only to rotate (rotation alone explains the clip to {rotating_px:.2f} px, a path through space to "
+            f"{model_px:.2f} px), so that nothing tells where it was: film with the camera moving sideways, or track a printed board"
+        )
+
+
+def quality_warnings(model: SparseModel, found: list[FramePose], parallax_deg: float) -> tuple[str, ...]:
+    """Return warnings about a scene that moves, or a camera that hardly does."""
+    points = _points_of_keyframe(model)
+    fitting = float(np.median([pose.fitting for pose in found])) if found else 1.0
+    left_out = len(model.left_out)
+    told = (
+        (points < _FEW_POINTS, f"a keyframe sees only {points:.0f} points of the model"),
+        (parallax_deg < _SMALL_PARALLAX_DEG, f"points are seen under {parallax_deg:.1f} degrees only, so that depth is uncertain"),
+        (fitting < _FEW_INLIERS, f"of the points carried into a frame only {100 * fitting:.0f} % move with the scene"),
+        (left_out > 0, f"{left_out} of {left_out + len(model.views)} keyframes could not be placed"),
+    )
+    return tuple(text for doubtful, text in told if doubtful)
+
+
 @dataclass(frozen=True)
 class _Tracks:
     """Tracks of points. views, points: which view sees which point; offsets_px: position from the principal point."""
@@ -120,37 +154,3 @@ def _chained(tracks: _Tracks, focal_px: float) -> Rotation:
             step = Rotation.align_vectors(rays[in_other[second]], rays[in_one[first]])[0]
         turns.append(step * turns[-1])
     return Rotation.concatenate(turns)
-
-
-def _points_of_keyframe(model: SparseModel) -> float:
-    """Return the median number of points that a keyframe sees."""
-    return float(np.median(np.bincount(model.observations[:, 0], minlength=len(model.views))))
-
-
-def require_translation(clip: Path, model: SparseModel) -> None:
-    """Raise InputError if the camera seems to have stayed at one place."""
-    if (points := _points_of_keyframe(model)) < _TOO_FEW_POINTS:
-        raise InputError(
-            f"{clip}: COLMAP placed {len(model.views)} keyframes by {points:.0f} points each, too few to trust: film more texture with the "
-            f"camera moving sideways (one that only rotates gives no points), or track a printed board"
-        )
-    rotating_px, model_px = rotation_only_residual_px(model), model_residual_px(model)
-    if rotating_px < max(_ROTATES_AS_WELL * model_px, _ROTATES_PX):
-        raise InputError(
-            f"{clip}: the camera seems only to rotate (rotation alone explains the clip to {rotating_px:.2f} px, a path through space to "
-            f"{model_px:.2f} px), so that nothing tells where it was: film with the camera moving sideways, or track a printed board"
-        )
-
-
-def quality_warnings(model: SparseModel, found: list[FramePose], parallax_deg: float) -> tuple[str, ...]:
-    """Return warnings about a scene that moves, or a camera that hardly does."""
-    points = _points_of_keyframe(model)
-    fitting = float(np.median([pose.fitting for pose in found])) if found else 1.0
-    left_out = len(model.left_out)
-    told = (
-        (points < _FEW_POINTS, f"a keyframe sees only {points:.0f} points of the model"),
-        (parallax_deg < _SMALL_PARALLAX_DEG, f"points are seen under {parallax_deg:.1f} degrees only, so that depth is uncertain"),
-        (fitting < _FEW_INLIERS, f"of the points carried into a frame only {100 * fitting:.0f} % move with the scene"),
-        (left_out > 0, f"{left_out} of {left_out + len(model.views)} keyframes could not be placed"),
-    )
-    return tuple(text for doubtful, text in told if doubtful)

@@ -55,94 +55,6 @@ _LOOK_EVERY_S = 0.5
 IMAGES_FOLDER = "images"
 
 
-def run_colmap(folder: Path, pictures: int) -> dict[str, Any] | None:
-    """Run the job in `folder`; return None, or match statistics if no model was found.
-
-    Raises MissingExtraError without pycolmap, InputError if the process dies; its output is in colmap.log.
-    """
-    if find_spec("pycolmap") is None:
-        raise MissingExtraError("pycolmap", "capture")
-    with (folder / LOG_NAME).open("w", encoding="utf-8") as log, progress_bars() as bars, _worker(folder, log) as process:
-        with _features_shown(folder, pictures, bars):
-            last = _follow(process, bars)
-        status = process.wait()
-    if status != 0 or not last:
-        raise InputError(_death(folder, status, last))
-    failure: dict[str, Any] | None = last.get("failure")
-    return failure
-
-
-@contextmanager
-def _worker(folder: Path, log: IO[str]) -> Iterator["subprocess.Popen[str]"]:
-    """Start the process and terminate it when the block ends."""
-    root = str(Path(capture.__file__).parent.parent)
-    path = os.pathsep.join(each for each in (root, os.environ.get("PYTHONPATH", "")) if each)
-    command = [sys.executable, "-m", _WORKER, str(folder)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, env=os.environ | {"PYTHONPATH": path}) as process:
-        try:
-            yield process
-        finally:
-            if process.poll() is None:
-                process.terminate()
-
-
-def _follow(process: "subprocess.Popen[str]", bars: Progress) -> dict[str, Any]:
-    """Show the worker's progress; return its last message."""
-    tasks, last = {}, {}
-    assert process.stdout is not None
-    for line in process.stdout:
-        if not line.startswith("{"):
-            continue
-        last = json.loads(line)
-        stage = last.get("stage")
-        if stage in _STAGES:
-            if stage not in tasks:
-                tasks[stage] = bars.add_task(f"COLMAP: {stage}", total=last["total"])
-            bars.update(tasks[stage], completed=last["done"], total=last["total"])
-    return last
-
-
-@contextmanager
-def _features_shown(folder: Path, pictures: int, bars: Progress) -> Iterator[None]:
-    """Show the progress of the features by polling COLMAP's database, since COLMAP does not report it."""
-    if bars.disable:
-        yield
-        return
-    task, over = bars.add_task("COLMAP: features", total=pictures), Event()
-
-    def look() -> None:
-        while not over.wait(_LOOK_EVERY_S):
-            bars.update(task, completed=_count_features(folder / DATABASE_NAME))
-
-    watcher = Thread(target=look, daemon=True)
-    watcher.start()
-    try:
-        yield
-    finally:
-        over.set()
-        watcher.join()
-
-
-def _count_features(database: Path) -> int:
-    try:
-        with closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=0.2)) as connection:
-            return int(connection.execute("SELECT COUNT(*) FROM keypoints").fetchone()[0])
-    except sqlite3.Error:
-        return 0
-
-
-def _death(folder: Path, status: int, last: dict[str, Any]) -> str:
-    how = signal.Signals(-status).name if status < 0 else f"status {status}"
-    during = {"matches": "matching", "poses": "finding poses"}.get(str(last.get("stage")), "finding features")
-    lines = [line for line in (folder / LOG_NAME).read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
-    errors = [line for line in lines if line[:1] in "EF" and line[1:9].isdigit()] or lines
-    told = f" ({errors[-1].strip()[:200]})" if errors else ""
-    return (
-        f"COLMAP stopped with {how} while {during}{told}: see {folder / LOG_NAME}; give --overwrite to start from the pictures, "
-        f"--max-image-size to use less memory"
-    )
-
-
 @dataclass(frozen=True)
 class PoseSettings:
     """Settings of COLMAP.
@@ -240,3 +152,91 @@ def _same_features(path: Path, job: ColmapJob) -> bool:
         return job_from_json(read_json(path, "a job for COLMAP")).features_key() == job.features_key()
     except (InputError, KeyError, TypeError):
         return False
+
+
+def run_colmap(folder: Path, pictures: int) -> dict[str, Any] | None:
+    """Run the job in `folder`; return None, or match statistics if no model was found.
+
+    Raises MissingExtraError without pycolmap, InputError if the process dies; its output is in colmap.log.
+    """
+    if find_spec("pycolmap") is None:
+        raise MissingExtraError("pycolmap", "capture")
+    with (folder / LOG_NAME).open("w", encoding="utf-8") as log, progress_bars() as bars, _worker(folder, log) as process:
+        with _features_shown(folder, pictures, bars):
+            last = _follow(process, bars)
+        status = process.wait()
+    if status != 0 or not last:
+        raise InputError(_death(folder, status, last))
+    failure: dict[str, Any] | None = last.get("failure")
+    return failure
+
+
+@contextmanager
+def _worker(folder: Path, log: IO[str]) -> Iterator["subprocess.Popen[str]"]:
+    """Start the process and terminate it when the block ends."""
+    root = str(Path(capture.__file__).parent.parent)
+    path = os.pathsep.join(each for each in (root, os.environ.get("PYTHONPATH", "")) if each)
+    command = [sys.executable, "-m", _WORKER, str(folder)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True, env=os.environ | {"PYTHONPATH": path}) as process:
+        try:
+            yield process
+        finally:
+            if process.poll() is None:
+                process.terminate()
+
+
+def _follow(process: "subprocess.Popen[str]", bars: Progress) -> dict[str, Any]:
+    """Show the worker's progress; return its last message."""
+    tasks, last = {}, {}
+    assert process.stdout is not None
+    for line in process.stdout:
+        if not line.startswith("{"):
+            continue
+        last = json.loads(line)
+        stage = last.get("stage")
+        if stage in _STAGES:
+            if stage not in tasks:
+                tasks[stage] = bars.add_task(f"COLMAP: {stage}", total=last["total"])
+            bars.update(tasks[stage], completed=last["done"], total=last["total"])
+    return last
+
+
+@contextmanager
+def _features_shown(folder: Path, pictures: int, bars: Progress) -> Iterator[None]:
+    """Show the progress of the features by polling COLMAP's database, since COLMAP does not report it."""
+    if bars.disable:
+        yield
+        return
+    task, over = bars.add_task("COLMAP: features", total=pictures), Event()
+
+    def look() -> None:
+        while not over.wait(_LOOK_EVERY_S):
+            bars.update(task, completed=_count_features(folder / DATABASE_NAME))
+
+    watcher = Thread(target=look, daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        over.set()
+        watcher.join()
+
+
+def _count_features(database: Path) -> int:
+    try:
+        with closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True, timeout=0.2)) as connection:
+            return int(connection.execute("SELECT COUNT(*) FROM keypoints").fetchone()[0])
+    except sqlite3.Error:
+        return 0
+
+
+def _death(folder: Path, status: int, last: dict[str, Any]) -> str:
+    how = signal.Signals(-status).name if status < 0 else f"status {status}"
+    during = {"matches": "matching", "poses": "finding poses"}.get(str(last.get("stage")), "finding features")
+    lines = [line for line in (folder / LOG_NAME).read_text(encoding="utf-8", errors="replace").splitlines() if line.strip()]
+    errors = [line for line in lines if line[:1] in "EF" and line[1:9].isdigit()] or lines
+    told = f" ({errors[-1].strip()[:200]})" if errors else ""
+    return (
+        f"COLMAP stopped with {how} while {during}{told}: see {folder / LOG_NAME}; give --overwrite to start from the pictures, "
+        f"--max-image-size to use less memory"
+    )

@@ -30,25 +30,6 @@ _LEAST_WRONG_PX = 0.1
 Points = Float[np.ndarray, "points 3"]
 
 
-class BoardSearch:
-    """A thorough search for a board's corners in photographs.
-
-    The board is tried as printed by OpenCV before and since 4.6, since nobody knows which version made a print.
-    The whole print is not fitted to the picture (mrbokeh.tracking.charuco.board_alignment). On a traced board with white paper around it
-    that took the corners' error from 0.070 to 0.016 px and their share of the scale's from 0.02 to 0.004 %, where poses leave 0.05 %;
-    but its homography knows no distortion, which photographs keep here, and a board cut off at its squares does not fit.
-    """
-
-    def __init__(self, board: CharucoBoard) -> None:
-        self._detectors = [CharucoDetector(replace(board, legacy=legacy)) for legacy in (board.legacy, not board.legacy)]
-
-    def corners(self, rgb8: UInt8[np.ndarray, "height width 3"]) -> Corners:
-        """Return the corners of the search that found most. Small pictures are also searched enlarged, which finds smaller markers."""
-        grey = cv2.cvtColor(np.ascontiguousarray(rgb8), cv2.COLOR_RGB2GRAY)
-        scales = (1, 2) if max(grey.shape) <= _ENLARGED_UP_TO_PX else (1,)
-        return max((each.detect_enlarged(grey, enlarged) for enlarged in scales for each in self._detectors), key=len)
-
-
 @dataclass(frozen=True)
 class BoardDetections:
     """Corners of the board seen in the views: index of the view, id of the corner, position in the picture."""
@@ -212,3 +193,22 @@ def board_from_options(board: str, square_mm: float | None, marker_mm: float | N
     if square_mm is None or marker_mm is None:
         raise InputError("--board COLUMNSxROWS needs --square-mm and --marker-mm as measured on the print")
     return CharucoBoard((CharucoGrid((columns, rows), square_mm, marker_mm),), dictionary)
+
+
+class BoardSearch:
+    """A thorough search for a board's corners in photographs.
+
+    The board is tried as printed by OpenCV before and since 4.6, since nobody knows which version made a print.
+    The whole print is not fitted to the picture (mrbokeh.tracking.charuco.board_alignment). On a traced board with white paper around it
+    that took the corners' error from 0.070 to 0.016 px and their share of the scale's from 0.02 to 0.004 %, where poses leave 0.05 %;
+    but its homography knows no distortion, which photographs keep here, and a board cut off at its squares does not fit.
+    """
+
+    def __init__(self, board: CharucoBoard) -> None:
+        self._detectors = [CharucoDetector(replace(board, legacy=legacy)) for legacy in (board.legacy, not board.legacy)]
+
+    def corners(self, rgb8: UInt8[np.ndarray, "height width 3"]) -> Corners:
+        """Return the corners of the search that found most. Small pictures are also searched enlarged, which finds smaller markers."""
+        grey = cv2.cvtColor(np.ascontiguousarray(rgb8), cv2.COLOR_RGB2GRAY)
+        scales = (1, 2) if max(grey.shape) <= _ENLARGED_UP_TO_PX else (1,)
+        return max((each.detect_enlarged(grey, enlarged) for enlarged in scales for each in self._detectors), key=len)

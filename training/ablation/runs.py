@@ -31,15 +31,6 @@ from training.fitting.train import require_same_settings
 FLICKER = "flicker"
 
 
-def machine_line() -> str:
-    """Describe the machine in one line: processor, cores, the GPU if torch sees one, and versions."""
-    import torch
-
-    gpu = [torch.cuda.get_device_name(0)] if torch.cuda.is_available() else []
-    parts = [_processor(), f"{os.cpu_count()} cores", *gpu, f"Python {platform.python_version()}", f"torch {torch.__version__}"]
-    return ", ".join(parts)
-
-
 def _processor() -> str:
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
@@ -133,3 +124,12 @@ def _pairs(planned: PlannedRun) -> PairSet:
 
 def _steps(planned: PlannedRun) -> float:
     return (planned.settings.epochs or 0) * len(_pairs(planned)) / planned.settings.batch
+
+
+def machine_line() -> str:
+    """Describe the machine in one line: processor, cores, the GPU if torch sees one, and versions."""
+    import torch
+
+    gpu = [torch.cuda.get_device_name(0)] if torch.cuda.is_available() else []
+    parts = [_processor(), f"{os.cpu_count()} cores", *gpu, f"Python {platform.python_version()}", f"torch {torch.__version__}"]
+    return ", ".join(parts)

@@ -28,31 +28,6 @@ _LARGEST_SHARE = 0.5
 _ERROR_CELL_PX, _REGION_CELL_PX, _EDGE_CELL_PX = 64.0, 16.0, 12.0
 
 
-def smooth_noise(size_px: tuple[int, int], cell_px: float, rng: np.random.Generator) -> Float32[np.ndarray, "height width"]:
-    """Return (height, width) normal noise with mean 0 and variance 1 at every pixel; values a cell apart are nearly independent.
-
-    White noise on a grid, spread by Gaussians; each row of weights has a sum of squares of 1, so that the variance is exact.
-    """
-    down, across = (_weights(length, cell_px) for length in size_px)
-    grid = rng.standard_normal((down.shape[1], across.shape[1]), dtype=np.float32)
-    return np.asarray(down @ grid @ across.T)
-
-
-def octaves(size_px: tuple[int, int], cell_px: float, count: int, rng: np.random.Generator) -> Float32[np.ndarray, "height width"]:
-    """Sum octaves of noise as Perlin does: each with half the cell and half the amplitude of the last; mean 0, variance 1."""
-    amplitudes = 0.5 ** np.arange(count)
-    fields = [amplitude * smooth_noise(size_px, cell_px * amplitude, rng) for amplitude in amplitudes.tolist()]
-    return np.asarray(sum(fields) / np.float32(np.linalg.norm(amplitudes)), np.float32)
-
-
-@functools.lru_cache(maxsize=64)
-def _weights(length_px: int, cell_px: float) -> Float32[np.ndarray, "pixels nodes"]:
-    nodes = np.arange(-2, int(np.ceil(length_px / cell_px)) + 3) * cell_px
-    offsets = (np.arange(length_px) + 0.5)[:, None] - nodes
-    weights = np.exp(-0.5 * (offsets / (_SIGMA_IN_CELLS * cell_px)) ** 2)
-    return np.asarray(weights / np.linalg.norm(weights, axis=1, keepdims=True), np.float32)
-
-
 def augmented(pair: Pair, depth_noise: float, rng: np.random.Generator, largest_coc_px: float = math.inf) -> Pair:
     """Return the pair with worse circles of confusion. depth_noise: strength, 0 returns the pair itself.
 
@@ -119,3 +94,28 @@ def _size(dioptres: Dioptres) -> tuple[int, int]:
 def _deviations(share: float) -> float:
     """Return how many standard deviations a normal variable exceeds in this fraction of cases."""
     return NormalDist().inv_cdf(1.0 - share)
+
+
+def smooth_noise(size_px: tuple[int, int], cell_px: float, rng: np.random.Generator) -> Float32[np.ndarray, "height width"]:
+    """Return (height, width) normal noise with mean 0 and variance 1 at every pixel; values a cell apart are nearly independent.
+
+    White noise on a grid, spread by Gaussians; each row of weights has a sum of squares of 1, so that the variance is exact.
+    """
+    down, across = (_weights(length, cell_px) for length in size_px)
+    grid = rng.standard_normal((down.shape[1], across.shape[1]), dtype=np.float32)
+    return np.asarray(down @ grid @ across.T)
+
+
+def octaves(size_px: tuple[int, int], cell_px: float, count: int, rng: np.random.Generator) -> Float32[np.ndarray, "height width"]:
+    """Sum octaves of noise as Perlin does: each with half the cell and half the amplitude of the last; mean 0, variance 1."""
+    amplitudes = 0.5 ** np.arange(count)
+    fields = [amplitude * smooth_noise(size_px, cell_px * amplitude, rng) for amplitude in amplitudes.tolist()]
+    return np.asarray(sum(fields) / np.float32(np.linalg.norm(amplitudes)), np.float32)
+
+
+@functools.lru_cache(maxsize=64)
+def _weights(length_px: int, cell_px: float) -> Float32[np.ndarray, "pixels nodes"]:
+    nodes = np.arange(-2, int(np.ceil(length_px / cell_px)) + 3) * cell_px
+    offsets = (np.arange(length_px) + 0.5)[:, None] - nodes
+    weights = np.exp(-0.5 * (offsets / (_SIGMA_IN_CELLS * cell_px)) ** 2)
+    return np.asarray(weights / np.linalg.norm(weights, axis=1, keepdims=True), np.float32)

@@ -38,6 +38,77 @@ class DataFacts:
     focal_lengths_mm: tuple[float, float]
 
 
+@dataclass(frozen=True)
+class TrainingData:
+    """All stacks, training and test; dataset: the manifest that they came with, in its order, or None."""
+
+    stacks: tuple[FocalStack, ...]
+    dataset: FocalStackDataset | None = None
+
+    def split(self, held_out: Sequence[str], test_fraction: float, seed: int) -> Split:
+        """Split whole stacks: hold out those named; without names those of the manifest; without one a fraction.
+
+        Of a single stack slices are held out, those of the manifest or `slices_to_hold_out`, unless the fraction is 0.
+        """
+        if held_out:
+            apart = named(self.stacks, held_out)
+        elif self.dataset is not None:
+            apart = [stack_name(stack) for stack, record in zip(self.stacks, self.dataset.stacks, strict=True) if record.part == "test"]
+        else:
+            apart = drawn(self.stacks, test_fraction, seed)
+        train, test = split_stacks(self.stacks, apart)
+        slices = self._slices_apart(test_fraction) if len(self.stacks) == 1 else ()
+        return Split(tuple(train), tuple(train if slices else test), slices)
+
+    def _slices_apart(self, test_fraction: float) -> tuple[int, ...]:
+        if self.dataset is not None:
+            return self.dataset.stacks[0].held_out_slices
+        return slices_to_hold_out(self.stacks[0]) if test_fraction > 0.0 else ()
+
+    def facts(self, pairs: PairSet, several_lenses: bool = False) -> DataFacts:
+        """Read facts from the manifest, or from every pair to train on. several_lenses: f-number and focal length may differ."""
+        if self.dataset is None:
+            return gather_facts(pairs, several_lenses)
+        return manifest_facts(self.dataset, pairs.stacks, several_lenses)
+
+
+def training_data(folders: Sequence[Path]) -> TrainingData:
+    """Return the stacks of a data set, or of scene folders. Raises InputError if they cannot be used or are a mixture of both."""
+    datasets = [folder for folder in folders if (folder / FILE_NAME).is_file()]
+    if datasets and len(folders) > 1:
+        raise InputError(
+            f"expected one data set or any number of scene folders, got {datasets[0]} and {len(folders) - 1} more: one network has one "
+            f"split and one radiance scale, so write all scenes into one data set with `mrbokeh capture dataset`"
+        )
+    if datasets:
+        return _of_dataset(read_focal_stack_dataset(datasets[0]))
+    stacks = [stack for folder in folders for stack in find_focal_stacks(folder)]
+    for stack in stacks:
+        _require_no_manifest(stack)
+        require_usable(stack)
+    return TrainingData(tuple(stacks))
+
+
+def _of_dataset(dataset: FocalStackDataset) -> TrainingData:
+    trouble = next((each for record in dataset.stacks for each in file_troubles(dataset, record)), None)
+    if trouble is not None:
+        raise InputError(
+            f"{dataset.folder} is not the data set that its {FILE_NAME} describes: {trouble}; "
+            f"`mrbokeh capture dataset --out {dataset.folder} --verify` names everything that differs"
+        )
+    stacks = tuple(read_focal_stack(dataset.folder / record.name) for record in dataset.stacks)
+    for stack in stacks:
+        require_usable(stack)
+    return TrainingData(stacks, dataset)
+
+
+def _require_no_manifest(stack: FocalStack) -> None:
+    """Refuse a part of a data set given as a scene: it would be split anew, and held-out stacks trained on."""
+    dataset = stack.folder.resolve().parent.parent
+    if (dataset / FILE_NAME).is_file():
+        raise InputError(f"{stack.folder} belongs to the data set {dataset}: give {dataset} itself, so that its split holds")
+
+
 def gather_facts(pairs: PairSet, several_lenses: bool = False) -> DataFacts:
     """Gather the facts in one pass over all pairs, whose largest radiance is the scale. Raises InputError for several lenses or sizes.
 
@@ -116,74 +187,3 @@ def _require_same_size(name: str, size: tuple[int, ...], other_size: tuple[int, 
             f"one network learns one size of picture: expected {size[1]}x{size[0]} px as in the first stack, but {name} has "
             f"{other_size[1]}x{other_size[0]} px; train on it apart"
         )
-
-
-@dataclass(frozen=True)
-class TrainingData:
-    """All stacks, training and test; dataset: the manifest that they came with, in its order, or None."""
-
-    stacks: tuple[FocalStack, ...]
-    dataset: FocalStackDataset | None = None
-
-    def split(self, held_out: Sequence[str], test_fraction: float, seed: int) -> Split:
-        """Split whole stacks: hold out those named; without names those of the manifest; without one a fraction.
-
-        Of a single stack slices are held out, those of the manifest or `slices_to_hold_out`, unless the fraction is 0.
-        """
-        if held_out:
-            apart = named(self.stacks, held_out)
-        elif self.dataset is not None:
-            apart = [stack_name(stack) for stack, record in zip(self.stacks, self.dataset.stacks, strict=True) if record.part == "test"]
-        else:
-            apart = drawn(self.stacks, test_fraction, seed)
-        train, test = split_stacks(self.stacks, apart)
-        slices = self._slices_apart(test_fraction) if len(self.stacks) == 1 else ()
-        return Split(tuple(train), tuple(train if slices else test), slices)
-
-    def _slices_apart(self, test_fraction: float) -> tuple[int, ...]:
-        if self.dataset is not None:
-            return self.dataset.stacks[0].held_out_slices
-        return slices_to_hold_out(self.stacks[0]) if test_fraction > 0.0 else ()
-
-    def facts(self, pairs: PairSet, several_lenses: bool = False) -> DataFacts:
-        """Read facts from the manifest, or from every pair to train on. several_lenses: f-number and focal length may differ."""
-        if self.dataset is None:
-            return gather_facts(pairs, several_lenses)
-        return manifest_facts(self.dataset, pairs.stacks, several_lenses)
-
-
-def training_data(folders: Sequence[Path]) -> TrainingData:
-    """Return the stacks of a data set, or of scene folders. Raises InputError if they cannot be used or are a mixture of both."""
-    datasets = [folder for folder in folders if (folder / FILE_NAME).is_file()]
-    if datasets and len(folders) > 1:
-        raise InputError(
-            f"expected one data set or any number of scene folders, got {datasets[0]} and {len(folders) - 1} more: one network has one "
-            f"split and one radiance scale, so write all scenes into one data set with `mrbokeh capture dataset`"
-        )
-    if datasets:
-        return _of_dataset(read_focal_stack_dataset(datasets[0]))
-    stacks = [stack for folder in folders for stack in find_focal_stacks(folder)]
-    for stack in stacks:
-        _require_no_manifest(stack)
-        require_usable(stack)
-    return TrainingData(tuple(stacks))
-
-
-def _of_dataset(dataset: FocalStackDataset) -> TrainingData:
-    trouble = next((each for record in dataset.stacks for each in file_troubles(dataset, record)), None)
-    if trouble is not None:
-        raise InputError(
-            f"{dataset.folder} is not the data set that its {FILE_NAME} describes: {trouble}; "
-            f"`mrbokeh capture dataset --out {dataset.folder} --verify` names everything that differs"
-        )
-    stacks = tuple(read_focal_stack(dataset.folder / record.name) for record in dataset.stacks)
-    for stack in stacks:
-        require_usable(stack)
-    return TrainingData(stacks, dataset)
-
-
-def _require_no_manifest(stack: FocalStack) -> None:
-    """Refuse a part of a data set given as a scene: it would be split anew, and held-out stacks trained on."""
-    dataset = stack.folder.resolve().parent.parent
-    if (dataset / FILE_NAME).is_file():
-        raise InputError(f"{stack.folder} belongs to the data set {dataset}: give {dataset} itself, so that its split holds")

@@ -42,28 +42,6 @@ REFERENCE_RENDERER = "polygon"
 Image = Float32[np.ndarray, "height width 3"]
 
 
-def timed(work: Callable[[], Result]) -> tuple[Result, float]:
-    """Return (the result, seconds)."""
-    started_s = time.perf_counter()
-    result = work()
-    return result, time.perf_counter() - started_s
-
-
-def peak_memory_mib(work: Callable[[], object]) -> float:
-    """Return the rise of the process's memory while `work` runs; nan on systems other than Linux.
-
-    Memory used before, such as the weights of a network, does not count; freed memory is given back to the system first.
-    """
-    _give_back()
-    try:
-        _RESET.write_text(_FORGET_PEAK, encoding="ascii")
-        before_kib = _status_kib("VmRSS")
-        work()
-        return (_status_kib("VmHWM") - before_kib) / 1024.0
-    except OSError:
-        return float("nan")
-
-
 def _give_back() -> None:
     gc.collect()
     try:
@@ -215,3 +193,25 @@ def _warmed_up(method: Method, seen: UnseenSlice, memory: bool) -> float:
     """Run a first picture, which compiles, and return the memory of a second one."""
     method.blur(seen)
     return peak_memory_mib(partial(method.blur, seen)) if memory else float("nan")
+
+
+def timed(work: Callable[[], Result]) -> tuple[Result, float]:
+    """Return (the result, seconds)."""
+    started_s = time.perf_counter()
+    result = work()
+    return result, time.perf_counter() - started_s
+
+
+def peak_memory_mib(work: Callable[[], object]) -> float:
+    """Return the rise of the process's memory while `work` runs; nan on systems other than Linux.
+
+    Memory used before, such as the weights of a network, does not count; freed memory is given back to the system first.
+    """
+    _give_back()
+    try:
+        _RESET.write_text(_FORGET_PEAK, encoding="ascii")
+        before_kib = _status_kib("VmRSS")
+        work()
+        return (_status_kib("VmHWM") - before_kib) / 1024.0
+    except OSError:
+        return float("nan")

@@ -101,6 +101,39 @@ class _Grow:
         return graph.op("Pad", planes, graph.op("Concat", graph.ints([0] * 6), *missing, axis=0))
 
 
+def _split(graph: GraphBuilder, planes: str, parts: int) -> list[str]:
+    return graph.ops("Split", planes, outputs=parts, axis=1, num_outputs=parts) if parts > 1 else [planes]
+
+
+def gated_model(network: BlurNetwork, weights: GatedWeights, factors: Sequence[int]) -> ModelProto:
+    """Build the graph of a network without tiles from its weights, or fewer of them.
+
+    factors: for n = 1, 2, ... the reduction of the resolution.
+    """
+    groups, graph = groups_of(weights, factors), GraphBuilder()
+    coarsest = max(group.factor for group in groups)
+    inputs = prepared(graph, network, weights, coarsest)
+    windows = windows_of(graph, groups, inputs.position, inputs.size, coarsest)
+    lights = [spread(graph, weights, inputs, *each) for each in zip(groups, windows, strict=True)]
+    hidden = hidden_features(graph, weights, inputs, [coverage for _, coverage in lights])
+    members = [(group, window, light) for group, window, (light, _) in zip(groups, windows, lights, strict=True)]
+    total = total_light(graph, weights, inputs, members, hidden)
+    return graph.model(graph_inputs(network), _radiance(graph, network, inputs, total), ["batch", 3, "height", "width"])
+
+
+def _radiance(graph: GraphBuilder, network: BlurNetwork, inputs: GatedInputs, total: str) -> str:
+    assert isinstance(network.tiles, GatedTiles)
+    height, width = inputs.true_size
+    whole = graph.sliced(graph.sliced(total, 0, height, 2), 0, width, 3)
+    colour, coverage = graph.sliced(whole, 0, 3, 1), graph.sliced(whole, 3, 3 + network.tiles.colours, 1)
+    blurred = graph.op("Div", colour, coverage)
+    if network.tiles.activation != "tanh":
+        return blurred
+    half, one = graph.floats(0.5 * network.top), graph.floats(1.0)
+    bounded = graph.op("Tanh", graph.op("Sub", graph.op("Div", blurred, half), one))
+    return graph.op("Mul", graph.op("Add", bounded, one), half)
+
+
 def _features(graph: GraphBuilder, network: BlurNetwork, grow: _Grow, size: list[str]) -> str:
     """Add features of place and lens, which choose between the kernels of a bin (training/networks/gated_network.py)."""
     assert isinstance(network.tiles, GatedTiles)
@@ -237,36 +270,3 @@ def _weighed(graph: GraphBuilder, group: Group, window: Window, light: str, weig
 def _nothing(values: int) -> Callable[[GraphBuilder], list[str]]:
     """Return the other branch: zeros that are added at no cost, or never looked at."""
     return lambda graph: [graph.floats(np.zeros((1, 1, 1, 1))) for _ in range(values)]
-
-
-def _split(graph: GraphBuilder, planes: str, parts: int) -> list[str]:
-    return graph.ops("Split", planes, outputs=parts, axis=1, num_outputs=parts) if parts > 1 else [planes]
-
-
-def gated_model(network: BlurNetwork, weights: GatedWeights, factors: Sequence[int]) -> ModelProto:
-    """Build the graph of a network without tiles from its weights, or fewer of them.
-
-    factors: for n = 1, 2, ... the reduction of the resolution.
-    """
-    groups, graph = groups_of(weights, factors), GraphBuilder()
-    coarsest = max(group.factor for group in groups)
-    inputs = prepared(graph, network, weights, coarsest)
-    windows = windows_of(graph, groups, inputs.position, inputs.size, coarsest)
-    lights = [spread(graph, weights, inputs, *each) for each in zip(groups, windows, strict=True)]
-    hidden = hidden_features(graph, weights, inputs, [coverage for _, coverage in lights])
-    members = [(group, window, light) for group, window, (light, _) in zip(groups, windows, lights, strict=True)]
-    total = total_light(graph, weights, inputs, members, hidden)
-    return graph.model(graph_inputs(network), _radiance(graph, network, inputs, total), ["batch", 3, "height", "width"])
-
-
-def _radiance(graph: GraphBuilder, network: BlurNetwork, inputs: GatedInputs, total: str) -> str:
-    assert isinstance(network.tiles, GatedTiles)
-    height, width = inputs.true_size
-    whole = graph.sliced(graph.sliced(total, 0, height, 2), 0, width, 3)
-    colour, coverage = graph.sliced(whole, 0, 3, 1), graph.sliced(whole, 3, 3 + network.tiles.colours, 1)
-    blurred = graph.op("Div", colour, coverage)
-    if network.tiles.activation != "tanh":
-        return blurred
-    half, one = graph.floats(0.5 * network.top), graph.floats(1.0)
-    bounded = graph.op("Tanh", graph.op("Sub", graph.op("Div", blurred, half), one))
-    return graph.op("Mul", graph.op("Add", bounded, one), half)

@@ -27,36 +27,6 @@ from training.fitting.settings import TrainSettings, read_settings, write_settin
 _MAY_DIFFER = ("threads", "device", "cache_mib", "checkpoint_every_s", "sheets")
 
 
-def require_same_settings(run_folder: Path, settings: TrainSettings) -> None:
-    """Raise InputError for settings that differ from the run's, except where and how fast it computes and how often it writes."""
-    if _begun(run_folder, SETTINGS_NAME):
-        _require_same(run_folder, "settings", read_settings(run_folder), settings, _MAY_DIFFER)
-
-
-def require_same_data(run_folder: Path, facts: RunFacts) -> None:
-    """Raise InputError for data that differ from the run's: what it has seen cannot be held out later."""
-    if _begun(run_folder, FACTS_NAME):
-        _require_same(run_folder, "data", read_facts(run_folder), facts, ("lens", "commit"))
-
-
-def _begun(run_folder: Path, name: str) -> bool:
-    return (run_folder / CHECKPOINT_NAME).exists() and (run_folder / name).exists()
-
-
-def _require_same(run_folder: Path, what: str, before: object, now: object, may_differ: tuple[str, ...]) -> None:
-    differing = [name for name, value in vars(now).items() if vars(before)[name] != value and name not in may_differ]
-    if differing:
-        raise InputError(
-            f"{run_folder} holds a run with other {what} ({', '.join(differing)}): give another --out, or --overwrite to start again"
-        )
-
-
-def remove_unfinished(run_folder: Path) -> None:
-    """Remove files that a killed run was writing; finished files have their final names."""
-    for path in run_folder.rglob(".*.part.*"):
-        path.unlink()
-
-
 def fit(
     data: TrainingData,
     run_folder: Path,
@@ -138,3 +108,33 @@ def _facts_of(data: TrainingData, pairs: PairSet, split: Split, settings: TrainS
         f_numbers=found.f_numbers,
         focal_lengths_mm=found.focal_lengths_mm,
     )
+
+
+def require_same_settings(run_folder: Path, settings: TrainSettings) -> None:
+    """Raise InputError for settings that differ from the run's, except where and how fast it computes and how often it writes."""
+    if _begun(run_folder, SETTINGS_NAME):
+        _require_same(run_folder, "settings", read_settings(run_folder), settings, _MAY_DIFFER)
+
+
+def require_same_data(run_folder: Path, facts: RunFacts) -> None:
+    """Raise InputError for data that differ from the run's: what it has seen cannot be held out later."""
+    if _begun(run_folder, FACTS_NAME):
+        _require_same(run_folder, "data", read_facts(run_folder), facts, ("lens", "commit"))
+
+
+def _begun(run_folder: Path, name: str) -> bool:
+    return (run_folder / CHECKPOINT_NAME).exists() and (run_folder / name).exists()
+
+
+def _require_same(run_folder: Path, what: str, before: object, now: object, may_differ: tuple[str, ...]) -> None:
+    differing = [name for name, value in vars(now).items() if vars(before)[name] != value and name not in may_differ]
+    if differing:
+        raise InputError(
+            f"{run_folder} holds a run with other {what} ({', '.join(differing)}): give another --out, or --overwrite to start again"
+        )
+
+
+def remove_unfinished(run_folder: Path) -> None:
+    """Remove files that a killed run was writing; finished files have their final names."""
+    for path in run_folder.rglob(".*.part.*"):
+        path.unlink()

@@ -76,38 +76,6 @@ class TileGrid:
         return len(self.origins_px)
 
 
-def _starts(length_px: int, tile_px: int, overlap_px: int) -> list[int]:
-    last = max(0, length_px - tile_px)
-    return [*range(0, last, tile_px - overlap_px), last]
-
-
-def split(picture: Tensor, grid: TileGrid) -> Tensor:
-    """Split (B, C, H, W) into (B, tiles * C, t, t): the channels of the first tile, then those of the second, and so on."""
-    height, width = grid.tile_size_px
-    return torch.cat([picture[:, :, top : top + height, left : left + width] for top, left in grid.origins_px], dim=1)
-
-
-def assemble(tiles: Tensor, grid: TileGrid) -> Tensor:
-    """Assemble (B, tiles * C, t, t) to (B, C, H, W): every tile at its place, the mean where they overlap."""
-    return _sum_placed(tiles.chunk(len(grid), dim=1), grid) / tile_count(grid).to(tiles)
-
-
-def tile_count(grid: TileGrid) -> Tensor:
-    """Return (H, W): how many tiles cover each pixel."""
-    return _sum_placed([torch.ones(1, 1, *grid.tile_size_px)] * len(grid), grid)[0, 0]
-
-
-def _sum_placed(tiles: Sequence[Tensor], grid: TileGrid) -> Tensor:
-    placed = [_placed(tile, origin, grid) for tile, origin in zip(tiles, grid.origins_px, strict=True)]
-    return functools.reduce(torch.add, placed)
-
-
-def _placed(tile: Tensor, origin_px: tuple[int, int], grid: TileGrid) -> Tensor:
-    """Place a tile in a picture that is 0 elsewhere."""
-    (top, left), (height, width) = origin_px, grid.tile_size_px
-    return functional.pad(tile, (left, grid.width_px - left - width, top, grid.height_px - top - height))
-
-
 class BlurNetwork(nn.Module):
     """A network from linear radiance and circles of confusion to linear radiance, with tiling and the mapping to [-1, 1] inside.
 
@@ -209,3 +177,35 @@ def _given(values: Tensor | None, what: str, setting: str) -> Tensor:
     if values is None:
         raise InputError(f"this network was made with {setting}, so it needs {what} beside the picture, got none: give it")
     return values
+
+
+def _starts(length_px: int, tile_px: int, overlap_px: int) -> list[int]:
+    last = max(0, length_px - tile_px)
+    return [*range(0, last, tile_px - overlap_px), last]
+
+
+def split(picture: Tensor, grid: TileGrid) -> Tensor:
+    """Split (B, C, H, W) into (B, tiles * C, t, t): the channels of the first tile, then those of the second, and so on."""
+    height, width = grid.tile_size_px
+    return torch.cat([picture[:, :, top : top + height, left : left + width] for top, left in grid.origins_px], dim=1)
+
+
+def assemble(tiles: Tensor, grid: TileGrid) -> Tensor:
+    """Assemble (B, tiles * C, t, t) to (B, C, H, W): every tile at its place, the mean where they overlap."""
+    return _sum_placed(tiles.chunk(len(grid), dim=1), grid) / tile_count(grid).to(tiles)
+
+
+def tile_count(grid: TileGrid) -> Tensor:
+    """Return (H, W): how many tiles cover each pixel."""
+    return _sum_placed([torch.ones(1, 1, *grid.tile_size_px)] * len(grid), grid)[0, 0]
+
+
+def _sum_placed(tiles: Sequence[Tensor], grid: TileGrid) -> Tensor:
+    placed = [_placed(tile, origin, grid) for tile, origin in zip(tiles, grid.origins_px, strict=True)]
+    return functools.reduce(torch.add, placed)
+
+
+def _placed(tile: Tensor, origin_px: tuple[int, int], grid: TileGrid) -> Tensor:
+    """Place a tile in a picture that is 0 elsewhere."""
+    (top, left), (height, width) = origin_px, grid.tile_size_px
+    return functional.pad(tile, (left, grid.width_px - left - width, top, grid.height_px - top - height))
