@@ -85,7 +85,7 @@ def has_fresh_exclusions(stack: FocalStack) -> bool:
 
 
 def board_mask(stack: FocalStack, shape: tuple[int, ...]) -> Mask:
-    """Return pixels of the calibration board and up to one around it; none where no board was found (see `capture.scale.scale_file`)."""
+    """Return pixels of the calibration board and up to one around it; none where no board was found (see `capture.scale.answer`)."""
     mask = np.zeros(shape, np.uint8)
     path = stack.folder.parent / SCALE_FILE
     if not path.is_file():

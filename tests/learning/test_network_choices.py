@@ -106,5 +106,5 @@ def test_presets() -> None:
 
 
 def test_modules_of_all_forms_exist() -> None:
-    for name in ("published_tiles", "gated_network", "deepfocus_network", "neural_camera_network"):
-        assert importlib.util.find_spec(f"training.{name}") is not None
+    for name in ("published_network", "gated_network", "baseline_networks"):
+        assert importlib.util.find_spec(f"training.networks.{name}") is not None
