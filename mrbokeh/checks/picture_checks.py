@@ -78,7 +78,7 @@ Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 
 ALPHA_SLACK = 1e-3
-"""What half floats and sums of weights may be off."""
+"""Error allowed for half floats and sums of weights."""
 DARK_SLACK = 1e-4
 _BORDER_PX = 2
 

@@ -62,7 +62,7 @@ def _box(picture: np.ndarray, radius_px: int) -> np.ndarray:
 Mask = Bool[np.ndarray, "height width"]
 
 LEAST_JUMP = 0.05
-"""Of the range of the map in dioptres: what rises by less within a few pixels is a surface."""
+"""Least jump as a share of the map's range in dioptres: what rises by less within a few pixels is a surface."""
 EPSILON = 1e-4
 """Variance of the root of light in [0, 1] below which the photograph tells nothing."""
 _LARGEST_SIDE_PX = 1536

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Float32
 from mrbokeh.system.errors import InputError
 
 GIVES = ("inverse", "metric")
-"""What a depth network can give: numbers that grow with 1 / depth up to scale and offset, or metres."""
+"""Outputs of depth networks: numbers that grow with 1 / depth up to scale and offset, or metres."""
 
 
 @dataclass(frozen=True)

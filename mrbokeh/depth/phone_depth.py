@@ -17,6 +17,7 @@ from jaxtyping import Float32
 
 from mrbokeh.depth.depth_map import DepthMap
 from mrbokeh.images.color import srgb_to_linear
+from mrbokeh.images.exif import stored_orientation, upright
 from mrbokeh.system.errors import InputError
 
 _PACKET = b"http://ns.adobe.com/xap/1.0/\0"
@@ -87,7 +88,6 @@ def _properties(packet: bytes, path: Path) -> dict[str, str]:
 _DEPTH = "{http://ns.google.com/photos/1.0/depthmap/}"
 _IMAGE = "{http://ns.google.com/photos/1.0/image/}"
 _FOCUS = "{http://ns.google.com/photos/1.0/focus/}"
-_ORIENTATION = 0x0112
 
 
 @dataclass(frozen=True)
@@ -128,14 +128,12 @@ def read_phone_photo(path: Path, near_far_m: tuple[float, float] | None = None) 
     xmp = read_xmp(path) if path.suffix.lower() in (".jpg", ".jpeg") else {}
     if _DEPTH + "Data" not in xmp:
         return None
-    turned, original = _orientation(path), xmp.get(_IMAGE + "Data")
-    depth = _depth(xmp, path, near_far_m)
-    upright = replace(depth, depth_m=_upright(depth.depth_m, turned), valid=_upright(depth.valid.astype(np.float32), turned) > 0)
+    orientation, original = stored_orientation(path), xmp.get(_IMAGE + "Data")
+    stored = _depth(xmp, path, near_far_m)
+    depth = replace(stored, depth_m=upright(stored.depth_m, orientation), valid=upright(stored.valid, orientation))
     if original is None:
-        return PhonePhoto(upright, None, _focus(xmp))
-    channels = np.moveaxis(_decoded(original, path)[..., :3], 2, 0)
-    rgb = np.stack([_upright(np.ascontiguousarray(each), turned) for each in channels], axis=2)
-    return PhonePhoto(upright, srgb_to_linear(rgb), _focus(xmp))
+        return PhonePhoto(depth, None, _focus(xmp))
+    return PhonePhoto(depth, srgb_to_linear(upright(_decoded(original, path)[..., :3], orientation)), _focus(xmp))
 
 
 def _depth(xmp: Mapping[str, str], path: Path, near_far_m: tuple[float, float] | None) -> DepthMap:
@@ -157,22 +155,6 @@ def _depth(xmp: Mapping[str, str], path: Path, near_far_m: tuple[float, float] |
     if kind == "RangeInverse":
         return DepthMap.of_dioptres((1.0 - level) / near + level / far, everywhere, note)
     return DepthMap((near + level * (far - near)).astype(np.float32), everywhere, note)
-
-
-def _orientation(path: Path) -> int:
-    from PIL import Image
-
-    with Image.open(path) as picture:
-        return int(picture.getexif().get(_ORIENTATION, 1))
-
-
-def _upright(plane: Float32[np.ndarray, "height width"], orientation: int) -> Float32[np.ndarray, "rows columns"]:
-    """Turn and mirror a plane by Exif's orientation, 1 to 8."""
-    from PIL import Image, ImageOps
-
-    picture = Image.fromarray(plane)
-    picture.getexif()[_ORIENTATION] = orientation
-    return np.ascontiguousarray(ImageOps.exif_transpose(picture), np.float32)
 
 
 def _focus(xmp: Mapping[str, str]) -> PhoneFocus | None:

@@ -204,7 +204,7 @@ _MODELS: dict[str, tuple[int, str, tuple[str, ...]]] = {
     "SIMPLE_RADIAL_FISHEYE": (1, "fisheye", ("k1",)),
     "RADIAL_FISHEYE": (1, "fisheye", ("k1", "k2")),
 }
-"""How many focal lengths a model has, then ours and the names of its values."""
+"""Number of focal lengths of a COLMAP model, our model, and the names of its values."""
 
 Pair = tuple[float, float]
 

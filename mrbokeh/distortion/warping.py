@@ -54,7 +54,7 @@ def _layer(values: Float32[np.ndarray, "height width channels"], depth_m: Float3
 
 GRID_STEP_PX = 16
 _FRAME_ROOM_PX = 1
-"""So that filters at the frame's edge find samples on both sides."""
+"""Margin with which filters at the frame's edge find samples on both sides."""
 _FINE_STEP_PX = 2
 _ENOUGH = 0.999
 _MOST_ENLARGED = 2.0

@@ -63,7 +63,7 @@ def _draw_diameters(figure: "Figure", place: "SubplotSpec", aperture: Aperture) 
     grid = place.subgridspec(1, len(KERNEL_COC_PX))
     for column, coc_px in enumerate(KERNEL_COC_PX):
         axes = figure.add_subplot(grid[0, column])
-        axes.imshow(_shown(kernel_rgb(aperture, coc_px)))
+        axes.imshow(shown_light(kernel_rgb(aperture, coc_px)))
         axes.set_title(f"{coc_px:+.0f} px " + ("behind" if coc_px > 0 else "in front"), fontsize=9)
         axes.axis("off")
 
@@ -80,12 +80,12 @@ def draw_field(axes: "Axes", aperture: Aperture, coc_px: float) -> None:
         top = index // columns * cell + (cell - len(kernel)) // 2
         left = index % columns * cell + (cell - len(kernel)) // 2
         sheet[top : top + len(kernel), left : left + len(kernel)] = kernel
-    axes.imshow(_shown(sheet))
+    axes.imshow(shown_light(sheet))
     axes.set_title(f"over the frame, {coc_px:+.0f} px " + ("behind" if coc_px > 0 else "in front"), fontsize=9)
     axes.axis("off")
 
 
-def _shown(light: Float64[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width 3"]:
+def shown_light(light: Float[np.ndarray, "height width 3"]) -> Float[np.ndarray, "height width 3"]:
     """Return light as a display shows it, its largest value white."""
     from mrbokeh.images.color import linear_to_srgb
 

@@ -5,8 +5,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float64
 
+from mrbokeh.figures.lens_drawing import shown_light
 from mrbokeh.images.image_io import write_image
 from mrbokeh.optics.psf_bank import Axis, PsfBank
 from mrbokeh.system.atomic_files import atomic_path
@@ -99,17 +100,10 @@ def _draw_kernels(figure: "Figure", place: "SubplotSpec", bank: PsfBank) -> None
     grid = place.subgridspec(KERNELS_IN_ROW, KERNELS_IN_ROW)
     for index, cell in enumerate(cells):
         axes = figure.add_subplot(grid[index // KERNELS_IN_ROW, index % KERNELS_IN_ROW])
-        axes.imshow(_shown(bank.kernels[cell]), interpolation="nearest")
+        kernel = bank.kernels[cell]
+        axes.imshow(shown_light(np.broadcast_to(kernel, (*kernel.shape[:2], 3))), interpolation="nearest")
         axes.set_title(", ".join(f"{value:.3g}" for value in bank.centres[cell].round(9) + 0.0), fontsize=7)
         axes.axis("off")
-
-
-def _shown(kernel: Float32[np.ndarray, "size size channels"]) -> Float[np.ndarray, "size size 3"]:
-    """Return a kernel as a display shows it, its largest value white."""
-    from mrbokeh.images.color import linear_to_srgb
-
-    rgb = np.broadcast_to(kernel, (*kernel.shape[:2], 3))
-    return linear_to_srgb(np.clip(rgb / rgb.max(), 0.0, 1.0).astype(np.float32))
 
 
 def _draw_cells(axes: "Axes", bank: PsfBank) -> None:

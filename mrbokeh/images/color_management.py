@@ -20,7 +20,7 @@ from mrbokeh.images.exr_io import known_primaries
 from mrbokeh.system.errors import InputError, MissingExtraError
 
 REC709_LINEAR = "Linear Rec.709 (sRGB)"
-"""What everything here is in, as the Academy's configurations name it; many others know it by the alias lin_rec709_srgb."""
+"""Colour space of all pictures here, as the Academy's configurations name it; many others know it by the alias lin_rec709_srgb."""
 BUILT_IN = {"aces": "studio-config-latest", "aces-cg": "cg-config-latest"}
 _OURS = (REC709_LINEAR, "lin_rec709_srgb", "lin_rec709", "lin_srgb", "Utility - Linear - sRGB", "Linear Rec.709")
 _NAMED = 5

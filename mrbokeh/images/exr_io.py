@@ -114,16 +114,16 @@ REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 """CIE x, y of red, green, blue and white (D65), ITU-R BT.709; what EXR takes where a file states nothing."""
 
 BT2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
-"""The same of ITU-R BT.2020, which holds nearly all colours of real things."""
+"""Primaries and white of ITU-R BT.2020, which holds nearly all colours of real things."""
 
 AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
-"""The same of ACES2065-1 (SMPTE ST 2065-1)."""
+"""Primaries and white of ACES2065-1 (SMPTE ST 2065-1)."""
 
 AP1 = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
-"""The same of ACEScg (S-2014-004)."""
+"""Primaries and white of ACEScg (S-2014-004)."""
 
 P3_D65 = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
-"""The same of SMPTE RP 431-2 with the white of displays."""
+"""Primaries of SMPTE RP 431-2 with the white of displays."""
 
 # Cone responses that the Bradford transform scales (Lam 1985; CIE 160:2004).
 _CONES_FROM_XYZ = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])

@@ -87,7 +87,7 @@ def _font_scale(caption: str, width_px: int) -> float:
 
 
 INTEGER_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
-"""Of what is read and written; the others are read only."""
+"""Suffixes of integer pictures that are read and written; the others are read only."""
 ENCODED_SUFFIXES = (*INTEGER_SUFFIXES, ".webp")
 HEIF_SUFFIXES = (".heic", ".heif", ".hif")
 HEIF_ADVICE = "HEIC is not read: convert it to PNG or TIFF of 16 bits, or to JPEG"

@@ -17,9 +17,9 @@ Plane = Float32[np.ndarray, "height width"]
 Transfers = Float[np.ndarray, "_ values"]
 
 STEPS_PER_PX = 16
-"""The table is so fine."""
+"""Steps of the table per pixel."""
 _WIDEST_PX = 16.0
-"""Beyond it the difference of the squares stays: variances add, and that of a pixel does not depend on the diameter."""
+"""End of the table, beyond which the difference of squares stays: variances add, and a pixel's does not depend on the diameter."""
 _DRAWN_PX = np.concatenate([np.arange(1.0, 4.0, 0.1), np.arange(4.0, 8.0, 0.25), np.arange(8.0, 18.0, 0.5)])
 _BLURS_PX = np.arange(0.0, 18.0, 0.05)
 _FINE_PX = 100.0

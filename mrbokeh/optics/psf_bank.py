@@ -91,7 +91,7 @@ Kernel = Float32[np.ndarray, "size size channels"]
 Grid = NestedGrid | ProportionalGrid
 
 _MOST_LIGHT = 1.001
-"""What a kernel may sum to: 1, but for the rounding of float32."""
+"""Largest sum of a kernel: 1, but for the rounding of float32."""
 
 
 @dataclass(frozen=True, eq=False)

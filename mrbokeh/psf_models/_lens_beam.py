@@ -16,7 +16,7 @@ BANDS_UM = np.array([[0.6114, 0.04], [0.5491, 0.04], [0.4642, 0.04]])
 primaries (where lines from D65 through them meet the spectral locus of CIE 1931)."""
 
 GREEN_UM = float(BANDS_UM[1, 0])
-"""Of the chief ray and of the focus."""
+"""Wavelength of the chief ray and of the focus."""
 
 _COARSE, _FINE, _LOOKS, _NODES = 48, 256, 3, 65
 _AREA_RAYS = 1 << 16

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 EXPONENT = 1.5
 SAMPLES = 200
 LARGEST_PX = 480.0
-"""With the chromatic scale of red it fits the paper's 512 pixels."""
+"""Largest diameter, which with the chromatic scale of red fits the paper's 512 pixels."""
 CHROMATIC = (0.05, 0.0, -0.05)
 _LARGEST_PICTURE_PX = 512
 _STEP_PX = 0.5

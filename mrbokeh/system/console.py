@@ -17,9 +17,9 @@ from mrbokeh.system.errors import INTERRUPTED
 Item = TypeVar("Item")
 
 LINE_EVERY_S, LINE_EVERY_SHARE = 10.0, 0.05
-"""The longer of the two, the second of the time so far: a night of training is no thousand lines."""
+"""Time between lines: the longer of the two, the second a share of the time so far; a night of training is no thousand lines."""
 WORTH_A_LINE_S = 2.0
-"""What took less ends without a line: a command that is done at once leaves no log of its parts."""
+"""Shortest task whose end is worth a line: a command that is done at once leaves no log of its parts."""
 
 
 class PlainLines(Progress):

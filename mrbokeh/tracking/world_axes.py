@@ -45,7 +45,9 @@ UPRIGHT_FROM_WORLD = {
     "-y": np.eye(4),
     "+y": np.diag([1.0, -1.0, -1.0, 1.0]),
 }
-"""By what points up. "-z" is a board as OpenCV has it (x right, y down along the board, z into the table); OpenTrackIO and FreeD are
+"""Rotations by the axis that points up.
+
+"-z" is a board as OpenCV has it (x right, y down along the board, z into the table); OpenTrackIO and FreeD are
 turned into one where they are read. "+z" is a floor with z up, "-y" mrbokeh and most COLMAP maps, "+y" ARKit and Blender's glTF.
 None of them mirrors."""
 
@@ -73,7 +75,7 @@ def rays(camera: Camera, xy_px: Float[np.ndarray, "points 2"]) -> Float[np.ndarr
 
 
 CAMERA_FROM_STAGE_CAMERA = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
-"""From a camera that looks along +Y with Z up to ours, which looks along +z with y down."""
+"""Rotation from a camera that looks along +Y with Z up to ours, which looks along +z with y down."""
 
 _STEEP = 1e-9
 

@@ -11,7 +11,7 @@ from mrbokeh.optics.psf import kernel_radius_px
 from mrbokeh.system.errors import InputError
 
 EXTENT = 1.2
-"""How far the picture reaches, in radii of the unit pupil: openings end at 1, unless the lens blurs more than was calibrated."""
+"""Reach of the picture in radii of the unit pupil: openings end at 1, unless the lens blurs more than was calibrated."""
 
 _SHARP_PX = 1.0  # up to this diameter a kernel is the pixel itself, as mrbokeh.optics.psf.shown_diameter_px has it
 _LEAST_SIDE, _MOST_SIDE = 21, 41

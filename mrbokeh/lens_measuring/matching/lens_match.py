@@ -54,7 +54,7 @@ def depth_from_size(lens: Lens, coc_px: float, image_width_px: int) -> float:
 
 
 EDGE_PX, FULL_EDGE_PX = 0.15, 0.6
-"""By how much diameters are off all alike. Where light L is clipped at 1, the contour at one half lies where a pixel is covered by
+"""Error that all diameters share. If light L is clipped at 1, the contour at one half lies where a pixel is covered by
 0.5 / L: up to half a pixel too far out on each side, on average over all L a quarter."""
 
 

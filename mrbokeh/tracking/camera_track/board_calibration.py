@@ -14,7 +14,7 @@ from mrbokeh.tracking.charuco.board import CharucoBoard
 from mrbokeh.tracking.charuco.detector import Corners
 
 FEWEST_CORNERS = 8
-"""That a frame must show."""
+"""Corners that a frame must show."""
 
 _FEWEST_VIEWS = 4
 _MOST_VIEWS = 40

@@ -80,7 +80,7 @@ def intrinsics_of_clip(stated: Intrinsics, size_px: tuple[int, int], quarter_tur
 
 
 _CARRIED_FRAMES = 30
-"""So long may corners be carried that no print confirms; real clips blur for less, and flow has slipped by then."""
+"""Longest run in which corners are carried that no print confirms; real clips blur for less, and flow has slipped by then."""
 
 _BACK_FRAMES = 60
 

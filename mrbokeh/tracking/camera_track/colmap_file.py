@@ -31,7 +31,7 @@ MODELS: dict[int, tuple[str, tuple[str, ...]]] = {
     4: ("OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
     6: ("FULL_OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")),
 }
-"""By number: name and parameters. The others are fisheyes and prisms."""
+"""Name and parameters by number. The others are fisheyes and prisms."""
 
 MODEL_OF_NAME = {name: number for number, (name, _) in MODELS.items()}
 
@@ -246,7 +246,7 @@ _KINDS = {
     ".bin": (_read_binary_cameras, _read_binary_images, _write_binary),
     ".txt": (_read_text_cameras, _read_text_images, _write_text),
 }
-"""How the files of each suffix are read (cameras, images) and written."""
+"""Functions that read (cameras, images) and write the files of each suffix."""
 
 
 def read(folder: Path, options: TrackOptions) -> CameraTrack:

@@ -23,7 +23,7 @@ Distortion = Mapping[str, float]
 """Coefficients by their names in OpenCV and COLMAP: k1, k2, k3 (of r^2, r^4, r^6), k4, k5, k6 (the same below the bar), p1, p2."""
 
 DISTORTION_NAMES = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-"""In OpenCV's order."""
+"""Names of the coefficients in OpenCV's order."""
 
 
 @dataclass(frozen=True)

@@ -20,10 +20,10 @@ CERTAIN_DEG = 3.0
 
 _RAD_PER_S = 1.0
 _SWITCHES = 1e-5
-"""That poses are exchanged whatever the motion, per frame."""
+"""Probability per frame that poses are exchanged whatever the motion."""
 
 _INDEPENDENT = 0.2
-"""Of the evidence of a frame: corners carried by flow, and the errors of a lens, are alike in frame after frame."""
+"""Independent share of a frame's evidence: corners carried by flow, and the errors of a lens, are alike in frame after frame."""
 
 Weights = Float64[np.ndarray, " poses"]
 

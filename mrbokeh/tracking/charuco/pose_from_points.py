@@ -20,7 +20,7 @@ from mrbokeh.optics.camera import Camera
 _PARAMETERS = 6
 _EXPECTED_PX = 0.3
 _EXPECTED_WEIGHT = 12
-"""What corners scatter by before any is seen, and for how many coordinates that counts: few corners fit well by chance, and those that are
+"""Prior scatter of corners, and for how many coordinates it counts: few corners fit well by chance, and those that are
 aligned with the print, or carried by flow, share errors that a residual does not show."""
 
 _BACK_SIGMAS = 2.0
@@ -86,7 +86,7 @@ def _cross_matrices(arms: Points) -> Float64[np.ndarray, "points 3 3"]:
 
 
 FEWEST_POINTS = 6
-"""With fewer, near the limit of defocus, poses were off by degrees."""
+"""Fewest points of a pose: with fewer, near the limit of defocus, poses were off by degrees."""
 
 _SAME_RAD = 0.01
 _STOP = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 30, 1e-10)
