@@ -22,8 +22,8 @@ _SORTED_PIXELS = 1 << 14
 Window = tuple[slice, slice]
 _LEAST_CELL_PX = 16
 _MOST_CELLS = 64
-_PIXELS_PER_SPREAD = 1 << 14
-"""What it costs to spread once more, in pixels of a window."""
+_PIXELS_PER_BLUR = 1 << 14
+"""Cost of blurring once more, in pixels of a window."""
 _LEAST_STEP_PX = 0.5
 _HALF_A_SLICE = 0.501  # and what rounding may add
 _BAND_PIXELS = 1 << 16
@@ -69,30 +69,26 @@ class Slicing:
 
         If pixels of two layers share a place there are two rounds or more.
         """
+        from mrbokeh.layering._slices_numba import place_light, remove_light
+
         parts, reach = component
         rounds: list[tuple[Channels, Window]] = []
         while parts and (window := window_of(parts, reach, self.frame)) is not None:
-            light, parts = self._blur_round(parts, window)
-            rounds.append((light, window))
+            channels = parts[0].pixels.values.shape[1]
+            memory = self.memory.take(self.size[0] * self.size[1] * (channels + 1), np.float32)
+            light, coc_px = _laid_out(memory, window, channels)
+            where = self.size[1], window[0].start, window[1].start
+            late = [
+                place_light(light, coc_px, each.runs, each.pixels.places, each.pixels.values, each.pixels.coc_px, each.shares, *where)
+                for each in parts
+            ]
+            blurred = self.psf.blur(light, coc_px, self.frame.moved(window[1].start, window[0].start))
+            rounds.append((blurred.copy() if np.may_share_memory(blurred, memory) else blurred, window))
+            for part in parts:
+                remove_light(light, coc_px, part.runs, part.pixels.places, *where)
+            self.memory.give_back(memory)
+            parts = [replace(part, runs=runs) for part, runs in zip(parts, late, strict=True) if len(runs) > 0]
         return rounds
-
-    def _blur_round(self, parts: Sequence[Part], window: Window) -> tuple[Channels, list[Part]]:
-        """Return light blurred within a window of the frame, and the parts that found their place taken."""
-        from mrbokeh.layering._slices_numba import place_light, remove_light
-
-        memory = self.memory.take(self.size[0] * self.size[1] * (parts[0].pixels.values.shape[1] + 1), np.float32)
-        light, coc_px = _laid_out(memory, window, parts[0].pixels.values.shape[1])
-        where = self.size[1], window[0].start, window[1].start
-        late = [
-            place_light(light, coc_px, each.runs, each.pixels.places, each.pixels.values, each.pixels.coc_px, each.shares, *where)
-            for each in parts
-        ]
-        spread = self.psf.blur(light, coc_px, self.frame.moved(window[1].start, window[0].start))
-        spread = spread.copy() if np.may_share_memory(spread, memory) else spread
-        for part in parts:
-            remove_light(light, coc_px, part.runs, part.pixels.places, *where)
-        self.memory.give_back(memory)
-        return spread, [replace(part, runs=runs) for part, runs in zip(parts, late, strict=True) if len(runs) > 0]
 
 
 def _laid_out(memory: Float32[np.ndarray, " elements"], window: Window, channels: int) -> tuple[Channels, Plane]:
@@ -253,7 +249,7 @@ def connected_components(parts: Sequence[Part], reach: int, size: tuple[int, int
         mark_cells(cells, cell_px, part.runs, part.pixels.places, size[1])
     boxes = np.tile(np.array([size[0], 0, size[1], 0]), (label_components(cells), 1))
     own = [components_of_runs(boxes, cells, cell_px, part.runs, part.pixels.places, size[1]) for part in parts]
-    joined = join_components(boxes, reach, _PIXELS_PER_SPREAD)
+    joined = join_components(boxes, reach, _PIXELS_PER_BLUR)
     if not joined.any():
         yield list(parts)
         return

@@ -159,20 +159,8 @@ class BandRunner:
             nonnegative=nonnegative,
             largest_px=light.largest_of_tile_px,
         )
-        self._run_bands(picture, list(zip(bands, targets, strict=False)), margin)
-        starts = np.array([[top - margin, bottom] for top, bottom in edges]).reshape(-1)
-        pieces = strays.reshape(2 * len(edges), *strays.shape[2:])
-
-        def finish(top: int) -> None:
-            target = Target(out=flat, above=strays[0, 0], below=strays[0, 1], top=top, bottom=min(top + SETTLED_ROWS, len(out)))
-            settle(target, pieces, starts, half, np.empty(half.shape[1], np.float32), nonnegative)
-
-        list(self.pool.map(finish, range(0, len(out), SETTLED_ROWS)))
-        return out
-
-    def _run_bands(self, picture: Picture, bands: list[tuple[Band, Target]], margin: int) -> None:
-        waiting, lock = iter(bands), Lock()
-        width = max((int((band.parts[:, 3] - band.parts[:, 2]).max()) for band, _ in bands), default=0)
+        waiting, lock = zip(bands, targets, strict=False), Lock()
+        width = max((int((band.parts[:, 3] - band.parts[:, 2]).max()) for band in bands), default=0)
         tables = self.tables
 
         def work() -> None:
@@ -189,3 +177,12 @@ class BandRunner:
             self.memory.give_back(planes)
 
         list(self.pool.map(lambda _: work(), range(min(self.threads, len(bands)))))
+        starts = np.array([[top - margin, bottom] for top, bottom in edges]).reshape(-1)
+        pieces = strays.reshape(2 * len(edges), *strays.shape[2:])
+
+        def finish(top: int) -> None:
+            target = Target(out=flat, above=strays[0, 0], below=strays[0, 1], top=top, bottom=min(top + SETTLED_ROWS, len(out)))
+            settle(target, pieces, starts, half, np.empty(half.shape[1], np.float32), nonnegative)
+
+        list(self.pool.map(finish, range(0, len(out), SETTLED_ROWS)))
+        return out
