@@ -13,7 +13,7 @@ import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -95,7 +95,13 @@ class _KernelCacheImpl(CompileResultCacheImpl):  # type: ignore[misc]
 
 
 class _KernelCache(FunctionCache):  # type: ignore[misc]
+    """numba's cache of a kernel's signatures; a full disk costs time and not the picture."""
+
     _impl_class = _KernelCacheImpl
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        with suppress(OSError):
+            super().save_overload(sig, data)
 
 
 @cache
@@ -116,9 +122,11 @@ def _folder(file: Path, module: str) -> Path | None:
 
 @cache
 def _writable_base() -> Path | None:
-    """Return NUMBA_CACHE_DIR where it is set, else the user's cache folder, else __pycache__ here: the first that can be written."""
+    """Return a folder that can be written: in NUMBA_CACHE_DIR where that is set, else the user's cache folder, else __pycache__ here."""
     user = Path(AppDirs(appname="mrbokeh", appauthor=False).user_cache_dir)
-    bases = [Path(_config.CACHE_DIR)] if _config.CACHE_DIR else [user / "kernels", Path(__file__).parent / "__pycache__" / "kernels"]
+    bases = [user / "kernels", Path(__file__).parent / "__pycache__" / "kernels"]
+    if _config.CACHE_DIR:
+        bases = [Path(_config.CACHE_DIR) / "mrbokeh"]
     for base in bases:
         with suppress(OSError):
             base.mkdir(parents=True, exist_ok=True)
@@ -144,14 +152,11 @@ def _once_at_a_time(compile_one: Callable[[Any], Any], known: Any, lock: Path) -
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
     """Hold a file locked against other processes, where the system and the file system can do that."""
-    try:
-        import fcntl
+    with ExitStack() as held:
+        with suppress(ImportError, OSError):
+            import fcntl
 
-        with path.open("a") as held:
-            with suppress(OSError):
-                fcntl.flock(held, fcntl.LOCK_EX)
-            yield
-    except (ImportError, FileNotFoundError, PermissionError):
+            fcntl.flock(held.enter_context(path.open("a")), fcntl.LOCK_EX)
         yield
 
 
