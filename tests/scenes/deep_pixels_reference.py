@@ -1,5 +1,4 @@
 """Reference for deep pixels: samples of one pixel sorted, none overlapping another ("Interpreting OpenEXR Deep Pixels", openexr.com).
-openexr.com).
 
 It says plainly, one pixel at a time, what the compiled `flatten_layers` does at once for a whole picture.
 
