@@ -77,7 +77,7 @@ class LensCalibration:
     def _table(self, column: str) -> tuple[np.ndarray, np.ndarray]:
         pairs = [(row.stated_dioptre, getattr(row, column)) for row in self.rows if row.stated_dioptre is not None]
         if not pairs:
-            raise InputError("this lens calibration has no stated focus distances: its lens told none, so it serves no other stack")
+            raise InputError("expected a lens calibration with stated focus distances, got one without: it serves no other stack")
         stated, values = np.array(sorted(pairs)).T
         return stated, values
 
