@@ -134,9 +134,9 @@ def test_every_column_of_a_profile_is_one_pixel_high(dx: int, dy: int) -> None:
             downwards((dx, dy))
         return
     run = abs(downwards((dx, dy))[0])
-    for binary in (False, True):
+    for profile in (edge_profile, binary_profile):
         columns: dict[int, float] = {}
-        for (x, _), weight in edge_profile((dx, dy), binary).items():
+        for (x, _), weight in profile((dx, dy)).items():
             columns[x] = columns.get(x, 0.0) + weight
         assert len(columns) == run
         np.testing.assert_allclose(list(columns.values()), 1.0, atol=1e-12)
