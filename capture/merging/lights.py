@@ -70,7 +70,13 @@ class Lights:
         """Return some of the lights; the others are no lights any more."""
         number = np.concatenate([[0], np.where(kept, np.cumsum(kept), 0)]).astype(self.zone.dtype)
         zone = number[self.zone]
-        return Lights(zone, self.core & (zone > 0), self.sharpest[kept], self.focus_index[kept], self.areas_px[:, kept])
+        return Lights(
+            zone=zone,
+            core=self.core & (zone > 0),
+            sharpest=self.sharpest[kept],
+            focus_index=self.focus_index[kept],
+            areas_px=self.areas_px[:, kept],
+        )
 
     def slice_index(self) -> Int[np.ndarray, "height width"]:
         """(H, W): the sharpest slice of the light that reaches a pixel, -1 where none does."""
@@ -136,7 +142,7 @@ def _lights(spreads: "_Spreads", near: Int[np.ndarray, "height width"], distance
     for index in range(len(areas_px)):
         mine = owner == index
         core.ravel()[members[mine]] = spreads.over_range(index)[mine]
-    found = Lights(zone, core, sharpest, _between_slices(areas_px, seen, sharpest), areas_px)
+    found = Lights(zone=zone, core=core, sharpest=sharpest, focus_index=_between_slices(areas_px, seen, sharpest), areas_px=areas_px)
     return found.only(_grows(areas_px, peaks, seen))
 
 
@@ -149,13 +155,20 @@ def _grows(areas_px: np.ndarray, peaks: np.ndarray, seen: np.ndarray) -> Bool[np
 
 def no_lights(shape: tuple[int, ...]) -> Lights:
     nothing = np.zeros(0, np.int64)
-    return Lights(np.zeros(shape, np.int64), np.zeros(shape, bool), nothing, nothing.astype(np.float64), np.zeros((0, 0)))
+    return Lights(
+        zone=np.zeros(shape, np.int64),
+        core=np.zeros(shape, bool),
+        sharpest=nothing,
+        focus_index=nothing.astype(np.float64),
+        areas_px=np.zeros((0, 0)),
+    )
 
 
 def _between_slices(areas_px: np.ndarray, seen: np.ndarray, sharpest: Int[np.ndarray, " lights"]) -> PerLight:
-    """Return the index at which each light is in focus: the diameter grows evenly with the distance from there, so the area is a parabola of the index.
+    """Return the index at which each light is in focus.
 
-    Fitted to the slices within two of the sharpest one; kept within half a step of it.
+    The diameter of its disc grows evenly with the distance from there, so the area is a parabola of the index. Fitted
+    to the slices within two of the sharpest one; kept within half a step of it.
     """
     result = sharpest.astype(np.float64)
     for light, index in enumerate(sharpest):

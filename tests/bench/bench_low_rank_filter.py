@@ -83,12 +83,17 @@ def _one_size(picture: np.ndarray, diameter_px: float, gauss_ms: float) -> None:
     print(f"kernels of {kernel.shape[0]} px: full 2D {full_ms:.0f} ms; one kernel for all by filter2D: {fourier_ms:.0f} ms")
     for name, aperture in APERTURES.items():
         rank = int(np.argmax(aperture_errors(aperture, diameter_px) <= renderer.relative_error)) + 1
-        took_ms = _milliseconds(lambda chosen=aperture: renderer.spread(picture, even, chosen))
+        took_ms = _milliseconds(lambda chosen=aperture: renderer.sum_kernels(picture, even, chosen))
         _line(f"one diameter, {name}, rank {max(rank, 4)}", took_ms, full_ms, gauss_ms)
     eight = APERTURES["8 blades"]
-    _line("diameters +- 2 px, 8 blades", _milliseconds(lambda: renderer.spread(picture, sliced, eight)), full_ms, gauss_ms)
-    _line("tilt-shift, 8 blades, levels", _milliseconds(lambda: renderer.spread(picture, tilted, eight)), full_ms, gauss_ms)
-    _line("tilt-shift, 8 blades, paper's passes, rank 3", _milliseconds(lambda: paper.spread(picture, tilted, eight), 1), full_ms, gauss_ms)
+    _line("diameters +- 2 px, 8 blades", _milliseconds(lambda: renderer.sum_kernels(picture, sliced, eight)), full_ms, gauss_ms)
+    _line("tilt-shift, 8 blades, levels", _milliseconds(lambda: renderer.sum_kernels(picture, tilted, eight)), full_ms, gauss_ms)
+    _line(
+        "tilt-shift, 8 blades, paper's passes, rank 3",
+        _milliseconds(lambda: paper.sum_kernels(picture, tilted, eight), 1),
+        full_ms,
+        gauss_ms,
+    )
     rgb = np.ascontiguousarray(picture[..., :3])
     _line("tilt_shift() as a whole, rank 3", _milliseconds(lambda: tilt_shift(rgb, tilted, eight)), full_ms, gauss_ms)
 

@@ -75,7 +75,7 @@ def spread_rows() -> None:
     for largest_px in (40.0, 121.0, 400.0):
         coc_px, renderer = diameters_px(FULL_HD, largest_px), PolygonDifferences()
         took_ms[largest_px] = row(
-            f"1920x1080, octagon, to {largest_px:g} px", lambda c=coc_px, r=renderer: r.spread(values, c, OCTAGON), values
+            f"1920x1080, octagon, to {largest_px:g} px", lambda c=coc_px, r=renderer: r.sum_kernels(values, c, OCTAGON), values
         )
     print(f"{'the largest over the smallest of these':<68} {took_ms[400.0] / took_ms[40.0]:8.2f}")
     coc_px = diameters_px(FULL_HD, 121.0)
@@ -84,7 +84,7 @@ def spread_rows() -> None:
         ("disc of 16 edges", Aperture.disc(), values),
     ):
         renderer = PolygonDifferences()
-        row(f"1920x1080, {name}, to 121 px", lambda a=aperture, v=light, r=renderer: r.spread(v, coc_px, a), light)
+        row(f"1920x1080, {name}, to 121 px", lambda a=aperture, v=light, r=renderer: r.sum_kernels(v, coc_px, a), light)
 
 
 def render_row() -> None:
@@ -102,7 +102,7 @@ def render_row() -> None:
 
     def timed(*arguments: np.ndarray) -> np.ndarray:
         started_s = time.perf_counter()
-        result = PolygonDifferences.spread(renderer, *arguments)
+        result = PolygonDifferences.sum_kernels(renderer, *arguments)
         spreads_ms.append(1e3 * (time.perf_counter() - started_s))
         return result
 
@@ -143,7 +143,7 @@ def print_peak() -> None:
 
     values, coc_px = frame(ULTRA_HD), diameters_px(ULTRA_HD, 400.0)
     before_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    PolygonDifferences(precision="double").spread(values, coc_px, OCTAGON)
+    PolygonDifferences(precision="double").sum_kernels(values, coc_px, OCTAGON)
     print(before_mb, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)
 
 
@@ -152,7 +152,7 @@ def main() -> None:
     spread_rows()
     render_row()
     values, coc_px, renderer = frame(FULL_HD), np.full(FULL_HD, 2.0 * GEGL_RADIUS_PX, np.float32), PolygonDifferences()
-    gegl_row(row("1920x1080, octagon, 128 px for all pixels", lambda: renderer.spread(values, coc_px, OCTAGON), values))
+    gegl_row(row("1920x1080, octagon, 128 px for all pixels", lambda: renderer.sum_kernels(values, coc_px, OCTAGON), values))
     memory_row()
     print(machine_line())
 

@@ -1,8 +1,8 @@
 """Real focus stacks from strangers' cameras: `python -m tests.bench.bench_real DATA --out PAGE.html`.
 
 Every stack and pair in DATA goes through `mrbokeh capture` with no option set, each command a process of its own. Measured, without truth
-(capture.report.picture_sharpness): lost, the share of textured blocks with less than 60 % of the detail of their sharpest slice; flat, how much flat
-blocks are raised by seams and noise; top, the largest value over that of the slices. The same of FocusWeave and of enfuse after
+(capture.report.picture_sharpness): lost, the share of textured blocks with less than 60 % of the detail of their sharpest slice; flat, how
+much flat blocks are raised by seams and noise; top, the largest value over that of the slices. The same of FocusWeave and of enfuse after
 align_image_stack where they are installed (on the path, or where FOCUSWEAVE, ENFUSE and ALIGN_IMAGE_STACK say), CPU seconds and memory of
 all, slices left out and made again by refocusing, focus positions beside stated ones, and the rank of fused pairs among published methods.
 

@@ -64,7 +64,7 @@ def in_front(size: int) -> Sheet:
 
 
 def by_the_cpu(renderer: LaplacianSpreadlets, sheets: list[Sheet]) -> np.ndarray:
-    front, back = (renderer.spread_bank(values, coc_px, Place(motion_px=motion)) for values, coc_px, motion in sheets)
+    front, back = (renderer.sum_bank_kernels(values, coc_px, Place(motion_px=motion)) for values, coc_px, motion in sheets)
     return front + (1.0 - np.clip(front[..., 3:], 0.0, 1.0)) * back
 
 
@@ -80,7 +80,7 @@ def picture_rows(device_name: str, size: int) -> None:
     print(f"{len(bank.kernels)} kernels of up to {2 * bank.radius_px + 1} px; first picture {first_s:.1f} s, with points to be found")
     with torch.inference_mode():
         took_ms = milliseconds(lambda: on_device.picture(layers), device)
-        each_ms = [milliseconds(lambda layer=layer: on_device.spread(layer), device) for layer in layers]
+        each_ms = [milliseconds(lambda layer=layer: on_device.sum_kernels(layer), device) for layer in layers]
     cpu_ms = milliseconds(lambda: by_the_cpu(cpu, sheets), torch.device("cpu"))
     print(f"two layers of {size} x {size} to a picture: {took_ms:.1f} ms (in front {each_ms[0]:.1f}, behind {each_ms[1]:.1f})")
     print(f"  the compiled renderer on all cores ({os.cpu_count()}): {cpu_ms:.0f} ms, {cpu_ms / took_ms:.2f} times as long")

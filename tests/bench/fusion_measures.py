@@ -2,7 +2,7 @@
 
 Each takes two sources and the fused picture, grey, 0 to 255, and is larger for a better fusion. They were chosen and compared by Z. Liu et
 al., "Objective Assessment of Multiresolution Image Fusion Algorithms for Context Enhancement in Night Vision", TPAMI 34(1), 2012. Where a
-paper leaves a constant open, the one is taken that gives the values published for the Lytro pairs (`python -m tests.bench.bench_real` compares).
+paper leaves a constant open, the one is taken that gives the values published for the Lytro pairs (tests.bench.bench_real compares).
 """
 
 from dataclasses import dataclass

@@ -6,14 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.compositing.plate_look.lensfun_falloff import CameraAndLens, lensfun_falloff
 from mrbokeh.compositing.plate_look.vignetting import (
+    CameraAndLens,
     FlatField,
     RadialFalloff,
     Vignetting,
     darkened,
     falloff_at,
     flat_field_of,
+    lensfun_falloff,
     read_flat_field,
 )
 from mrbokeh.images.image_io import write_image

@@ -44,13 +44,13 @@ def address(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 def address_in(told: Path) -> str:
-    def is_told() -> bool:
+    def can_tell() -> bool:
         try:
             return "address" in json.loads(told.read_text(encoding="utf-8"))
         except (OSError, ValueError):
             return False
 
-    wait_for(is_told)
+    wait_for(can_tell)
     address = str(json.loads(told.read_text(encoding="utf-8"))["address"])
     with distributed.Client(address, timeout=60, set_as_default=False) as client:
         client.wait_for_workers(2, timeout=60)

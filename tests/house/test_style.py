@@ -40,8 +40,8 @@ def test_docstrings_begin_with_a_verb_or_a_noun() -> None:
 
 
 def test_constructors_with_many_arguments_are_called_by_keyword() -> None:
-    """Compiled kernels are left out: numba's named tuples are built in place there."""
-    classes = {node.name for _, node in nodes() if isinstance(node, ast.ClassDef)}
+    """Compiled kernels are left out: numba's named tuples are built in place there. `Table` is rich's, which lists its columns."""
+    classes = {node.name for _, node in nodes() if isinstance(node, ast.ClassDef)} - {"Table"}
     calls = ((path, node) for path, node in nodes() if isinstance(node, ast.Call) and not path.stem.endswith("_numba"))
     named = ((path, node, node.func.id) for path, node in calls if isinstance(node.func, ast.Name))
     assert not [place(path, node, name) for path, node, name in named if name in classes and len(node.args) > MOST_POSITIONAL]

@@ -385,17 +385,13 @@ def test_near_and_far_are_turned_by_one_word(known: FocalStack, tmp_path: Path, 
 
 
 def test_what_was_preferred_turns_with_near_and_far(guessed: FocalStack, run: Run) -> None:
-    """And words of merges of former versions, which stated the guess as part of why metres are guessed, go."""
     record = {"side": "near", "share": 0.1, "first_is_near": True, "sure": False}
-    why = "no focus distance is stated: the nearest plane of focus is put at 1 m; that the first slice is the nearest is a guess"
-    facts = guessed.metadata["metres"] | {"why": why}
     positions = tuple(replace(each, metadata=each.metadata | {SLICE_POSITION: 3.0}) for each in guessed.slices)
-    write_focal_stack(replace(guessed, slices=positions, metadata=guessed.metadata | {"metres": facts, PREFERRED: record}))
+    write_focal_stack(replace(guessed, slices=positions, metadata=guessed.metadata | {PREFERRED: record}))
     for nearest, side in (("first", "near"), ("last", "far")):
         run("capture", "scale", guessed.folder, "--nearest", nearest)
         made = read_focal_stack(guessed.folder)
         assert made.metadata[PREFERRED] == record | {"side": side, "first_is_near": side == "near", "sure": True}
-        assert made.metadata["metres"]["why"].endswith("put at 1 m")
     assert made.slices[0].metadata[SLICE_POSITION] == -3.0
 
 

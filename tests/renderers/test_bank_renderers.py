@@ -86,7 +86,7 @@ def test_the_plain_twin_is_the_sum_of_kernels_of_the_bank() -> None:
     place = Place(field_xy=np.ascontiguousarray(where))
     of_bank = ScatterReference(bank=rings)._of_bank
     assert of_bank is not None
-    spread = of_bank.sum_kernels(values, np.full((33, 33), coc_px, np.float32), place)
+    spread = of_bank.sum_bank_kernels(values, np.full((33, 33), coc_px, np.float32), place)
     kernel = rings.kernel_at(np.array([coc_px, 2.0 / 3.0 * HIGHS[0], 0.0]))[..., 0]
     border = (33 - len(kernel)) // 2
     np.testing.assert_allclose(spread[..., 1], np.pad(kernel, border), atol=2e-6)
@@ -166,7 +166,7 @@ def test_a_symmetric_bank_is_turned_with_the_field(symmetric: PsfBank) -> None:
     expected = np.rot90(symmetric.kernel_at(np.array([coc_px[0, 0], 0.5]))[..., 0], -1)
     for name, least in (("scatter", 90.0), ("polygon", 34.0), ("low-rank", 38.0)):
         of_bank = renderers(symmetric)[name]._of_bank
-        seen = of_bank.sum_kernels(values, coc_px, Place(field_xy=down))[..., 1]
+        seen = of_bank.sum_bank_kernels(values, coc_px, Place(field_xy=down))[..., 1]
         assert psnr(seen / expected.max(), np.pad(expected, (33 - len(expected)) // 2) / expected.max()) > least, name
 
 

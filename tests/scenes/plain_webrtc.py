@@ -1,4 +1,4 @@
-"""The peer of tests/bench/bench_viewfinder.py: a video file sent as aiortc sends it, with an encoder for each viewer and nothing laid over."""
+"""The peer of tests/bench/bench_viewfinder.py: a video file sent as aiortc sends it, an encoder for each viewer, nothing laid over."""
 
 import asyncio
 import json

@@ -8,7 +8,7 @@ import pytest
 
 from capture.dense._guided_numba import aggregate
 from capture.dense.dense_depth import DenseSettings, dense_depth, halvings, level_sizes
-from capture.dense.depth_priors import DepthPriors, Consistency, FocusVote, SparseDepths, ViewDepth, consistency
+from capture.dense.depth_priors import Consistency, DepthPriors, FocusVote, SparseDepths, ViewDepth, consistency
 from capture.dense.finish import FILLED, FOCUS, SWEEP, DenseDepth, sweep_trust, with_consistency
 from capture.dense.guided_depth import (
     Penalties,
@@ -18,7 +18,7 @@ from capture.dense.guided_depth import (
     smooth,
     weighted_medians,
 )
-from capture.dense.patch_match import on_original_pixels, patch_match_prior, patch_match_obstacle
+from capture.dense.patch_match import on_original_pixels, patch_match_obstacle, patch_match_prior
 from capture.dense.sweep_view import SweepView
 from mrbokeh.optics.camera import Camera
 from tests.scenes.dense_references import aggregate_reference, weighted_medians_reference

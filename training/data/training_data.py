@@ -122,7 +122,7 @@ def gather_facts(pairs: PairSet, several_lenses: bool = False) -> DataFacts:
         counted = np.abs(piece.coc_px)[piece.weight > 0]
         largest_coc_px = max(largest_coc_px, float(counted.max(initial=0.0)))
         largest_radiance = max(largest_radiance, float(piece.all_in_focus.max()), float(piece.target.max()))
-    return DataFacts(lens, size[1], size[0], largest_coc_px, largest_radiance, *lens_ranges(pairs.stacks))
+    return _facts(lens, size, (largest_coc_px, largest_radiance), pairs.stacks)
 
 
 def manifest_facts(dataset: FocalStackDataset, stacks: Sequence[FocalStack], several_lenses: bool = False) -> DataFacts:
@@ -131,7 +131,21 @@ def manifest_facts(dataset: FocalStackDataset, stacks: Sequence[FocalStack], sev
     for record in dataset.stacks:
         _require_same_size(record.name, size, (record.height_px, record.width_px))
     lens = lens_of_stacks(stacks, several_lenses)
-    return DataFacts(lens, size[1], size[0], dataset.largest_coc_px, dataset.radiance_scale, *lens_ranges(stacks))
+    return _facts(lens, size, (dataset.largest_coc_px, dataset.radiance_scale), stacks)
+
+
+def _facts(lens: Lens, size: tuple[int, int], largest: tuple[float, float], stacks: Sequence[FocalStack]) -> DataFacts:
+    """Return the facts. size: (rows, columns). largest: circle of confusion in pixels, radiance."""
+    f_numbers, focal_lengths_mm = lens_ranges(stacks)
+    return DataFacts(
+        lens=lens,
+        width_px=size[1],
+        height_px=size[0],
+        largest_coc_px=largest[0],
+        radiance_scale=largest[1],
+        f_numbers=f_numbers,
+        focal_lengths_mm=focal_lengths_mm,
+    )
 
 
 def lens_ranges(stacks: Sequence[FocalStack]) -> tuple[tuple[float, float], tuple[float, float]]:

@@ -118,7 +118,9 @@ class Record:
         """Append a point to the curve."""
         progress = self._progress
         elapsed_s, rate = round(progress.elapsed_s, 2), self._learner.learning_rate
-        progress.curve.append(CurvePoint(progress.step, elapsed_s, progress.smoothed_loss, psnr_db, rate))
+        progress.curve.append(
+            CurvePoint(step=progress.step, elapsed_s=elapsed_s, loss=progress.smoothed_loss, held_out_psnr_db=psnr_db, learning_rate=rate)
+        )
 
     def note_if_due(self, done: float) -> None:
         """Append a point to the curve for every part of the budget; done: the used fraction of it."""

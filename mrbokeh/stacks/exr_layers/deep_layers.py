@@ -119,7 +119,15 @@ def _from_part(path: Path, part: Any, metres_per_unit: float) -> DeepSamples:
     back_m = np.maximum(values["ZBack"].astype(np.float64) * metres_per_unit, front_m) if "ZBack" in values else front_m
     alpha = values["A"].astype(np.float32)
     _check(path, np.isfinite(rgb).all(axis=1) & np.isfinite(alpha) & (front_m > 0) & ~np.isnan(back_m))
-    return DeepSamples(*size, _starts(counts.ravel()), in_rec709(rgb, part.header.get(ATTRIBUTE), path), alpha, front_m, back_m)
+    return DeepSamples(
+        height_px=size[0],
+        width_px=size[1],
+        starts=_starts(counts.ravel()),
+        rgb=in_rec709(rgb, part.header.get(ATTRIBUTE), path),
+        alpha=alpha,
+        front_m=front_m,
+        back_m=back_m,
+    )
 
 
 def _windows(header: Any) -> tuple[tuple[int, int], tuple[slice, slice], tuple[slice, slice]]:
