@@ -68,7 +68,8 @@ class Laid(NamedTuple):
 
         offsets = (FOUR * (points.xy[:, 1] * width + points.xy[:, 0])).astype(np.int32)
         weights = _sums_before(points) if precision is np.int32 else points.weights.astype(precision)
-        return cls(offsets, weights, *rows_of(points.xy, points.starts, points.reach_px), points.reach_px)
+        rows, apart = rows_of(points.xy, points.starts, points.reach_px)
+        return cls(offsets=offsets, weights=weights, rows=rows, apart=apart, reach_px=points.reach_px)
 
 
 def gains_for(largest: Float32[np.ndarray, " channels"], points: Points) -> Float32[np.ndarray, " lanes"]:
