@@ -27,6 +27,8 @@ PLAIN = (0.4, 0.6)
 WIDER_SIGMA = 2.5
 WIDER_NOISE_FLOORS = 10.0
 WIDER_FROM_PX = 0.7e6
+# Of two slices a place's own weak detail tells more: mean rank 2.5 of 36 methods on 20 pairs without windows, 4.6 with them.
+FEWEST_SLICES_FOR_WIDER = 3
 # In plain places, detail is the rim of a blur where the light of its slice differs by RIM_LIGHT or more (square roots, 255 at white) from
 # that of the slice in which the surroundings are sharp. It has half its say where it is RIM_STRENGTH times the detail around it.
 RIM_LIGHT = 5.0
@@ -141,7 +143,7 @@ def _without_rims(energies: Volume, lights: UInt8[np.ndarray, "slices height wid
 
 def _costs(energies: Volume, plain: Plane) -> Volume:
     """Return how many e-folds the energy of each slice is below the strongest, times the say of the pixel, then of wider windows."""
-    wider = [_wider(energies, shrink) for shrink in WIDER]
+    wider = [_wider(energies, shrink) for shrink in WIDER] if len(energies) >= FEWEST_SLICES_FOR_WIDER else []
     say = share_above(energies.max(axis=0), LABELLING_NOISE_FLOORS)
     costs = _below_strongest(np.log1p(energies, out=energies))
     costs *= say
