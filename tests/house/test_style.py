@@ -17,12 +17,8 @@ COMMANDS = re.compile(r"(command|callback|main)")
 
 
 @cache
-def tree_of(path: Path) -> ast.Module:
-    return ast.parse(path.read_text(encoding="utf-8"))
-
-
-def nodes() -> Iterator[tuple[Path, ast.AST]]:
-    yield from ((path, node) for path in FILES for node in ast.walk(tree_of(path)))
+def nodes() -> list[tuple[Path, ast.AST]]:
+    return [(path, node) for path in FILES for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))]
 
 
 def functions() -> Iterator[tuple[Path, ast.FunctionDef]]:
