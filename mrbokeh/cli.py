@@ -1,10 +1,12 @@
 """`mrbokeh`: one typer app; the package behind a sub-command is imported when it is called, not before."""
 
+import errno
 import os
 import signal
 import sys
 import tempfile
 import traceback
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from types import FrameType
@@ -127,19 +129,25 @@ def _mistake(error: Exception) -> str:
     if isinstance(error, ModuleNotFoundError):
         extra = EXTRA_OF_MODULE.get((error.name or "").partition(".")[0])
         return str(MissingExtraError(str(error.name), extra)) if extra else ""
+    if isinstance(error, MemoryError):
+        return "there is not enough memory for this: use smaller pictures (--max-width where there is one) or fewer at once"
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return "there is no space left where this was written, or in the temporary folder: free some and run the same command again"
     if isinstance(error, OSError) and isinstance(error.filename, str | bytes):
         return _refused(error)
     return ""
 
 
 def _fault(error: Exception) -> str:
-    """Keep the traceback in a file and return what to do with it."""
-    with tempfile.NamedTemporaryFile("w", prefix="mrbokeh-fault-", suffix=".txt", delete=False, encoding="utf-8") as file:
-        file.write(" ".join(sys.argv) + "\n\n" + "".join(traceback.format_exception(error)))
+    """Keep the traceback in a file, where one can be written, and return what to do with it."""
+    kept, text = "`mrbokeh --debug ...`", " ".join(sys.argv) + "\n\n" + "".join(traceback.format_exception(error))
+    with suppress(OSError), tempfile.NamedTemporaryFile("wb", prefix="mrbokeh-fault-", suffix=".txt", delete=False) as file:
+        file.write(text.encode("utf-8", "backslashreplace"))
+        kept = file.name
     first = (str(error).splitlines() or [""])[0]
     return (
         f"this is a fault of mrbokeh ({type(error).__name__}{': ' + first if first else ''}). "
-        f"Please report it with {file.name}; `mrbokeh --debug ...` shows it here"
+        f"Please report it with {kept}; `mrbokeh --debug ...` shows it here"
     )
 
 

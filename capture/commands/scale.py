@@ -75,9 +75,13 @@ def scale_command(
             "--no-calibrate": not calibrate,
         }
         if given := [name for name, value in of_scenes.items() if value is not None and value is not False]:
-            raise InputError(f"--ruler, --distance-at and --nearest are for one stack, {', '.join(given)} for a scene: choose")
+            raise InputError(
+                f"--ruler, --distance-at and --nearest are for one stack, but {', '.join(given)} is for a whole scene: give one kind"
+            )
         if overwrite and not (ruler or distance_at):
-            raise InputError("--overwrite drops lengths and distances told before, in favour of new ones: --nearest alone needs none")
+            raise InputError(
+                "--overwrite replaces earlier lengths: add --ruler or --distance-at, or leave it out; --nearest works without it"
+            )
         _tell(scene, ruler or [], distance_at or [], nearest, overwrite)
         return
     if lens_calibration is not None:

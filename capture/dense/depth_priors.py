@@ -1,4 +1,4 @@
-"""Priors on a viewpoint's depth beside its neighbours' pictures: focus, depths at single points, and finished depths of other views.
+"""Priors on a viewpoint's depth besides its neighbours' pictures: focus, depths at single points, and finished depths of other views.
 
 Focus votes on the planes of a sweep. It is metric and sees what only one view sees, but it is coarse, and wrong around highlights,
 where the rim of a highlight's disc outweighs the scene. So it votes only if its peak lies between slices, is sharp and above the

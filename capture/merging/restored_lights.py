@@ -53,8 +53,9 @@ USUAL_RADIUS_PX = 1.0
 USUAL_WEIGHT = 10.0
 SUBPIXELS = 8
 MARGIN_PX = 3
-# A light or the disc of a lens (a cat-eye) is an ellipse where its axes differ at least by this factor, and at most by the larger.
-ELONGATIONS = (1.2, 4.0)
+# A light or the disc of a lens (a cat-eye) is an ellipse where its axes differ at least by this factor. Discs of a lens are measured within
+# a circle, which cuts longer ones off (5 % of the flux at 1.8, 15 % at 3).
+LEAST_ELONGATION, LARGEST_OF_LIGHTS, LARGEST_OF_LENSES = 1.2, 4.0, 1.8
 PIXEL_VARIANCE_PX2 = 1.0 / 12.0
 
 
@@ -149,7 +150,8 @@ class Discs:
             return np.eye(2)
         beyond = self.covariance_px2[wide] - self.covariance_px2[sharpest]
         weight = np.maximum(np.trace(beyond, axis1=1, axis2=2), 0.0)
-        return ellipse_of((weight[:, None, None] * beyond).sum(axis=0))
+        shape = (weight[:, None, None] * beyond).sum(axis=0)
+        return ellipse_of(shape, LARGEST_OF_LENSES) if np.linalg.eigvalsh(shape)[0] > 0 else np.eye(2)
 
     @property
     def believable(self) -> Bool[np.ndarray, " slices"]:
@@ -174,13 +176,16 @@ def measured_discs(patches: Patches, zone: Mask, centre_px: Float[np.ndarray, "2
     )
 
 
-def ellipse_of(covariance_px2: Matrix) -> Matrix:
-    """Return the symmetric matrix that turns a disc into the ellipse of this shape and the same area; the identity if it is about round."""
+def ellipse_of(covariance_px2: Matrix, largest: float) -> Matrix:
+    """Return the symmetric matrix that turns a disc into the ellipse of this shape and the same area; the identity if it is about round.
+
+    largest: ratio of the axes. A shape without any width has it.
+    """
     variances, axes = np.linalg.eigh(covariance_px2)
     ratio = float(np.sqrt(variances[1] / variances[0])) if variances[0] > 0 else np.inf
-    if ratio < ELONGATIONS[0] or variances[1] <= 0:
+    if ratio < LEAST_ELONGATION or variances[1] <= 0:
         return np.eye(2)
-    stretch = np.sqrt(min(ratio, ELONGATIONS[1]))
+    stretch = np.sqrt(min(ratio, largest))
     return np.asarray(axes @ np.diag([1.0 / stretch, stretch]) @ axes.T)
 
 
@@ -351,7 +356,7 @@ def _fitting_disc(
     light = np.where(near, np.maximum(unsaturated - surroundings, 0.0).sum(axis=2), 0.0)
     y, x = np.mgrid[: seen.shape[0], : seen.shape[1]] + 0.5
     _, covariance = _moments(np.where(light > 0.5 * light.max(), light, 0.0), x, y)
-    elongated = ellipse_of(covariance - PIXEL_VARIANCE_PX2 * np.eye(2))
+    elongated = ellipse_of(covariance - PIXEL_VARIANCE_PX2 * np.eye(2), LARGEST_OF_LIGHTS)
 
     def miss(drawn: Float[np.ndarray, "height width"], radius_px: float) -> float:
         expected = np.minimum(surroundings + drawn[near][:, None] * flux, OVER_RANGE)

@@ -63,7 +63,7 @@ class Values:
             raise InputError(f"{self.where}: expected an object {{...}}, got {self.document!r}")
         missing, unknown = sorted(set(self.required) - set(self.document)), sorted(set(self.document) - set(self.known))
         if missing:
-            raise InputError(f"{self.where} is incomplete: {', '.join(missing)} missing; compare with one of `mrbokeh lens new`")
+            raise InputError(f"{self.where} is incomplete: {', '.join(missing)} missing; compare with a file made by `mrbokeh lens new`")
         if unknown:
             raise InputError(
                 f"{self.where}: nothing knows the key {', '.join(map(repr, unknown))}; the keys are {', '.join(sorted(self.known))}"

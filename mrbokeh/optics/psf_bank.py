@@ -185,7 +185,7 @@ def check_space(axes: tuple[Axis, ...], counts: tuple[int, ...], nested: bool, t
     """Refuse axes, counts and turns that make no space of PSFs."""
     names = [axis.name for axis in axes]
     if not axes or len(axes) != len(counts) or len(set(names)) != len(names):
-        raise InputError(f"a bank needs different axes and a count for each, got {names} and {counts}")
+        raise InputError(f"each axis of a bank must appear once and have one count, got {names} and {counts}")
     if nested and any(axis.is_signed for axis in axes):
         raise InputError("a bank over signed coordinates needs a regular grid (nested=False): a nested one is fine at one end only")
     if turns not in get_args(Turns):

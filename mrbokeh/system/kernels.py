@@ -30,7 +30,14 @@ _config: Any = numba.config
 KEPT_UNUSED_DAYS = 60
 """Kernels of sources that nothing has loaded for so long are removed when new ones are written."""
 
+OURS = ("mrbokeh", "capture", "training", "viewfinder", "datasets_scripts")
+"""Packages whose modules count into the hash of a kernel that imports them, beside its own."""
+LONGEST_WAIT_S = 300.0
+"""A process that was stopped while it compiled does not hold up others for ever."""
+
+_STARTED_S = time.time()
 _DAY_S = 86400.0
+_LOOK_S = 0.02
 _IMPORT = re.compile(r"^[ \t]*(?:from[ \t]+([\w.]+)[ \t]+import[ \t]+(\([^)]*\)|[^\n]*)|import[ \t]+([^\n]+))", re.MULTILINE)
 
 
@@ -52,7 +59,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 def fingerprint(file: Path, module: str) -> str | None:
     """Return the hash of a module, of all of ours that it imports and of the compiler's versions; None where a source is not at hand."""
     root = file.resolve().parents[module.count(".")]
-    if root / _path_of(module) != file.resolve():
+    if root / _path_of(module) != file.resolve() or not file.is_file():
         return None
     sources = sorted(_with_imported(root, module))
     versions = f"{numba.__version__} {llvmlite.__version__} {np.__version__} {sys.version_info[:2]}"
@@ -72,8 +79,8 @@ def forget_unused(folder: Path) -> None:
 class _KernelLocator(_CacheLocator):  # type: ignore[misc]
     """Place of the kernels of a module, for numba; what they depend on is in the name of the folder."""
 
-    def __init__(self, folder: Path, line: int) -> None:
-        self._folder, self._line = folder, line
+    def __init__(self, folder: Path, py_file: str, line: int) -> None:
+        self._folder, self._py_file, self._line = folder, py_file, line
 
     def get_cache_path(self) -> str:
         return str(self._folder)
@@ -87,7 +94,7 @@ class _KernelLocator(_CacheLocator):  # type: ignore[misc]
     @classmethod
     def from_function(cls, py_func: Callable[..., Any], py_file: str) -> "_KernelLocator | None":
         folder = _folder(Path(py_file), py_func.__module__)
-        return cls(folder, py_func.__code__.co_firstlineno) if folder else None
+        return cls(folder, py_file, py_func.__code__.co_firstlineno) if folder else None
 
 
 class _KernelCacheImpl(CompileResultCacheImpl):  # type: ignore[misc]
@@ -95,9 +102,17 @@ class _KernelCacheImpl(CompileResultCacheImpl):  # type: ignore[misc]
 
 
 class _KernelCache(FunctionCache):  # type: ignore[misc]
-    """numba's cache of a kernel's signatures; a full disk costs time and not the picture."""
+    """numba's cache of a kernel's signatures; a full disk or a damaged file costs time and not the picture."""
 
     _impl_class = _KernelCacheImpl
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # what unpickling a damaged file raises is anything
+            with suppress(OSError):
+                self.flush()
+            return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         with suppress(OSError):
@@ -106,9 +121,12 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]
 
 @cache
 def _folder(file: Path, module: str) -> Path | None:
-    """Return the folder of a module's kernels, marked as used today; None where nothing can be written or the source is not at hand."""
+    """Return the folder of a module's kernels, marked as used today; None where nothing can be written or the source is not at hand.
+
+    Sources that were changed since this process began may not be what it has loaded: their kernels are not kept.
+    """
     base, name = _writable_base(), fingerprint(file, module)
-    if base is None or name is None:
+    if base is None or name is None or _newest_s(file, module) > _STARTED_S:
         return None
     folder = base / name
     with suppress(OSError):
@@ -149,14 +167,28 @@ def _once_at_a_time(compile_one: Callable[[Any], Any], known: Any, lock: Path) -
     return compile_or_wait
 
 
+_HELD: set[Path] = set()
+"""Locks of this process, guarded by numba's own: a kernel that needs itself while it is compiled does not wait for itself."""
+
+
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
-    """Hold a file locked against other processes, where the system and the file system can do that."""
+    """Hold a file locked against other processes, where the system and the file system can do that, or go on after LONGEST_WAIT_S."""
+    if path in _HELD:
+        yield
+        return
     with ExitStack() as held:
         with suppress(ImportError, OSError):
             import fcntl
 
-            fcntl.flock(held.enter_context(path.open("a")), fcntl.LOCK_EX)
+            file, until_s = held.enter_context(path.open("a")), time.monotonic() + LONGEST_WAIT_S
+            while time.monotonic() < until_s:
+                with suppress(BlockingIOError):
+                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    break
+                time.sleep(_LOOK_S)
+        _HELD.add(path)
+        held.callback(_HELD.discard, path)
         yield
 
 
@@ -180,7 +212,8 @@ def _imported(root: Path, module: str) -> frozenset[str]:
     for source, members, plain in _IMPORT.findall(_text_of(root, module)):
         words = re.findall(r"[\w.]+", re.sub(r"#[^\n]*|\bas\s+\w+", "", members or plain))
         names.update([source, *(f"{source}.{word}" for word in words)] if source else words)
-    return frozenset(name for name in names if _text_of(root, name))
+    ours = {*OURS, module.partition(".")[0]}
+    return frozenset(name for name in names if name.partition(".")[0] in ours and _text_of(root, name))
 
 
 def _with_imported(root: Path, module: str) -> set[str]:
@@ -192,3 +225,10 @@ def _with_imported(root: Path, module: str) -> set[str]:
             found.add(name)
             waiting.extend(_imported(root, name))
     return found
+
+
+def _newest_s(file: Path, module: str) -> float:
+    """Return when the last of a module and all that it imports was changed, in seconds since the epoch."""
+    root = file.resolve().parents[module.count(".")]
+    paths = (root / _path_of(name) for name in _with_imported(root, module))
+    return max((path.stat().st_mtime for path in paths if path.is_file()), default=0.0)

@@ -156,3 +156,18 @@ def test_a_fault_of_ours_is_one_sentence_with_its_traceback_in_a_file(
     monkeypatch.setattr(sys, "argv", ["mrbokeh", "--debug", "render"])
     with pytest.raises(ZeroDivisionError):
         main()
+
+
+@pytest.mark.parametrize(
+    ("error", "said"), [(OSError(28, "No space left on device"), "no space left"), (MemoryError(), "not enough memory")]
+)
+def test_a_full_disk_and_a_full_memory_are_no_faults_of_ours(
+    error: Exception, said: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full() -> None:
+        raise error
+
+    monkeypatch.setattr("mrbokeh.cli.app", full)
+    with pytest.raises(SystemExit) as stop:
+        main()
+    assert stop.value.code == 2 and said in capsys.readouterr().err

@@ -61,6 +61,30 @@ def test_a_second_checkout_finds_what_the_first_compiled_and_a_changed_callee_is
     checkout(tmp_path / "b", factor=5)
     assert answer(start(second, cache))["value"] == 10.0
     assert answer(start(first, cache)) == {"value": 6.0, "compiled": 0, "hits": 1}
+    # A damaged file costs time: everything is compiled anew, once.
+    for path in cache.rglob("*.nb[ci]"):
+        path.write_bytes(b"")
+    assert answer(start(first, cache))["value"] == 6.0
+    assert answer(start(first, cache)) == {"value": 6.0, "compiled": 0, "hits": 1}
+
+
+def test_sources_changed_since_the_process_began_are_not_kept(tmp_path: Path) -> None:
+    """What this process has loaded may be the text of before."""
+    caller = checkout(tmp_path / "a") / "room/caller_numba.py"
+    assert kernels._folder(caller, "room.caller_numba") is None
+    for path in caller.parent.iterdir():
+        os.utime(path, (time.time() - 86400,) * 2)
+    kernels._folder.cache_clear()
+    assert kernels._folder(caller, "room.caller_numba") is not None
+
+
+def test_a_lock_that_another_process_never_gives_back_is_waited_for_only_so_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fcntl = pytest.importorskip("fcntl")
+    monkeypatch.setattr(kernels, "LONGEST_WAIT_S", 0.1)
+    with (tmp_path / "lock").open("a") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        with kernels._locked(tmp_path / "lock"), kernels._locked(tmp_path / "lock"):
+            pass  # and a kernel that needs itself does not wait for itself
 
 
 def test_a_kernel_depends_on_its_module_and_on_what_that_imports_alone(tmp_path: Path) -> None:

@@ -255,7 +255,7 @@ def test_too_few_and_contradicting_views_are_refused() -> None:
     with pytest.raises(InputError, match="disagree by"):
         calibrated(VIEWS, 16, wrong_deg=6.0)
     # Nobody stands still: each view lasts 0.3 s.
-    with pytest.raises(InputError, match="got 0: show both the board longer"):
+    with pytest.raises(InputError, match="got 0: show both the board for longer"):
         calibrated(VIEWS, 3)
 
 

@@ -452,9 +452,9 @@ def test_what_cannot_be_told_is_refused(known: FocalStack, guessed: FocalStack, 
         (guessed.folder, ("--ruler", "9,9,20,9"), "--ruler: expected"),
         (guessed.folder, ("--distance-at", "9,9,-1"), "--distance-at: expected"),
         (guessed.folder, ("--distance-at", "99,9,1"), "outside the picture of 72x48"),
-        (guessed.folder, ("--distance-at", "9,9,1", "--distance", "a,b,1"), "--distance for a scene: choose"),
-        (guessed.folder, ("--distance-at", "9,9,1", "--square-mm", 30, "--marker-mm", 22), "--square-mm, --marker-mm for a scene: choose"),
-        (guessed.folder, ("--nearest", "last", "--no-calibrate"), "--no-calibrate for a scene: choose"),
+        (guessed.folder, ("--distance-at", "9,9,1", "--distance", "a,b,1"), "--distance is for a whole scene"),
+        (guessed.folder, ("--distance-at", "9,9,1", "--square-mm", 30, "--marker-mm", 22), "--square-mm, --marker-mm is for a whole scene"),
+        (guessed.folder, ("--nearest", "last", "--no-calibrate"), "--no-calibrate is for a whole scene"),
         (guessed.folder, ("--nearest", "last", "--overwrite"), "--nearest alone needs none"),
     ):
         with pytest.raises(AssertionError, match=match):
@@ -509,7 +509,7 @@ def test_a_slice_stated_at_infinity_stays_there_and_one_fact_gives_the_rest(tmp_
     assert made.metres_known and "how deep the scene is" not in told
     for index in range(3):
         np.testing.assert_allclose(made.coc_px(index, made.depth_m()), known.coc_px(index, known.depth_m()), atol=1e-3)
-    with pytest.raises(AssertionError, match="knows its nearest slice from its distances"):
+    with pytest.raises(AssertionError, match="which slice is nearest is already known"):
         run("capture", "scale", twin.folder, "--nearest", "last")
 
 

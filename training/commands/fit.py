@@ -124,7 +124,7 @@ def _summary(progress: "Progress") -> str:
     if looks:
         said += f", held-out slices {looks[-1]:.2f} dB"
     if progress.stopped_early:
-        said += f"; stopped early, for nothing was better in {progress.looks_since_best} looks"
+        said += f"; stopped early: no improvement in the last {progress.looks_since_best} evaluations"
     if looks and progress.kept_step != progress.step:
         said += f"; kept the weights of step {progress.kept_step}, {progress.best_psnr_db:.2f} dB"
     return said

@@ -80,9 +80,7 @@ class Plan:
 def plans(network: BlurNetwork) -> Sequence[Plan]:
     """Return the plans, boldest first. Large kernels move to coarse pixels while they stay at least `least_pixels` of them wide."""
     if isinstance(network.tiles, GatedTiles) and network.grid is not None:
-        raise InputError(
-            "a fast export of the gated form needs a network without tiles: train with tile_px 0 (field_bases learn the field)"
-        )
+        raise InputError("a fast export of the gated form needs a network without tiles: train with `--set network.tile_px=0`")
     if isinstance(network.tiles, GatedTiles):
         return _gated_plans(network.tiles)
     if isinstance(network.tiles, PublishedTiles):

@@ -105,7 +105,8 @@ def settings_to_json(settings: TrainSettings) -> dict[str, Any]:
 
 def settings_from_json(document: dict[str, Any], where: str = "settings") -> TrainSettings:
     if document.get("format") != FORMAT or document.get("version") != VERSION:
-        raise InputError(f"{where}: expected format {FORMAT!r} version {VERSION}, got {document.get('format')!r}: train again")
+        got = f"{document.get('format')!r} version {document.get('version')}"
+        raise InputError(f"{where}: expected format {FORMAT!r} version {VERSION}, got {got}: train again")
     values = {name: value for name, value in document.items() if name not in ("format", "version")}
     return _checked(TrainSettings, values | {"network": _checked(NetworkSettings, values.get("network", {}), where)}, where)
 

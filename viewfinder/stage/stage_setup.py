@@ -1,4 +1,4 @@
-"""StageSetup: everything a drawing depends on beside pose, lens and time, loaded from the scene file and again when it changes.
+"""StageSetup: everything a drawing depends on besides pose, lens and time, loaded from the scene file and again when it changes.
 
 SceneWatch: whether the scene file or a file that it names was written since it was read; asks the file system, waits for nothing.
 """

@@ -69,7 +69,7 @@ def calibrate_rig(pairs: Sequence[PosePair]) -> PhoneRig:
     """Solve where the phone sits from poses of both over one board; InputError with too few pairs, or if they contradict one another."""
     if len(pairs) < FEWEST_PAIRS:
         raise InputError(
-            f"the calibration of the phone needs {FEWEST_PAIRS} pairs of poses or more, got {len(pairs)}: show both the board longer"
+            f"the calibration of the phone needs {FEWEST_PAIRS} pairs of poses or more, got {len(pairs)}: show both the board for longer"
         )
     each = [pair.camera_from_world @ inverted(pair.phone_from_world) for pair in pairs]
     start = rigid(Rotation.from_matrix([one[:3, :3] for one in each]).mean().as_matrix(), np.median([one[:3, 3] for one in each], axis=0))

@@ -126,7 +126,7 @@ def apply_known_nearest(stack: FocalStack, first: bool) -> FocalStack:
     gauge, stated = metres_facts(stack).get("gauge"), _stated_dioptres(stack)
     by_distances = len(stated) > 1 or 0.0 in stated
     if not gauge or gauge.get("near_first_from") in (TOLD, FROM_DISTANCES) or by_distances:
-        raise InputError(f"{stack.folder} knows its nearest slice from its distances: --nearest is for stacks that have to guess it")
+        raise InputError(f"{stack.folder}: which slice is nearest is already known; --nearest is for stacks that have to guess it")
     turned = is_near_first(stack) != first
     p, q = _turn(stack, stated) if turned else (0.0, 1.0)
     changed = with_known_nearest(_rescaled(stack, p, q), turned)

@@ -1,4 +1,4 @@
-"""Compiled loops of Laplacian spreadlets: points splatted, sums in whole numbers and back, highlights among the pixels.
+"""Compiled loops of Laplacian spreadlets: points splatted, sums converted to integers and back, highlights among the pixels.
 
 Every pixel adds its value times the points of its cell to an accumulator.
 """
