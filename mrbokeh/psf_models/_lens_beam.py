@@ -62,9 +62,8 @@ class LensBeam:
                     seen = self._look(chief[1:], each, float(wavelength_um))
                     found = np.array([min(found[0], seen[0]), *np.maximum(found[1:], seen[1:])])
         if found[2] == 0.0:
-            raise InputError(
-                f"no light passes {self.lens.name} at an eccentricity of {eccentricities.min():.3g} to {eccentricities.max():.3g}: choose a smaller field"
-            )
+            span = f"{eccentricities.min():.3g} to {eccentricities.max():.3g}"
+            raise InputError(f"no light passes {self.lens.name} at an eccentricity of {span}: choose a smaller field")
         return found
 
     def _look(self, chief: Float64[np.ndarray, "4"], per_mm: float, wavelength_um: float) -> Window:

@@ -98,7 +98,7 @@ class _KernelLocator(_CacheLocator):  # type: ignore[misc]
 
 
 class _KernelCacheImpl(CompileResultCacheImpl):  # type: ignore[misc]
-    _locator_classes = [_KernelLocator]  # type: ignore[assignment]  # noqa: RUF012
+    _locator_classes = [_KernelLocator]  # type: ignore[assignment, list-item]  # noqa: RUF012
 
 
 class _KernelCache(FunctionCache):  # type: ignore[misc]

@@ -455,7 +455,7 @@ def test_what_cannot_be_told_is_refused(known: FocalStack, guessed: FocalStack, 
         (guessed.folder, ("--distance-at", "9,9,1", "--distance", "a,b,1"), "--distance is for a whole scene"),
         (guessed.folder, ("--distance-at", "9,9,1", "--square-mm", 30, "--marker-mm", 22), "--square-mm, --marker-mm is for a whole scene"),
         (guessed.folder, ("--nearest", "last", "--no-calibrate"), "--no-calibrate is for a whole scene"),
-        (guessed.folder, ("--nearest", "last", "--overwrite"), "--nearest alone needs none"),
+        (guessed.folder, ("--nearest", "last", "--overwrite"), "--nearest works without it"),
     ):
         with pytest.raises(AssertionError, match=match):
             run("capture", "scale", folder, *arguments)

@@ -239,7 +239,7 @@ MISTAKES = {
     "no such lens": (["psf", "simple", "--lens", "none.json"], "none.json"),
     "no such picture": (["psf", "stylized", "--image", "none.png"], "none.png"),
     "counts in words": (["psf", "simple", "--counts", "many"], "--counts as whole numbers"),
-    "too many counts": (["psf", "simple", "--counts", "3,3"], "a count for each"),
+    "too many counts": (["psf", "simple", "--counts", "3,3"], "have one count"),
     "a diameter below 0": (["psf", "simple", "--diameter", "-3"], "positive number"),
     "a focus for a model without": (["psf", "simple", "--focus", "3"], "--focus does nothing"),
     "vignetting of a thin lens": (["psf", "combined", "--no-vignetting"], "--vignetting does nothing"),
