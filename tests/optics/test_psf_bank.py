@@ -101,7 +101,7 @@ def test_what_is_not_a_bank() -> None:
         ({"kernels": (bank.kernels[0][..., :1], *bank.kernels[1:])}, "all have 1 or all have 3"),
         ({"kernels": (np.ones((2, 2, 3), np.float32) / 4, *bank.kernels[1:])}, "odd K"),
         ({"kernels": (np.full((3, 3, 3), np.nan, np.float32), *bank.kernels[1:])}, "must sum to 1"),
-        ({"axes": (DIAMETER, DIAMETER)}, "different axes"),
+        ({"axes": (DIAMETER, DIAMETER)}, "each axis of a bank must appear once"),
         ({"axes": (SIGNED, ECCENTRICITY)}, "regular grid"),
         ({"turns": "always"}, "turns by one of"),
     ]
