@@ -81,18 +81,12 @@ def test_hiatus_lies_between_lens_and_film(hiatus_mm: float) -> None:
 def test_intervals_are_counted_from_the_lens_too() -> None:
     """Nikon's code 66 is 0.4467 m, 0.4340 to 0.4597 from the film plane; with 28 mm and 1:1 as the end of what a lens reaches."""
     focus = read_focus({"Exif.NikonLd3.FocusDistance": "66"})
-    assert focus is not None
     interval_m = focus.lens_interval_m(28.0, 5.0)
-    assert interval_m is not None
     for end_m, stated_m in zip(interval_m, (focus.nearest_m, focus.farthest_m), strict=True):
         assert end_m + (5.0 + Lens(28.0, 2.0, end_m, 36.0).image_distance_mm) / 1000.0 == pytest.approx(stated_m, rel=1e-9)
     assert interval_m[0] < (focus.lens_distance_m(28.0, 5.0) or 0.0) < interval_m[1]
+    assert lens_distance_m(0.2, 50.0) == pytest.approx(0.1)
     macro = FocusReading(0.21, 0.19, 0.23, "film_plane", "test")
     assert macro.lens_interval_m(50.0) == pytest.approx((0.1, lens_distance_m(0.23, 50.0)))
     assert FocusReading(0.19, 0.18, 0.2, "film_plane", "test").lens_interval_m(50.0) is None
     assert FocusReading(0.3, 0.2, math.inf, "lens", "test").lens_interval_m(None) == (0.2, math.inf)
-
-
-def test_nearer_than_four_focal_lengths_no_thin_lens_focuses() -> None:
-    assert lens_distance_m(0.19, 50.0) is None
-    assert lens_distance_m(0.2, 50.0) == pytest.approx(0.1)

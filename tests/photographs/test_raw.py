@@ -13,6 +13,7 @@ from datasets_scripts.made_sets.simulated_camera import SensorModel, ShotMetadat
 from mrbokeh.images.color import convert, rec709_from_XYZ
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
+from tests.scenes.made_photographs import set_exif
 
 QUIET = {"full_well_electrons": 0.0, "read_noise_electrons": 0.0}
 
@@ -104,12 +105,9 @@ def test_white_balance_given_from_outside_scales_the_channels(tmp_path: Path) ->
 
 
 def test_orientation_is_left_alone(tmp_path: Path) -> None:
-    import pyexiv2
-
     path = photograph(tmp_path / "upright.dng", patches([(0.1,) * 3, (0.4,) * 3]), SensorModel(**QUIET))
     as_stored = decode_raw(path).rgb
-    with pyexiv2.Image(str(path)) as image:
-        image.modify_exif({"Exif.Image.Orientation": "6"})
+    set_exif(path, Orientation="6")
     assert np.array_equal(decode_raw(path).rgb, as_stored)
 
 

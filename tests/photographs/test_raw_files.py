@@ -35,7 +35,6 @@ def test_real_files_agree_with_libraws_own_colours(shared_data: Path, name: str)
 
     path = shared_data / "raw" / name
     decoded = decode_raw(path, half_size=True)
-    assert decoded.white_balance is not None
     red, green, blue = decoded.white_balance
     largest = max(decoded.white_balance)
     converted = {}
@@ -100,19 +99,18 @@ def test_greys_of_a_colour_chart_stay_grey(shared_data: Path) -> None:
         assert patch / patch[1] == pytest.approx([1.0] * 3, abs=0.03)
 
 
-@pytest.mark.parametrize(("name", "share"), [("canon_g2_0304.crw", 0.5), ("kodak_dc120.kdc", 0.9), ("bmpcc_cup.dng", 0.95)])
-def test_truncated_files_are_refused(shared_data: Path, tmp_path: Path, name: str, share: float) -> None:
+@pytest.mark.parametrize(
+    ("name", "share", "said"),
+    [
+        ("canon_g2_0304.crw", 0.5, "cannot be decoded|cut short"),
+        ("kodak_dc120.kdc", 0.9, "cannot be decoded|cut short"),
+        ("bmpcc_cup.dng", 0.95, "cannot be decoded|cut short"),
+        # Without its last percent LibRaw decodes this file with 3 % of its pixels wrong and says nothing.
+        ("canon_6d_lossy_linear.dng", 0.99, "cut short"),
+    ],
+)
+def test_truncated_files_are_refused(shared_data: Path, tmp_path: Path, name: str, share: float, said: str) -> None:
     data = (shared_data / "raw" / name).read_bytes()
-    path = tmp_path / name
-    path.write_bytes(data[: int(len(data) * share)])
-    with pytest.raises(InputError, match=r"cannot be decoded|cut short"):
-        decode_raw(path)
-
-
-def test_missing_tiles_that_libraw_passes_over_are_refused(shared_data: Path, tmp_path: Path) -> None:
-    """Without its last percent LibRaw decodes this file with 3 % of its pixels wrong and says nothing."""
-    data = (shared_data / "raw" / "canon_6d_lossy_linear.dng").read_bytes()
-    path = tmp_path / "short.dng"
-    path.write_bytes(data[: int(len(data) * 0.99)])
-    with pytest.raises(InputError, match="cut short"):
-        decode_raw(path)
+    (tmp_path / name).write_bytes(data[: int(len(data) * share)])
+    with pytest.raises(InputError, match=said):
+        decode_raw(tmp_path / name)

@@ -12,16 +12,13 @@ from capture.photos.sensor_metadata import SensorReading, read_sensor, sensor_of
 def test_focal_plane_units(unit: str, resolution: str) -> None:
     tags = {"Exif.Photo.FocalPlaneXResolution": resolution, "Exif.Photo.FocalPlaneResolutionUnit": unit}
     sensor = read_sensor(tags, None, (2400, 1600))
-    assert sensor is not None
     assert sensor.width_mm(2400, 1600) == pytest.approx(24.0)
 
 
 def test_film_equivalent_compares_diagonals() -> None:
     """50 mm that sees like 75 mm has a diagonal of 43.27 / 1.5 mm; at 3:2 that is a width of 24 mm."""
     sensor = read_sensor({"Exif.Photo.FocalLengthIn35mmFilm": "75"}, 50.0, (6000, 4000))
-    assert sensor is not None
     assert sensor.width_mm(6000, 4000) == pytest.approx(24.0)
-    assert read_sensor({"Exif.Photo.FocalLengthIn35mmFilm": "0"}, 50.0, (6000, 4000)) is None
 
 
 @pytest.mark.parametrize(
@@ -36,16 +33,16 @@ def test_film_equivalent_compares_diagonals() -> None:
 def test_cameras_that_do_not_tell_are_looked_up(make: str, model: str, width_mm: float, by_data_sheet_mm: float) -> None:
     tags = {"Exif.Image.Make": make, "Exif.Image.Model": model}
     sensor = read_sensor(tags, None, (6000, 4000))
-    assert sensor is not None
     assert "lensfun" in sensor.source
     assert sensor.width_mm(6000, 4000) == pytest.approx(width_mm, rel=1e-3)
     assert sensor.width_mm(6000, 4000) == pytest.approx(by_data_sheet_mm, rel=0.012)
     stated = read_sensor(tags | {"Exif.Photo.FocalPlaneXResolution": "25400/10"}, None, (2400, 1600))
-    assert stated is not None
     assert "FocalPlaneXResolution" in stated.source, "the file goes before the table"
 
 
-def test_unknown_cameras_are_not_guessed() -> None:
+def test_unknown_sensors_are_not_guessed() -> None:
+    assert read_sensor({"Exif.Photo.FocalLengthIn35mmFilm": "0"}, 50.0, (6000, 4000)) is None
+    assert read_sensor({"Exif.Photo.FocalPlaneXResolution": "1/1"}, None, (6000, 4000)) is None, "152 m wide"
     assert read_sensor({"Exif.Image.Make": "mrbokeh", "Exif.Image.Model": "Simulated Bayer Camera"}, None, (6000, 4000)) is None
     assert sensor_of_model("NIKON CORPORATION", "NIKON D3300", None) is None
 

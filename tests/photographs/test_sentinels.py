@@ -92,7 +92,6 @@ def test_intervals_reach_from_the_farthest_real_distance_to_infinity() -> None:
 def test_an_infinity_that_somebody_states_is_known() -> None:
     focus = StatedFocus.checked([math.inf], "lens.toml").reading("lens", "lens.toml")
     record = bounded_focus_records([PhotoMetadata(focus=focus)])[0]
-    assert record is not None
     assert (record["sentinel"], record["lens_interval_dioptre"]) == (False, [0.0, 0.0])
 
 

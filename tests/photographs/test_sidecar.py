@@ -85,9 +85,7 @@ def test_hiatus_and_intervals_from_the_sidecar(tmp_path: Path) -> None:
     sidecar = read_sidecar(write_sidecar(tmp_path, text))
     first, second = sidecar.applied(["a.jpg", "b.jpg"], [PhotoMetadata(), PhotoMetadata()])
     distance_m = first.focus_distance_m
-    assert distance_m is not None
     assert distance_m + Lens(50.0, 2.0, distance_m, 36.0).image_distance_mm / 1000.0 == pytest.approx(0.49)
-    assert first.focus_interval_m is not None
     assert first.focus_interval_m[0] < distance_m < first.focus_interval_m[1]
     assert (second.focus_distance_m, second.focus_interval_m) == (math.inf, (math.inf, math.inf))
 
@@ -103,7 +101,6 @@ def test_distances_from_a_table(tmp_path: Path) -> None:
     assert (first.focus_distance_m, first.focus_interval_m, first.focal_length_mm) == (0.5, (0.48, 0.52), 50.0)
     assert (second.focus_distance_m, second.focus_interval_m) == (0.6, (0.6, 0.6))
     assert (third.focus_distance_m, third.focus_interval_m) == (math.inf, (5.0, math.inf))
-    assert first.focus is not None
     assert first.focus.source == "focus.csv = 0.5 m"
     assert sidecar.unmatched_names(["a.jpg", "b.jpg", "c.jpg"]) == ["typo.jpg"]
 

@@ -46,12 +46,18 @@ def make_raw_photo(path: Path, rgb: Picture, focus_m: float, exposure_time_s: Fr
     return path
 
 
-def state_infinity(path: Path) -> None:
-    """SubjectDistance 0xFFFFFFFF / 1. exiv2 reads that but writes at most 0x7FFFFFFF, so the last bit is set by hand."""
+def set_exif(path: Path, **tags: str) -> None:
+    """Tags by their last name: Model, Orientation (of Exif.Image), SubjectDistance, FNumber (of Exif.Photo)."""
     import pyexiv2
 
+    groups = {"Model": "Image", "Orientation": "Image"}
     with pyexiv2.Image(str(path)) as image:
-        image.modify_exif({"Exif.Photo.SubjectDistance": "2147483647/1"})
+        image.modify_exif({f"Exif.{groups.get(name, 'Photo')}.{name}": value for name, value in tags.items()})
+
+
+def state_infinity(path: Path) -> None:
+    """SubjectDistance 0xFFFFFFFF / 1. exiv2 reads that but writes at most 0x7FFFFFFF, so the last bit is set by hand."""
+    set_exif(path, SubjectDistance="2147483647/1")
     written, meant = (struct.pack("<II", numerator, 1) for numerator in (0x7FFFFFFF, 0xFFFFFFFF))
     data = path.read_bytes()
     assert data.count(written) == 1
@@ -85,7 +91,6 @@ def defocused(rgb: Picture, sigma_px: float) -> Picture:
 
 def only_stack(report: IngestReport) -> FocalStack:
     assert len(report.stacks) == 1
-    assert report.stacks[0].stack is not None
     return report.stacks[0].stack
 
 
