@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mrbokeh.commands._composite_options import PlateOptions, ResultOptions
-from mrbokeh.commands._insertion_options import ColourOptions
+from mrbokeh.commands._composite_options import LensOptions, PlateOptions, ResultOptions
+from mrbokeh.commands._insertion_options import ColourOptions, LookGroup
 from mrbokeh.compositing.plate import Inserted, Plate, bundle_plate, open_plate, with_depth, with_matte, with_own_alpha
 from mrbokeh.depth.depth_map import DepthSettings, parse_near_far
 from mrbokeh.images.alpha_io import HOLDING_ALPHA, alpha_with
@@ -55,13 +55,31 @@ def _from_space(plate: Plate, photo: Path, space: NamedSpace) -> Plate:
     return with_own_alpha(replace(plate, rgb=space.to_rec709(stored)), photo, plate.alpha)
 
 
+def require_options_of_stacks(
+    taken: PlateOptions, optics: LensOptions, look: LookGroup, colour: ColourOptions, result: ResultOptions
+) -> None:
+    """Raise InputError if an option is given that is of one picture, and that --all-slices would not follow."""
+    one_picture = (
+        (taken, ("slice_", "depth", "disparity", "depth_scale", "matte", "near_distance")),
+        (optics, ("focus",)),
+        (look, tuple(vars(look))),
+        (colour, ("input_space", "output_space")),
+        (result, ("save_layer", "deep_out")),
+    )
+    given = [name for group, names in one_picture for name in names if getattr(group, name) != getattr(type(group)(), name)]
+    if given:
+        told = ", ".join(f"--{name.rstrip('_').replace('_', '-')}" for name in given)
+        raise InputError(
+            f"--all-slices writes every slice with the stack's own depth, focus and colours, but got {told}, of one picture: "
+            f"leave that out, or leave --all-slices out and choose a --slice"
+        )
+
+
 def check_outputs(out: Path, result: ResultOptions, read: Sequence[Path | None], *, all_slices: bool) -> None:
     """Raise InputError if a file would be lost, or cannot be what is asked for. read: the files that the command reads."""
     for path, name in ((result.save_layer, "--save-layer"), (result.deep_out, "--deep-out")):
         if path is not None:
             require_suffix(path, (".exr",), name)
-    if result.deep_out is not None and all_slices:
-        raise InputError("--deep-out writes the layers of one picture: leave --all-slices out, for they are the same in every slice")
     if all_slices and out.suffix:
         raise InputError(f"--all-slices writes a focal stack: expected the name of a folder, got --out {out}")
     if not all_slices:

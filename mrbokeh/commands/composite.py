@@ -43,7 +43,15 @@ def composite(
     Example: mrbokeh composite captures/20261122-101500 --out captured.png
     """
     from mrbokeh.commands._composite_layers import layers_by
-    from mrbokeh.commands._composite_outputs import alpha_lost, best_mode, blur_told, check_outputs, plate_by, write_results
+    from mrbokeh.commands._composite_outputs import (
+        alpha_lost,
+        best_mode,
+        blur_told,
+        check_outputs,
+        plate_by,
+        require_options_of_stacks,
+        write_results,
+    )
     from mrbokeh.compositing.choose import insertion_of
     from mrbokeh.compositing.plate_look.finishing import finished, finishing_of
     from mrbokeh.renderers.choose import lens_and_renderer
@@ -51,11 +59,13 @@ def composite(
     from mrbokeh.system.console import working
 
     read = (photo, taken.depth, taken.matte, *virtual.files, standing.object_, standing.environment, rendering.distortion, optics.lens)
+    if taken.all_slices:
+        require_options_of_stacks(taken, optics, look, colour, result)
     check_outputs(out, result, read, all_slices=taken.all_slices)
     bundle = read_bundle(photo) if is_bundle(photo) else None
     lens, renderer = lens_and_renderer(optics.lens, optics.renderer or (bundle.renderer if bundle and optics.lens is None else None))
     plate = plate_by(photo, taken, colour, bundle, lens=lens, focus_m=optics.focus)
-    _tell_metres(photo, virtual, standing)
+    _tell_metres(photo, virtual, standing, lens)
     layers_for = layers_by(virtual, standing, rendering, plate, bundle)
     mode = virtual.mode or best_mode(plate)
     insertion = insertion_of(mode, taken.near_distance, exact_depth=taken.exact_depth)
@@ -74,15 +84,15 @@ def composite(
     typer.echo(f"wrote {out} ({mode}; {blur_told(plate, sharp)})")
 
 
-def _tell_metres(photo: Path, virtual: VirtualOptions, standing: options.ObjectOptions) -> None:
-    """Print which of a stack's metres are guessed, and what follows for layers."""
+def _tell_metres(photo: Path, virtual: VirtualOptions, standing: options.ObjectOptions, lens: "Lens | None") -> None:
+    """Print which of a stack's metres are guessed, and what follows for layers and for another lens."""
     from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
-    from mrbokeh.stacks.guessed_metres import metres_note
+    from mrbokeh.stacks.guessed_metres import growth_note, metres_note
 
     if not (photo / FILE_NAME).is_file():
         return
     stack = read_focal_stack(photo)
-    if note := metres_note(stack):
+    for note in filter(None, (metres_note(stack), growth_note(stack, lens))):
         typer.echo(note)
     if not stack.metres_known and virtual.layer and not standing.at_pixel:
         typer.echo("the layers' depth is taken for guessed metres: --at-pixel X,Y puts them onto the surface at a pixel")

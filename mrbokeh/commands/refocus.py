@@ -69,7 +69,7 @@ def refocus(
     from mrbokeh.images.image_io import require_suffix
     from mrbokeh.stacks.focal_stack import read_focal_stack, write_focal_stack
     from mrbokeh.stacks.focus_places import FocusLookup, parse_focus
-    from mrbokeh.stacks.guessed_metres import inherited_facts, metres_note, unit_of
+    from mrbokeh.stacks.guessed_metres import growth_note, inherited_facts, metres_note, unit_of
     from mrbokeh.system.atomic_files import require_safe_outputs
     from mrbokeh.system.console import kept_when_interrupted
 
@@ -80,11 +80,9 @@ def refocus(
         require_safe_outputs((result.sheet,), (blur.lens, out), result.overwrite)
     source = read_focal_stack(stack)
     distances_m = parse_focus(focus, FocusLookup.of(source))
-    if note := metres_note(source):
-        typer.echo(note)
     way = _refocusing(source, blur)
-    if note and way.lens is not None:
-        typer.echo(f"the blur of this lens grows {_times_as_fast(way):.2f} times as fast as in the slices")
+    for note in filter(None, (metres_note(source), growth_note(source, way.lens))):
+        typer.echo(note)
     _make_room(out, result.overwrite)
     settings = {"stack": str(stack.resolve()), **vars(blur), "lens": str(blur.lens)}
     with kept_when_interrupted(f"finished slices are kept in {out}", result.overwrite):
@@ -167,12 +165,6 @@ def _growth(way: Refocusing, distance_m: float) -> dict:
     if way.lens is not None or width_px is None:
         return {}
     return {GROWTH: way.lens_at(distance_m).coc_px_per_dioptre(width_px), GROWTH_WIDTH: width_px}
-
-
-def _times_as_fast(way: Refocusing) -> float:
-    """Return the growth of another lens's blur relative to the stack's lens, both focused as the reference slice."""
-    focus_m = way.stack.lens_of(way.stack.reference).focus_distance_m
-    return way.lens_at(focus_m).coc_px_per_dioptre(1) / Refocusing(way.stack, way.renderer).lens_at(focus_m).coc_px_per_dioptre(1)
 
 
 def _write_sheet(path: Path, made: FocalStack) -> None:

@@ -8,6 +8,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FILE_NAME, METRES, FocalStack, read_focal_stack
 
 GUESSED = "guessed metres"
@@ -76,6 +77,15 @@ def metres_note(stack: FocalStack) -> str:
         return f"{stack.folder}: metres are guessed: {facts['why']}{f', the {end} slice nearest' if end else ''}; {way}"
     guessed = guesses(stack)
     return f"{stack.folder}: {facts['why']}; still guessed: {guessed}" if guessed else ""
+
+
+def growth_note(stack: FocalStack, lens: Lens | None) -> str:
+    """State how fast another lens's blur grows, focused as the reference slice; empty for the stack's lens and where metres are known."""
+    if lens is None or not metres_note(stack):
+        return ""
+    own = stack.registered_lens_of(stack.reference)
+    times = lens.focused_at(own.focus_distance_m).coc_px_per_dioptre(1) / own.coc_px_per_dioptre(1)
+    return f"the blur of this lens grows {times:.2f} times as fast as in the slices"
 
 
 def guesses(stack: FocalStack) -> str:

@@ -20,6 +20,7 @@ from mrbokeh.stacks.exr_layers.composite_exr import write_deep_exr
 from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from mrbokeh.system.errors import InputError
+from tests.house.test_user_mistakes import said
 from tests.scenes.composite_exr_reader import read_composite_exr
 
 HEIGHT, WIDTH = 96, 144
@@ -123,8 +124,22 @@ def test_sharp_layers_go_out_as_a_deep_picture(files: Path) -> None:
         put_in(files, "--deep-out", files / "virtual.png")
     with pytest.raises(InputError, match="exists already"):
         put_in(files, "--deep-out", files / "virtual.exr")
-    with pytest.raises(InputError, match="leave --all-slices out"):
-        put_in(files, "--all-slices", "--deep-out", files / "other.exr")
+
+
+@pytest.mark.parametrize(
+    ("words", "named"),
+    [
+        (("--deep-out", "other.exr"), "--deep-out"),
+        (("--save-layer", "layer.exr", "--output-space", "ACEScg"), "--output-space, --save-layer"),
+        (("--grain", "auto", "--seed", "3", "--light-wrap", "0.5"), "--grain, --light-wrap, --seed"),
+        (("--slice", "1", "--depth", "depth.exr", "--focus", "2"), "--slice, --depth, --focus"),
+    ],
+)
+def test_options_of_one_picture_are_refused_for_all_slices(
+    words: tuple[str, ...], named: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code, told = said(capsys, monkeypatch, "composite", "stack", "--all-slices", *words, "--out", "made")
+    assert code == 2 and f"but got {named}, of one picture: leave that out, or leave --all-slices out" in told
 
 
 def test_an_exr_holds_all_that_it_was_put_together_from(files: Path) -> None:

@@ -175,6 +175,16 @@ def test_a_layer_takes_the_blur_of_the_surface_at_its_pixel(known: FocalStack, g
     assert "--at-pixel X,Y puts them onto the surface" in told
 
 
+def test_another_lens_says_how_its_blur_compares_in_a_composite(guessed: FocalStack, tmp_path: Path, run: Run) -> None:
+    lens = guessed.lens_of(guessed.reference)
+    write_lens(tmp_path / "half.json", replace(lens, f_number=lens.f_number / 2))
+    write_layer(tmp_path / "card.exr", card(12.0), half=False)
+    common = ("--layer", tmp_path / "card.exr", "--at-pixel", ON_WALL, "--renderer", "scatter", "--mode", "front", "--slice", 0)
+    told = run("composite", guessed.folder, *common, "--lens", tmp_path / "half.json", "--out", tmp_path / "a.exr")
+    assert "metres are guessed" in told and "grows 2.00 times as fast as in the slices" in told
+    assert "times as fast" not in run("composite", guessed.folder, *common, "--out", tmp_path / "b.exr")
+
+
 def test_all_slices_hold_it_and_its_position_in_blur(guessed: FocalStack, tmp_path: Path, run: Run) -> None:
     write_layer(tmp_path / "odd.exr", card(12.0), half=False)
     arguments = ("--all-slices", "--renderer", "scatter", "--mode", "over", "--out", tmp_path / "made")
