@@ -11,6 +11,7 @@ import os
 import re
 import shutil
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
@@ -27,8 +28,10 @@ from numba.misc.appdirs import AppDirs
 
 _config: Any = numba.config
 
-KEPT_UNUSED_DAYS = 60
+KEPT_UNUSED_DAYS = 90
 """Kernels of sources that nothing has loaded for so long are removed when new ones are written."""
+MOST_BYTES = 1_000_000_000
+"""Where all kernels take more than this, those that have not been loaded for longest are removed as well."""
 
 OURS = ("mrbokeh", "capture", "training", "viewfinder", "datasets_scripts")
 """Packages whose modules count into the hash of a kernel that imports them, beside its own."""
@@ -70,10 +73,16 @@ def fingerprint(file: Path, module: str) -> str | None:
 
 
 def forget_unused(folder: Path) -> None:
-    """Remove the folders of kernels in `folder` that have not been loaded for KEPT_UNUSED_DAYS."""
-    for old in folder.iterdir():
-        if old.is_dir() and time.time() - old.stat().st_mtime > KEPT_UNUSED_DAYS * _DAY_S:
-            shutil.rmtree(old, ignore_errors=True)
+    """Remove the folders of kernels in `folder` that have not been loaded for KEPT_UNUSED_DAYS, and the oldest beyond MOST_BYTES in all."""
+    total_bytes = 0
+    for each in sorted((each for each in folder.iterdir() if each.is_dir()), key=_used_s, reverse=True):
+        total_bytes += sum(file.stat().st_size for file in each.iterdir())
+        if total_bytes > MOST_BYTES or time.time() - _used_s(each) > KEPT_UNUSED_DAYS * _DAY_S:
+            shutil.rmtree(each, ignore_errors=True)
+
+
+def _used_s(folder: Path) -> float:
+    return folder.stat().st_mtime
 
 
 class _KernelLocator(_CacheLocator):  # type: ignore[misc]
@@ -132,10 +141,13 @@ def _folder(file: Path, module: str) -> Path | None:
     with suppress(OSError):
         if not folder.is_dir():
             folder.mkdir(exist_ok=True)
-            forget_unused(base)
+            _forget_once(base)
         elif time.time() - folder.stat().st_mtime > _DAY_S:
             os.utime(folder)
     return folder if folder.is_dir() else None
+
+
+_forget_once = cache(forget_unused)
 
 
 @cache
@@ -143,14 +155,25 @@ def _writable_base() -> Path | None:
     """Return a folder that can be written: in NUMBA_CACHE_DIR where that is set, else the user's cache folder, else __pycache__ here."""
     user = Path(AppDirs(appname="mrbokeh", appauthor=False).user_cache_dir)
     bases = [user / "kernels", Path(__file__).parent / "__pycache__" / "kernels"]
-    if _config.CACHE_DIR:
-        bases = [Path(_config.CACHE_DIR) / "mrbokeh"]
-    for base in bases:
-        with suppress(OSError):
-            base.mkdir(parents=True, exist_ok=True)
-            if os.access(base, os.W_OK | os.X_OK):
-                return base
-    return None
+    if not _config.CACHE_DIR:
+        return next(filter(_can_be_written, bases), None)
+    named = Path(_config.CACHE_DIR) / "mrbokeh"
+    if _can_be_written(named):
+        return named
+    temporary = Path(tempfile.gettempdir()) / f"mrbokeh_kernels_{os.getuid() if hasattr(os, 'getuid') else 'user'}"
+    kept = temporary if _can_be_written(temporary) else None
+    told = f"they are kept in {kept}" if kept else "they are compiled anew each time"
+    print(f"NUMBA_CACHE_DIR: compiled kernels cannot be written to {named}, {told}; name a folder that can be written", file=sys.stderr)
+    return kept
+
+
+def _can_be_written(folder: Path) -> bool:
+    """Return whether kernels can be kept in a folder, which is made; one of another user could hold foreign code."""
+    with suppress(OSError):
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        ours = not hasattr(os, "getuid") or folder.stat().st_uid in (os.getuid(), 0)
+        return ours and os.access(folder, os.W_OK | os.X_OK)
+    return False
 
 
 def _once_at_a_time(compile_one: Callable[[Any], Any], known: Any, lock: Path) -> Callable[[Any], Any]:

@@ -98,14 +98,26 @@ def test_a_kernel_depends_on_its_module_and_on_what_that_imports_alone(tmp_path:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="folders that cannot be written are made otherwise there")
-def test_a_kernel_runs_where_nothing_can_be_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_kernel_runs_where_nothing_can_be_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Neither where NUMBA_CACHE_DIR says nor in the temporary folder: compiled each time, and told in one line."""
     (tmp_path / "file").write_text("no folder")
     monkeypatch.setattr(kernels.numba.config, "CACHE_DIR", str(tmp_path / "file" / "below"))
+    monkeypatch.setattr(kernels.tempfile, "gettempdir", lambda: str(tmp_path / "file"))
     kernels._writable_base.cache_clear()
     kernels._folder.cache_clear()
     try:
         kernel = kernels.njit(cache=True)(_doubled)
         assert kernel(2) == 4 and kernel.stats.cache_path is None
+        told = capsys.readouterr().err
+        assert told.count("\n") == 1 and "compiled anew each time" in told
+        monkeypatch.setattr(kernels.tempfile, "gettempdir", lambda: str(tmp_path))
+        kernels._writable_base.cache_clear()
+        kept = kernels._writable_base()
+        told = capsys.readouterr().err
+        assert kept is not None and kept.parent == tmp_path and kept.stat().st_mode & 0o077 == 0
+        assert told.count("\n") == 1 and f"kept in {kept}" in told
     finally:
         kernels._writable_base.cache_clear()
         kernels._folder.cache_clear()
@@ -121,6 +133,16 @@ def test_kernels_unused_for_long_are_removed(tmp_path: Path) -> None:
         os.utime(tmp_path / name, (time.time() - 86400 * days,) * 2)
     kernels.forget_unused(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["new"]
+
+
+def test_kernels_beyond_the_most_bytes_are_removed_the_oldest_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(kernels, "MOST_BYTES", 250)
+    for hours, name in enumerate(("newest", "middle", "oldest")):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "kernel.nbc").write_bytes(bytes(100))
+        os.utime(tmp_path / name, (time.time() - 3600 * hours,) * 2)
+    kernels.forget_unused(tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {"newest", "middle"}
 
 
 def test_every_kernel_of_the_product_is_kept_this_way() -> None:
