@@ -136,9 +136,9 @@ def test_what_the_specification_does_not_know_is_refused(tmp_path: Path) -> None
     path = tmp_path / "a.exr"
     half = crypto_channels() | {"CryptoObject00.R": np.zeros((HEIGHT, WIDTH), np.float16)}
     for channels, entries, message in (
-        (crypto_channels(), header(hash="md5"), "hash 'md5'"),
+        (crypto_channels(), header(hash="md5"), "expected hash MurmurHash3_32 of the Cryptomatte CryptoObject, got 'md5': write"),
         (half, header(), "stored as float16"),
-        ({}, header(), "not whole"),
+        ({}, header(), "got none: write the render again"),
         (crypto_channels(), {}, "has none"),
     ):
         write_exr(path, ExrPart(beauty() | channels, attributes=entries))

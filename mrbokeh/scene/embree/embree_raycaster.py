@@ -188,10 +188,10 @@ def ray_directions(camera: Camera, xy_px: Float[np.ndarray, "points 2"]) -> Floa
 
 
 def _checked(edge_samples: int, shadow_step_px: int) -> tuple[Float[np.ndarray, "samples 2"], int]:
-    if edge_samples not in SAMPLE_COUNTS or shadow_step_px < 1:
-        raise InputError(
-            f"expected 4 or 16 rays in a pixel at an edge and a step of whole pixels from 1 on, got {edge_samples} and {shadow_step_px}"
-        )
+    if edge_samples not in SAMPLE_COUNTS:
+        raise InputError(f"expected {' or '.join(map(str, SAMPLE_COUNTS))} as edge_samples, got {edge_samples}: take one of these")
+    if shadow_step_px < 1:
+        raise InputError(f"expected whole pixels from 1 on as shadow_step_px, got {shadow_step_px}: take 1 to look at every pixel")
     return sample_offsets_px(edge_samples), shadow_step_px
 
 

@@ -120,7 +120,9 @@ def _cryptomatte(render: RenderChannels, entries: Mapping[str, Any]) -> Cryptoma
     name = str(entries["name"])
     for what, expected in (("hash", "MurmurHash3_32"), ("conversion", "uint32_to_float32")):
         if entries[what] not in (None, expected):
-            raise InputError(f"{render.path}: the Cryptomatte {name} has {what} {entries[what]!r}, but only {expected} is known")
+            raise InputError(
+                f"{render.path}: expected {what} {expected} of the Cryptomatte {name}, got {entries[what]!r}: write it as Cryptomatte 1.2"
+            )
     planes = _ranked_planes(render, name)
     ids = [_bits(render, name, plane) for plane in planes[::2]]
     return Cryptomatte(name, _manifest(render.path, entries), ids, [plane.astype(np.float32) for plane in planes[1::2]])
@@ -136,7 +138,11 @@ def _ranked_planes(render: RenderChannels, name: str) -> list[np.ndarray]:
             break
         planes += [render.plane(f"{layer}.{channel}") for channel in spelled if f"{layer}.{channel}" in render.channels]
     if not planes or len(planes) % 2:
-        raise InputError(f"{render.path}: expected ranks of the Cryptomatte {name} in {name}00.R, G, B, A and on, but they are not whole")
+        came = f"{len(planes)} channels" if planes else "none"
+        raise InputError(
+            f"{render.path}: expected ID and coverage of the Cryptomatte {name} by turns in the channels {name}00.R, G, B, A and on, "
+            f"got {came}: write the render again with all of them"
+        )
     return planes
 
 
