@@ -15,7 +15,7 @@ from capture.poses.sparse_model import POSES_NAME, SCALE_NAME, SparseModel, read
 from capture.scale.answer import ScaleAnswer, ScaleResult, distance_scale, read_scale, write_scale
 from capture.scale.board import board_scale
 from capture.scale.focus import FocusSample, focus_sample, focus_scale
-from capture.scale.focus_calibration_stacks import StackFocus, calibrated_stack, focus_start, lens_calibrations, stack_focus, with_view
+from capture.scale.focus_calibration import StackFocus, calibrated_stack, focus_start, lens_calibrations, stack_focus, with_view
 from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_NAME
 from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack, write_focal_stack
 from mrbokeh.stacks.guessed_metres import metres_facts

@@ -25,8 +25,7 @@ from capture.tether.camera_driver import (
 from capture.tether.focus_motor import FocusAxis, Target
 from capture.tether.focus_plan import FocusPlan
 from capture.tether.live_view import Spot, read_live
-from capture.tether.saved_shot import SavedShot, check_return, require_same_exposure, save_shot
-from capture.tether.shoot_log import ShootLog, open_log, write_sidecar
+from capture.tether.shoot_files import SavedShot, ShootLog, check_return, open_log, require_same_exposure, save_shot, write_sidecar
 from mrbokeh.optics.lens import film_plane_m
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError

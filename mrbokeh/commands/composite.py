@@ -10,7 +10,7 @@ from mrbokeh.commands._insertion_options import ColourOptions, LookGroup, Virtua
 from mrbokeh.commands._option_groups import grouped
 
 if TYPE_CHECKING:
-    from mrbokeh.commands._composite_layers import LayersFor
+    from mrbokeh.commands._composite_parts import LayersFor
     from mrbokeh.compositing.plate import Insertion
     from mrbokeh.optics.lens import Lens
     from mrbokeh.renderers.base import Renderer
@@ -42,12 +42,12 @@ def composite(
 
     Example: mrbokeh composite captures/20261122-101500 --out captured.png
     """
-    from mrbokeh.commands._composite_layers import layers_by
-    from mrbokeh.commands._composite_outputs import (
+    from mrbokeh.commands._composite_parts import (
         alpha_lost,
         best_mode,
         blur_told,
         check_outputs,
+        layers_by,
         plate_by,
         require_options_of_stacks,
         write_results,

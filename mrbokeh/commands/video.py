@@ -19,9 +19,8 @@ from mrbokeh.shots.composite_recipe import CompositeRecipe
 from mrbokeh.shots.executors import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
 from mrbokeh.shots.frame_sources import CameraFile, ClipLook, DepthFiles, FocusPulled, MatteFiles
 from mrbokeh.shots.layer_sources import LayerFiles, sources_by_depth
-from mrbokeh.shots.render_shot import render_shot
+from mrbokeh.shots.render_shot import SequenceTarget, VideoTarget, render_shot
 from mrbokeh.shots.shot import Shot, Target
-from mrbokeh.shots.targets import SequenceTarget, VideoTarget
 from mrbokeh.stacks.photograph import SensorOrientation, lens_for_orientation
 from mrbokeh.system.atomic_files import require_safe_outputs
 from mrbokeh.system.console import kept_when_interrupted, progress_bars

@@ -10,6 +10,10 @@ hidden, and pixels that no virtual light reaches stay as they are, bit for bit.
 Rays tell which part of the pupil each of the three takes (mrbokeh.compositing.pupil_shares): coverages multiplied would be right only
 if near and virtual edges crossed the pupil independently, which those of one pixel do not.
 
+Highlights are followed ray by ray: at every place of its blur a highlight is seen through one point of the pupil, which is hidden or
+not. Few rays per pixel would miss it, and a blurred coverage would dim its whole disc where the truth cuts it. Only highlights whose
+discs reach a pixel that is asked for are followed.
+
 Under a user's matte, without a sharp scene, picture = alpha F + (1 - alpha) B is solved for F and B (Forte, Approximate Fast Foreground
 Colour Estimation, ICIP 2021): both are local means, then the rest of the mixture is given to them; a coarse round finds the colours, a
 fine one their detail.
@@ -21,25 +25,211 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Float64, Int64
 
 from mrbokeh.compositing.edge_refinement import EdgeRefinement
-from mrbokeh.compositing.near_and_far import NO_HIGHLIGHTS, NearAndFar, continued, cut_in_two, nearer_than, shows_anything, virtual_depth_m
+from mrbokeh.compositing.near_and_far import (
+    NO_HIGHLIGHTS,
+    Highlights,
+    NearAndFar,
+    continued,
+    cut_in_two,
+    nearer_than,
+    shows_anything,
+    virtual_depth_m,
+)
 from mrbokeh.compositing.plate import Inserted, Plate, same_size
-from mrbokeh.compositing.pupil_shares import Rays
-from mrbokeh.compositing.three_parts import LEAST_LIGHT, put_together
+from mrbokeh.compositing.pupil_shares import PupilMeans, Rays, pupil_points
 from mrbokeh.images.layer import Layer, clear, flatten
+from mrbokeh.layering.highlights import find_highlights
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.system.errors import InputError
 
+_LEAST_POINTS, _MOST_POINTS = 64, 16384
+_POINTS_PER_PX = 4.0
+_DISC_POINTS, _LEAST_DISC_PX, _MOST_GAIN, _LEAST_SUM = 256, 1.5, 50.0, 1e-6
+
+Plane = Float32[np.ndarray, "height width"]
+Mask = Bool[np.ndarray, "height width"]
+
+LEAST_LIGHT = np.float32(1e-5)
+"""Less coverage or light than this is rounding of the renderer, not light of a layer."""
+_ALL = 1e-4
+_MOST_NEAR = 0.995
+_ROUND = 1e-9
+_MOST_CHANGE, _LEAST_PART = 3.0, 0.02
+_UNEXPLAINED = 0.5
+Colours = Float32[np.ndarray, "places 3"]
+Shares = Float32[np.ndarray, " places"]
+Exact = Float64[np.ndarray, " places"]
+ExactColours = Float64[np.ndarray, "places 3"]
+Places = Int64[np.ndarray, " places"]
+
+
+@dataclass(frozen=True)
+class HighlightsThrough:
+    """Light of highlights (H, W, 3) as it arrives past one layer, and past that and another."""
+
+    one: Float32[np.ndarray, "height width 3"]
+    both: Float32[np.ndarray, "height width 3"]
+
+
+def put_together(plate: Plate, near: Layer, blurred: Layer, rays: Rays) -> Inserted:
+    """The picture, from what near and virtual light do by themselves."""
+    arrives = (blurred.alpha > LEAST_LIGHT) | (np.abs(blurred.rgb).max(axis=2) > LEAST_LIGHT)
+    alone = arrives & (near.alpha <= _ALL)
+    simple = alone & ((blurred.alpha >= 1.0 - _ALL) | rays.one_far_colour)
+    virtual_rgb = np.where(simple[..., None], np.maximum(blurred.rgb, 0.0), np.float32(0.0))
+    virtual_alpha = np.where(simple, np.maximum(blurred.alpha, 0.0), np.float32(0.0))
+    hides = np.where(virtual_alpha > LEAST_LIGHT, np.minimum(virtual_alpha, 1.0), np.float32(0.0))
+    photo_rgb = (np.float32(1.0) - hides)[..., None] * plate.rgb
+    places = np.flatnonzero(arrives & ~simple & (_least_around(near.alpha) < 1.0 - _ALL))
+    at = np.unravel_index(places, blurred.alpha.shape)
+    photo_rgb[at], virtual_rgb[at], virtual_alpha[at] = _shared(plate.rgb[at], near, blurred, rays, places)
+    seen = np.divide(virtual_alpha, blurred.alpha, out=np.zeros_like(virtual_alpha), where=blurred.alpha > LEAST_LIGHT)
+    extra = {name: values * seen[..., None] for name, values in blurred.extra.items()}
+    return Inserted(photo_rgb, Layer(virtual_rgb, virtual_alpha, blurred.depth_m, extra))
+
+
+def _shared(photo_rgb: Colours, near: Layer, blurred: Layer, rays: Rays, places: Places) -> tuple[Colours, Colours, Shares]:
+    """Return (photograph left, virtual light, its share of the pupil) at places that may see near, virtual and far."""
+    means = rays.means(places)
+    near_share = np.minimum(near.alpha.reshape(-1)[places].astype(np.float64), _MOST_NEAR)
+    covered = np.clip(blurred.alpha.reshape(-1)[places].astype(np.float64), 0.0, 1.0)
+    free = 1.0 - near_share
+    share = np.clip(free * covered + means.f_a - means.f * means.a, np.maximum(covered - near_share, 0.0), np.minimum(covered, free))
+    light = _virtual_light(blurred, rays, places, means, free)
+    far, stays = _far_light(photo_rgb, near, rays, places, means, free, share)
+    hidden = (share <= LEAST_LIGHT)[:, None]
+    left = np.where(hidden, photo_rgb, photo_rgb - far * (1.0 - stays))
+    light = np.where(hidden & (covered > LEAST_LIGHT)[:, None], 0.0, np.maximum(light, 0.0))
+    return left.astype(np.float32), light.astype(np.float32), share.astype(np.float32)
+
+
+def _virtual_light(blurred: Layer, rays: Rays, places: Places, means: PupilMeans, free: Exact) -> ExactColours:
+    """Return the virtual light past the near things: surfaces by their part of the pupil and the covariance, highlights one by one."""
+    wanted = np.zeros(blurred.alpha.shape, np.bool_)
+    wanted.reshape(-1)[places] = True
+    own = virtual_highlights(rays, wanted)
+    alone, past = own.one.reshape(-1, 3)[places], own.both.reshape(-1, 3)[places]
+    surfaces = free[:, None] * (blurred.rgb.reshape(-1, 3)[places] - alone)
+    return surfaces + means.f_virtual - means.f[:, None] * means.virtual + past
+
+
+def _far_light(
+    photo_rgb: Colours, near: Layer, rays: Rays, places: Places, means: PupilMeans, free: Exact, share: Exact
+) -> tuple[ExactColours, ExactColours]:
+    """Return (far light in the photograph, the part of it that the virtual surface leaves visible)."""
+    near_rgb = near.rgb.reshape(-1, 3)[places]
+    surfaces = means.f_far * (free / np.maximum(means.f, _ROUND))[:, None]
+    left_over = np.full_like(near.alpha, np.nan)
+    left_over.reshape(-1)[places] = (photo_rgb - near_rgb - surfaces).astype(np.float32).sum(axis=1)
+    bright = far_highlights(rays, left_over)
+    before, after = bright.one.reshape(-1, 3)[places], bright.both.reshape(-1, 3)[places]
+    stays = np.clip((1.0 - share / free)[:, None] * _colour_change(means), 0.0, 1.0)
+    far = surfaces + before
+    return _explained(photo_rgb, near_rgb, far), np.clip((surfaces * stays + after) / np.maximum(far, _ROUND), 0.0, 1.0)
+
+
+def _least_around(alpha: Plane) -> Plane:
+    """The least of 3x3 pixels: beside a rim a photograph may show more of what is behind than the sharp picture says."""
+    from cv2 import erode
+
+    return np.asarray(erode(alpha, np.ones((3, 3), np.uint8)), np.float32)
+
+
+def _colour_change(means: PupilMeans) -> Colours:
+    """Mean far colour in the part of the pupil that looks past near and virtual, over that past the near alone."""
+    change = means.past_far * means.f[:, None] / np.maximum(means.f_far * means.past[:, None], _ROUND)
+    enough = (means.past > _LEAST_PART)[:, None]
+    return np.where(enough, np.clip(change, 1.0 / _MOST_CHANGE, _MOST_CHANGE), np.float32(1.0))
+
+
+def _explained(photo_rgb: Colours, near_rgb: Colours, far_rgb: ExactColours) -> ExactColours:
+    """Return the far light of the photograph: what was blurred anew, and its share, by the squares of both, of what that leaves over."""
+    left_over = photo_rgb - near_rgb - far_rgb
+    far_share = far_rgb**2 / np.maximum(far_rgb**2 + near_rgb**2, _ROUND)
+    far_share = np.where(left_over > _UNEXPLAINED * (near_rgb + far_rgb), 1.0, far_share)
+    return np.clip(far_rgb + left_over * far_share, 0.0, np.maximum(photo_rgb, 0.0))
+
+
+def far_highlights(rays: Rays, left_over: Plane) -> HighlightsThrough:
+    """Follow far highlights past the near things, and past near and virtual ones, to pixels with a number in `left_over`.
+
+    left_over: light of the photograph (r + g + b) that surfaces do not explain, NaN where unknown. A highlight that the sharp picture
+    shows half hidden or clipped gets the brightness of its disc there.
+    """
+    first, second = (rays.scene.near.alpha, rays.coc_px[0]), (rays.virtual.alpha, rays.coc_px[1])
+    bright = _arriving(rays, rays.scene.highlights, rays.coc_px[2], np.isfinite(left_over))
+    dim = _followed(rays, bright, rays.coc_px[2], first, second)
+    if len(bright.places) == 0:
+        return dim
+    brighter = _gains(rays, bright, left_over / np.maximum(dim.one.sum(axis=2), _LEAST_SUM))
+    return _followed(rays, replace(bright, rgb=bright.rgb * brighter[:, None]), rays.coc_px[2], first, second)
+
+
+def _arriving(rays: Rays, bright: Highlights, coc_px: Plane, wanted: Mask) -> Highlights:
+    """Return the highlights whose discs reach a wanted pixel, or one beside it."""
+    from cv2 import integral
+
+    (height, width), (rows, columns) = wanted.shape, np.unravel_index(bright.places, wanted.shape)
+    farthest = max((aperture.unit_radius for _, aperture in rays.cells(bright.places)), default=0.0)
+    half_px = np.ceil(0.5 * farthest * np.abs(coc_px[rows, columns])).astype(int) + 1
+    counts = integral(wanted.astype(np.uint8))
+    top, bottom = np.maximum(rows - half_px, 0), np.minimum(rows + half_px + 1, height)
+    left, right = np.maximum(columns - half_px, 0), np.minimum(columns + half_px + 1, width)
+    kept = counts[bottom, right] - counts[top, right] - counts[bottom, left] + counts[top, left] > 0
+    return Highlights(bright.places[kept], bright.rgb[kept], bright.depth_m[kept])
+
+
+def _gains(rays: Rays, bright: Highlights, ratio: Plane) -> Float32[np.ndarray, " highlights"]:
+    """Return the median, over each highlight's disc, of the ratio of the light there to the light that it gives."""
+    height, width = ratio.shape
+    gains = np.ones(len(bright.places), np.float32)
+    for which, aperture in rays.cells(bright.places):
+        xy = pupil_points(aperture, _DISC_POINTS)[:, :2]
+        for index in which:
+            row, column = divmod(int(bright.places[index]), width)
+            centre_px, half_px = np.array([column + 0.5, row + 0.5]), 0.5 * float(rays.coc_px[2, row, column])
+            x, y = np.floor(centre_px + xy * half_px).astype(int).T
+            seen = ratio[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
+            known = np.isfinite(seen)
+            if abs(half_px) >= _LEAST_DISC_PX and known.sum() >= _DISC_POINTS // 8:
+                gains[index] = np.clip(np.median(seen[known]), 1.0 / _MOST_GAIN, _MOST_GAIN)
+    return gains
+
+
+def virtual_highlights(rays: Rays, wanted: Mask) -> HighlightsThrough:
+    """Follow the virtual layer's highlights as if nothing hid them, and past the near things, to wanted pixels."""
+    places = np.flatnonzero(find_highlights(rays.virtual_rgba))
+    whole, dark = (each.reshape(-1, 4)[places, :3] for each in (rays.virtual_rgba, rays.virtual_without_highlights))
+    bright = _arriving(rays, Highlights(places, whole - dark, np.zeros(len(places), np.float32)), rays.coc_px[1], wanted)
+    nothing = (np.zeros_like(rays.virtual.alpha), rays.coc_px[0])
+    return _followed(rays, bright, rays.coc_px[1], nothing, (rays.scene.near.alpha, rays.coc_px[0]))
+
+
+def _followed(rays: Rays, bright: Highlights, coc_px: Plane, first: tuple[Plane, Plane], second: tuple[Plane, Plane]) -> HighlightsThrough:
+    from mrbokeh.compositing._between_numba import follow
+
+    width = coc_px.shape[1]
+    one, both = np.zeros((*coc_px.shape, 3), np.float32), np.zeros((*coc_px.shape, 3), np.float32)
+    for which, aperture in rays.cells(bright.places):
+        pupil = pupil_points(aperture, _MOST_POINTS)
+        for place, rgb in zip(bright.places[which], bright.rgb[which], strict=True):
+            row, column = divmod(int(place), width)
+            light_coc_px = float(coc_px[row, column])
+            count = int(np.clip(_POINTS_PER_PX * light_coc_px**2, _LEAST_POINTS, _MOST_POINTS))
+            light = (row, column, light_coc_px, float(rgb[0]), float(rgb[1]), float(rgb[2]))
+            follow(one, both, light, *first, *second, pupil[:count])
+    return HighlightsThrough(one, both)
+
+
 _ROUNDS_PX = (91, 7)
 _LEAST = np.float32(1e-5)
 
-Plane = Float32[np.ndarray, "height width"]
 Picture = Float32[np.ndarray, "height width 3"]
 
-Mask = Bool[np.ndarray, "height width"]
 _HALF = 0.5
 _NEAR_EDGE_PX, _FAR_EDGE_PX = 3, 1  # the depth of what is near has a median over 5x5 pixels
 

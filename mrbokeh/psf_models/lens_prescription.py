@@ -7,7 +7,7 @@ densest flints. Indices of a lens come from its table, and so do its Abbe number
 If it has none, as those of the published double Gauss, wide-angle and fisheye, they are estimated. Of the double Gauss (Tronnier, US
 2,673,491) the Abbe numbers are known from Kolb et al. 1995: 47.1, 47.1, 30.1, 38.0, 57.3, 48.0. From the edges of the Abbe diagram alone
 they come out as 55.3, 55.3, 30.1, 38.3, 55.7, 54.6, and blue is focused 0.22 mm behind red, when it is 0.07 mm in front of it. With the
-edges mixed until blue and red meet (`mrbokeh.psf_models.lens_prescription_file`) they are 53.0, 53.0, 30.9, 39.2, 53.5, 51.8. Red and blue
+edges mixed until blue and red meet (`mrbokeh.psf_models.physical_lens`) they are 53.0, 53.0, 30.9, 39.2, 53.5, 51.8. Red and blue
 kernels at f/2, focused at 2 m, then differ from those of the known glass by 2 to 3 % of their light at 0.7 m (edges alone: 10 to 21 %) and
 by 17 to 25 % at 20 m (63 to 95 %). No published numbers were found for the other two lenses.
 """

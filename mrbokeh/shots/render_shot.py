@@ -1,22 +1,242 @@
 """Rendering of a shot from beginning to end: an executor renders the missing segments, then they are joined.
 
 Finished segments lie in a folder beside the result, with a manifest of their settings; a segment is never rendered twice.
+
+Targets are numbered pictures, and videos out of parts that are encoded on their own and joined packet by packet.
+Numbered EXR is linear in half, PNG and TIFF are 16-bit sRGB.
+
+Parts of a video are in the final encoding already, so that joining takes no time and no light away. That needs groups of pictures that
+do not refer to others (each part begins with a keyframe, and H.265 is told to close its groups) and encoders whose output does not
+depend on who runs them (one thread). The cut into segments never depends on the number of workers, so neither does the file: for
+ProRes, DNxHR and FFV1, where every picture stands alone, it is the one that would be written in one go; H.264 and H.265 get a keyframe
+at every segment.
 """
 
 import hashlib
 import shutil
-from collections.abc import Iterable
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, is_dataclass, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mrbokeh import __version__
+from mrbokeh.images.alpha_io import HOLDING_ALPHA, exr_part, in_named_space, write_finished
+from mrbokeh.images.color_management import NamedSpace
+from mrbokeh.images.exr_io import write_exr
+from mrbokeh.images.image_io import INTEGER_SUFFIXES, write_layer
+from mrbokeh.images.layer import Layer
 from mrbokeh.shots.executors import Executor, Progress
 from mrbokeh.shots.segment_task import SegmentTask
-from mrbokeh.shots.shot import MANIFEST, Segment, Shot
-from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.shots.shot import MANIFEST, PartSink, Picture, Rgba, Segment, Shot
+from mrbokeh.system.atomic_files import read_json, refuse_existing, write_json
 from mrbokeh.system.errors import InputError
-from mrbokeh.video.image_sequence import NumberedFiles, is_pattern
+from mrbokeh.video.encodings import encoding_for, encoding_name, with_alpha
+from mrbokeh.video.image_sequence import NumberedFiles, is_pattern, numbered
+from mrbokeh.video.writer import PacketWriter, VideoWriter, packets_of
+
+_EXR = ".exr"
+_THREADS = 1
+
+
+def in_space(picture: Picture, space: NamedSpace | None) -> Picture:
+    """Return the picture in a named colour space; None leaves linear Rec.709.
+
+    Curves are for straight colour: pictures with coverage are divided by it before them and multiplied after; light without coverage is
+    lost.
+    """
+    if isinstance(picture, (Layer, Rgba)):
+        return replace(picture, rgb=in_named_space(picture.rgb, picture.alpha, space))
+    return in_named_space(picture, None, space)
+
+
+@dataclass(frozen=True)
+class SequenceTarget:
+    """A Target. first_number: of the clip's frame 0, whether it is taken or not. layers: what is written is layers.
+
+    space: what the numbers of the pictures are; None is linear Rec.709 in EXR and sRGB in integers.
+    """
+
+    path: Path
+    first_number: int = 0
+    layers: bool = False
+    space: NamedSpace | None = None
+
+    @property
+    def settings(self) -> dict[str, str]:
+        numbers = f"{self.first_number} layers={self.layers}"
+        return {"container": self.path.name, "numbers": numbers, "output space": str(self.space or "")}
+
+    @property
+    def lacks_alpha(self) -> str | None:
+        suffix = self.path.suffix.lower()
+        return None if suffix in HOLDING_ALPHA else f"{suffix} cannot hold it (write .exr, .png or .tif)"
+
+    def require_new(self, shot: Shot, overwrite: bool) -> None:
+        suffix = self.path.suffix.lower()
+        if suffix != _EXR and (self.layers or suffix not in INTEGER_SUFFIXES):
+            expected = _EXR if self.layers else f"{_EXR}, {', '.join(INTEGER_SUFFIXES)}"
+            raise InputError(f"cannot write {self.path}: expected numbered {expected}, not {suffix or 'files without suffix'}")
+        if suffix != _EXR and self.space is not None and self.space.is_linear:
+            raise InputError(
+                f"{self.path}: {self.space.name} is linear light, which integers cut off at 1: write .exr, or name a space with a curve"
+            )
+        files = (self.file(index) for index in range(shot.start, shot.stop))
+        there = next((file for file in files if file.exists()), None)
+        if there is not None and not overwrite:
+            raise InputError(f"{there} exists already: give another name, or --overwrite to replace it")
+
+    def part(self, folder: Path, segment: Segment) -> Path:
+        return folder / f"{segment.number:05d}.json"
+
+    @contextmanager
+    def writing(self, shot: Shot, segment: Segment, folder: Path) -> Iterator[PartSink]:  # noqa: ARG002
+        yield _SequenceSink(self)
+        write_json(self.part(folder, segment), {"frames": [segment.start, segment.stop]})
+
+    def join(self, shot: Shot, folder: Path) -> str:  # noqa: ARG002
+        return "no audio"
+
+    def file(self, index: int) -> Path:
+        """Return the file of a frame of the clip."""
+        return numbered(self.path, self.first_number + index)
+
+
+@dataclass(frozen=True)
+class _SequenceSink:
+    target: SequenceTarget
+
+    def write(self, picture: Picture, index: int, time_s: float) -> None:  # noqa: ARG002
+        path, space = self.target.file(index), self.target.space
+        if isinstance(picture, Rgba):
+            write_finished(path, picture.rgb, picture.alpha, space)
+        elif not isinstance(picture, Layer):
+            write_finished(path, picture, None, space)
+        elif space is None:
+            write_layer(path, picture)
+        else:
+            part = exr_part(in_named_space(picture.rgb, picture.alpha, space), picture.alpha, space)
+            write_exr(path, replace(part, channels={**part.channels, "Z": picture.depth_m}))
+
+
+@dataclass(frozen=True)
+class VideoTarget:
+    """A Target. encoding: a name in ENCODINGS or None for the usual one of the suffix; audio_from: a video whose sound is copied.
+
+    space: what the codes are, where it is not BT.709 as the tags say then. even_rate: pictures per second of the result; at each of its
+    times it shows the nearest picture of the shot, which is held or left out for that.
+    """
+
+    path: Path
+    encoding: str | None = None
+    audio_from: Path | None = None
+    space: NamedSpace | None = None
+    even_rate: Fraction | None = None
+
+    @property
+    def settings(self) -> dict[str, str]:
+        return {
+            "encoding": repr(encoding_for(self.path, self.encoding)),
+            "container": self.path.suffix.lower(),
+            "output space": str(self.space or ""),
+            "even rate": str(self.even_rate or ""),
+        }
+
+    @property
+    def lacks_alpha(self) -> str | None:
+        if encoding_for(self.path, self.encoding).alpha:
+            return None
+        keeping = with_alpha(self.path)
+        instead = ".mov, .mkv or frames.%04d.exr" if keeping is None else f"--encoding {keeping}"
+        return f"{encoding_name(self.path, self.encoding)} cannot hold it (write {instead})"
+
+    def require_new(self, shot: Shot, overwrite: bool) -> None:
+        refuse_existing(self.path, overwrite)
+        encoding = encoding_for(self.path, self.encoding)
+        if self.space is not None and self.space.is_linear:
+            told = f"{self.space.name} is linear light, which codes of a video cannot hold"
+            raise InputError(f"{self.path}: {told}: write frames.%04d.exr, or name a space with a curve")
+        if self.even_rate is not None and not encoding.stands_alone:
+            told = f"--constant-rate needs pictures that stand alone, but those of {encoding.codec} refer to others"
+            raise InputError(f"{self.path}: {told}: take another --encoding")
+        writer = VideoWriter(self.path, *self._format(shot), encoding=self.encoding)
+        if self.path.suffix.lower() == ".mxf" and self.even_rate is None:
+            for segment in shot.segments:
+                for time_s in shot.times_s(segment):
+                    writer.next_tick(time_s)
+
+    def part(self, folder: Path, segment: Segment) -> Path:
+        suffix = self.path.suffix.lower()
+        return folder / f"{segment.number:05d}{encoding_for(self.path, self.encoding).part_suffix(suffix)}"
+
+    @contextmanager
+    def writing(self, shot: Shot, segment: Segment, folder: Path) -> Iterator[PartSink]:
+        name = encoding_name(self.path, self.encoding)
+        settings: dict[str, Any] = {"encoding": name, "threads": _THREADS, "as_codes": self.space is not None}
+        with VideoWriter(self.part(folder, segment), *self._format(shot), **settings) as writer:
+            yield _VideoSink(writer, self, shot.times_s(segment)[0], segment.start)
+
+    def join(self, shot: Shot, folder: Path) -> str:
+        reordered = max(packets_of(self.part(folder, segment))[1] for segment in shot.segments)
+        writer = PacketWriter(
+            self.path,
+            *self._format(shot),
+            encoding=self.encoding,
+            audio_from=self.audio_from,
+            audio_start_s=shot.begin_s,
+            reordered=reordered,
+            as_codes=self.space is not None,
+        )
+        with writer:
+            for segment in shot.segments:
+                packets, count = packets_of(self.part(folder, segment))[0], segment.frame_count
+                if len(packets) != count:
+                    raise InputError(f"{self.part(folder, segment)} holds {len(packets)} of {count} pictures: delete it and start again")
+                writer.append(*self._placed(packets, shot, segment))
+        return writer.audio_note
+
+    def _placed(self, packets: list[Any], shot: Shot, segment: Segment) -> tuple[list[Any], list[float]]:
+        """Return the packets of a part with the times at which they are shown; for an even rate some come twice and others never."""
+        if self.even_rate is None:
+            return packets, shot.times_s(segment)
+        first, last = segment.start - shot.start, segment.stop - shot.start
+        shown = enumerate(held_pictures(shot.all_times_s, self.even_rate))
+        here = [(packets[picture - first], float(tick / self.even_rate)) for tick, picture in shown if first <= picture < last]
+        return [packet for packet, _ in here], [time_s for _, time_s in here]
+
+    def _format(self, shot: Shot) -> tuple[Any, ...]:
+        info = shot.source.info
+        if self.even_rate is not None:
+            return info.width_px, info.height_px, self.even_rate, 1 / (self.even_rate * 1000)
+        return info.width_px, info.height_px, info.frame_rate, info.time_base
+
+
+def held_pictures(times_s: Sequence[float], rate: Fraction) -> list[int]:
+    """Return the picture that is nearest in time at 0, 1/rate, 2/rate and so on, as long as the last of them is shown (1/rate)."""
+    shown_s = np.asarray(times_s, np.float64)
+    ticks_s = np.arange(max(1, round(shown_s[-1] * rate) + 1)) / float(rate)
+    later = np.searchsorted((shown_s[1:] + shown_s[:-1]) / 2, ticks_s, side="right")
+    nearest: list[int] = later.tolist()
+    return nearest
+
+
+@dataclass(frozen=True)
+class _VideoSink:
+    writer: VideoWriter
+    target: VideoTarget
+    begin_s: float
+    start: int
+
+    def write(self, picture: Picture, index: int, time_s: float) -> None:
+        kept = picture.rgb if isinstance(picture, Rgba) and not self.writer.encoding.alpha else picture
+        stored = in_space(kept, self.target.space)
+        if isinstance(stored, (Layer, Rgba)):
+            stored = np.dstack([stored.rgb, stored.alpha])
+        rate = self.target.even_rate
+        self.writer.write(stored, time_s - self.begin_s if rate is None else float((index - self.start) / rate))
 
 
 def render_shot(shot: Shot, executor: Executor, *, overwrite: bool = False, progress: Progress = lambda _: None) -> str:

@@ -28,9 +28,8 @@ from mrbokeh.tracking.world_axes import upright_camera
 from tests.bench.machine import machine_line, memory_line
 from tests.scenes.stage_scenes import looking
 from viewfinder.stage.drawing import Drawing, DrawRequest, RenderSetup, draw
-from viewfinder.stage.drawing_thread import RESOLUTIONS
 from viewfinder.stage.reprojection import LayerDepth
-from viewfinder.stage.stage import Stage
+from viewfinder.stage.stage import RESOLUTIONS, Stage
 from viewfinder.stage.stage_setup import live_backend, live_renderer
 from viewfinder.tracking.tracker import TrackedPose
 

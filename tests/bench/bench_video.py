@@ -24,9 +24,8 @@ from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.shots.composite_recipe import CompositeRecipe
 from mrbokeh.shots.executors import Executor, ProcessExecutor, SerialExecutor
 from mrbokeh.shots.frame_sources import FocusPulled
-from mrbokeh.shots.render_shot import render_shot
+from mrbokeh.shots.render_shot import VideoTarget, render_shot
 from mrbokeh.shots.shot import SEGMENT_S, MakerRecipe, Shot
-from mrbokeh.shots.targets import VideoTarget
 from mrbokeh.video.clip import probe
 from mrbokeh.video.picture_source import open_source
 from mrbokeh.video.writer import VideoWriter

@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from mrbokeh.compositing.between import Between, clean_colours
+from mrbokeh.compositing.between import Between, clean_colours, virtual_highlights
 from mrbokeh.compositing.near_and_far import NO_HIGHLIGHTS, NearAndFar, cut_in_two, nearer_than
 from mrbokeh.compositing.plate import Plate, plate_of
 from mrbokeh.compositing.pupil_shares import Rays, pupil_points, transmission
-from mrbokeh.compositing.three_parts import virtual_highlights
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
@@ -266,7 +265,7 @@ def test_lights_whose_discs_come_to_no_wanted_pixel_are_not_followed(monkeypatch
     rays.virtual.rgb[[20, 6, 30], [70, 20, 50]] = 100.0
     wanted[:, 72:] = True
     few = virtual_highlights(rays, wanted)
-    monkeypatch.setattr("mrbokeh.compositing.three_parts._arriving", lambda *given: given[1])
+    monkeypatch.setattr("mrbokeh.compositing.between._arriving", lambda *given: given[1])
     every = virtual_highlights(rays, wanted)
     assert few.one[wanted].sum() > 10.0 and few.one.sum() < 0.5 * every.one.sum()
     np.testing.assert_array_equal(few.one[wanted], every.one[wanted])

@@ -19,10 +19,9 @@ import pytest
 
 from mrbokeh.images.image_io import read_image, read_layer, write_image
 from mrbokeh.shots.executors import Executor, ProcessExecutor, SerialExecutor
-from mrbokeh.shots.render_shot import PartsFolder, render_shot
+from mrbokeh.shots.render_shot import PartsFolder, SequenceTarget, VideoTarget, render_shot
 from mrbokeh.shots.segment_task import SegmentTask, render_segment
 from mrbokeh.shots.shot import FrameMaker, MakerRecipe, Shot, Target
-from mrbokeh.shots.targets import SequenceTarget, VideoTarget
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import probe, read_frames
 from mrbokeh.video.picture_source import open_source

@@ -14,8 +14,7 @@ import pytest
 
 from mrbokeh import __version__
 from mrbokeh.shots.executors import DaskExecutor, Executor, SerialExecutor, require_same_files
-from mrbokeh.shots.render_shot import render_shot
-from mrbokeh.shots.targets import VideoTarget
+from mrbokeh.shots.render_shot import VideoTarget, render_shot
 from mrbokeh.system.errors import InputError
 from tests.compositing.test_shots import COUNT, clip_of_blobs, opened_once_two_work, shot_of
 from tests.scenes.shot_makers import Brighter, wait_for

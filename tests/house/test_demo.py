@@ -13,9 +13,15 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from mrbokeh.demo.measurements import camera_measurements, depth_error, merge_measurements, placement_measurement, read_truth
 from mrbokeh.demo.plan import VIEWS, demo_stages
-from mrbokeh.demo.report import write_depth_pictures
+from mrbokeh.demo.report import (
+    camera_measurements,
+    depth_error,
+    merge_measurements,
+    placement_measurement,
+    read_truth,
+    write_depth_pictures,
+)
 from mrbokeh.demo.stages import Record, Stage, must_be_anew, read_record, run_stages, write_record
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.image_io import write_image, write_layer

@@ -17,10 +17,9 @@ from mrbokeh.layering.layering import Layering
 from mrbokeh.lens_measuring.fitting._pupil_rows_numba import gather_rows
 from mrbokeh.lens_measuring.fitting.evidence import Evidence, Knots, Sharing, simplest_of
 from mrbokeh.lens_measuring.fitting.fit_results import bank_of, picture_at
-from mrbokeh.lens_measuring.fitting.lens_fit import FitSettings, LensFit, fit_lens
+from mrbokeh.lens_measuring.fitting.lens_fit import FitSettings, LensFit, fit_lens, on_simplex
 from mrbokeh.lens_measuring.fitting.point_lights import PointLight, find_lights
 from mrbokeh.lens_measuring.fitting.pupil_picture import PupilGrid, kernel_of
-from mrbokeh.lens_measuring.fitting.solving import on_simplex
 from mrbokeh.lens_measuring.fitting.stack_equations import SliceView, StackSlices, drawn_pixels, equations_of, smoothed_coc, usable_pixels
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens

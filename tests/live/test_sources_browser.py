@@ -14,14 +14,13 @@ import aiohttp
 import aiortc
 import numpy as np
 import pytest
-from aiohttp import web
 
 from mrbokeh.system.errors import InputError
-from tests.scenes.browser_sender import HEIGHT, WIDTH, Canvas, Sender
-from tests.scenes.waiting import comes_true, in_time
+from tests.scenes.browser_sender import HEIGHT, WIDTH, Canvas, sending
+from tests.scenes.streaming_viewers import serving_routes
+from tests.scenes.waiting import comes_true
 from viewfinder.frames import CameraFrame
-from viewfinder.sources.browser_camera import LONGEST_OFFER_BYTES, BrowserCameraSource
-from viewfinder.sources.camera_message import LONGEST_MESSAGE, CameraKnowledge
+from viewfinder.sources.browser_camera import LONGEST_MESSAGE, LONGEST_OFFER_BYTES, BrowserCameraSource, CameraKnowledge
 from viewfinder.sources.frame_source import SizeLimit
 
 RED, GREEN = (40, 60, 200), (60, 190, 50)
@@ -60,22 +59,14 @@ class Reader:
 
 
 @asynccontextmanager
-async def serving(source: BrowserCameraSource) -> AsyncIterator[tuple[str, aiohttp.ClientSession, Reader]]:
-    app = web.Application()
-    app.add_routes(source.routes("/whip"))
-    runner = web.AppRunner(app)
-    await runner.setup()
-    site = web.TCPSite(runner, "127.0.0.1", 0)
-    await site.start()
-    port = site._server.sockets[0].getsockname()[1]  # type: ignore[union-attr]
+async def serving(source: BrowserCameraSource) -> AsyncIterator[tuple[str, Reader]]:
     reader = Reader(source)
-    try:
-        async with aiohttp.ClientSession() as session:
-            yield f"http://127.0.0.1:{port}", session, reader
-    finally:
-        reader.stop()
-        await source.close()
-        await runner.cleanup()
+    async with serving_routes(source.routes("/whip")) as url:
+        try:
+            yield url, reader
+        finally:
+            reader.stop()
+            await source.close()
 
 
 @pytest.fixture(autouse=True)
@@ -87,193 +78,146 @@ def no_thread_stays() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("codec", ["video/VP8", "video/H264"])
-def test_pictures_arrive_in_colour_and_follow_the_size_that_is_sent(codec: str) -> None:
-    async def work() -> None:
-        source = BrowserCameraSource()
-        async with serving(source) as (url, session, reader):
-            assert source.status == "waiting for a browser camera"
-            sender = Sender(url, Canvas(RED), codec)
-            await sender.start(session)
+async def test_pictures_arrive_in_colour_and_follow_the_size_that_is_sent(codec: str) -> None:
+    source = BrowserCameraSource()
+    async with serving(source) as (url, reader):
+        assert source.status == "waiting for a browser camera"
+        async with sending(url, Canvas(RED), codec) as sender:
             assert codec.split("/")[1] in sender.peer.remoteDescription.sdp
             await comes_true(lambda: reader.shows(RED))
             assert source.status is None and source.transfer == "bt709"
             sender.track.bgr, sender.track.size_px = GREEN, (WIDTH // 2, HEIGHT // 2)
             await comes_true(lambda: reader.shows(GREEN, WIDTH // 2))
             assert np.all(np.diff(reader.sequences) >= 1)
-            await sender.peer.close()
-
-    in_time(work)
 
 
-def test_vp8_of_high_definition_has_the_matrix_of_bt601() -> None:
+async def test_vp8_of_high_definition_has_the_matrix_of_bt601() -> None:
     """Untagged pictures of that size are taken for BT.709 elsewhere, which would leave green 20 codes off."""
-
-    async def work() -> None:
-        async with serving(BrowserCameraSource(SizeLimit(160, 160))) as (url, session, reader):
-            sender = Sender(url, Canvas(GREEN))
-            sender.track.size_px = (1280, 720)
-            await sender.start(session)
-            await comes_true(lambda: reader.shows(GREEN, 160))
-            assert reader.newest is not None and reader.newest.bgr.shape == (90, 160, 3)
-            await sender.peer.close()
-
-    in_time(work)
+    large = Canvas(GREEN)
+    large.size_px = (1280, 720)
+    async with serving(BrowserCameraSource(SizeLimit(160, 160))) as (url, reader), sending(url, large):
+        await comes_true(lambda: reader.shows(GREEN, 160))
+        assert reader.newest.bgr.shape == (90, 160, 3)
 
 
-def test_nobody_reads_and_nothing_piles_up() -> None:
+async def test_nobody_reads_and_nothing_piles_up() -> None:
     """aiortc's queue is emptied whether or not frames are asked for, and the source keeps one frame."""
-
-    async def work() -> None:
-        source = BrowserCameraSource()
-        async with serving(source) as (url, session, reader):
-            reader.stop()
-            sender = Sender(url, Canvas(RED))
-            await sender.start(session)
+    source = BrowserCameraSource()
+    async with serving(source) as (url, reader):
+        reader.stop()
+        async with sending(url, Canvas(RED)):
             await comes_true(lambda: source._newest.waiting)
             await asyncio.sleep(0.5)
-            assert source._session is not None
-            (transceiver,) = [each for each in source._session._peer.getTransceivers() if each.kind == "video"]
-            assert transceiver.receiver.track._queue.qsize() <= 1
+            receiver = receiver_of(source)
+            assert receiver.track._queue.qsize() <= 1
             # The buffer that releases on the marker is the one in use.
-            assert type(transceiver.receiver._RTCRtpReceiver__jitter_buffer).__name__ == "MarkerJitterBuffer"
-            taken = source._newest.take(0.0)
-            assert taken is not None and taken[0] > 3
-            await sender.peer.close()
-
-    in_time(work)
+            assert type(receiver._RTCRtpReceiver__jitter_buffer).__name__ == "MarkerJitterBuffer"
+            assert source._newest.take(0.0)[0] > 3
 
 
-def test_loss_and_reordering_on_the_way_cost_no_torn_picture(caplog: pytest.LogCaptureFixture) -> None:
+def receiver_of(source: BrowserCameraSource) -> Any:
+    (found,) = [each.receiver for each in source._session._peer.getTransceivers() if each.kind == "video"]
+    return found
+
+
+async def test_loss_and_reordering_on_the_way_cost_no_torn_picture(caplog: pytest.LogCaptureFixture) -> None:
     """Each tenth packet is lost once and some arrive late: pictures go on in order, and the decoder never gets a broken one."""
-    draw = random.Random(4)
-
-    async def work() -> None:
-        source = BrowserCameraSource()
-        async with serving(source) as (url, session, reader):
-            sender = Sender(url, Canvas(RED), "video/H264")
-            sender.track.noise = 120
-            await sender.start(session)
-            await comes_true(lambda: reader.newest is not None)
-            assert source._session is not None
-            (receiver,) = [each.receiver for each in source._session._peer.getTransceivers() if each.kind == "video"]
-            handle, lost, late = receiver._handle_rtp_packet, list[int](), list[Any]()
-
-            async def lossy(packet: Any, arrival_time_ms: int) -> None:
-                if draw.random() < 0.1:
-                    lost.append(packet.sequence_number)
-                elif draw.random() < 0.1 and not late:
-                    late.append(packet)
-                else:
-                    await handle(packet, arrival_time_ms=arrival_time_ms)
-                    while late:
-                        await handle(late.pop(), arrival_time_ms=arrival_time_ms)
-
-            receiver._handle_rtp_packet = lossy
-            before = reader.sequences[-1]
-            await comes_true(lambda: len(lost) > 10 and reader.sequences[-1] > before + 30)
-            assert np.all(np.diff(reader.sequences) >= 1)
-            await sender.peer.close()
-
+    draw, noisy = random.Random(4), Canvas(RED)
+    noisy.noise = 120
     caplog.set_level("WARNING", logger="aiortc.rtcrtpreceiver")
-    in_time(work)
+    source = BrowserCameraSource()
+    async with serving(source) as (url, reader), sending(url, noisy, "video/H264"):
+        await comes_true(lambda: reader.newest is not None)
+        receiver = receiver_of(source)
+        handle, lost, late = receiver._handle_rtp_packet, list[int](), list[Any]()
+
+        async def lossy(packet: Any, arrival_time_ms: int) -> None:
+            if draw.random() < 0.1:
+                lost.append(packet.sequence_number)
+            elif draw.random() < 0.1 and not late:
+                late.append(packet)
+            else:
+                await handle(packet, arrival_time_ms=arrival_time_ms)
+                while late:
+                    await handle(late.pop(), arrival_time_ms=arrival_time_ms)
+
+        receiver._handle_rtp_packet = lossy
+        before = reader.sequences[-1]
+        await comes_true(lambda: len(lost) > 10 and reader.sequences[-1] > before + 30)
+        assert np.all(np.diff(reader.sequences) >= 1)
     assert not [each for each in caplog.records if "failed to decode" in each.getMessage()]
 
 
-def test_focus_and_pose_travel_with_the_frames() -> None:
-    async def work() -> None:
-        source = BrowserCameraSource()
-        async with serving(source) as (url, session, reader):
-            sender = Sender(url, Canvas(RED))
-            await sender.start(session)
-            await comes_true(lambda: sender.channel.readyState == "open" and reader.shows(RED))
-            assert reader.newest is not None and reader.newest.camera_from_world is None
-            identity = [float(i % 5 == 0) for i in range(16)]
-            sender.channel.send(json.dumps({"focusDistance": 0.8, "pose": [*identity[:12], 1.0, 2.0, 3.0, 1.0]}))
-            await comes_true(lambda: reader.newest is not None and reader.newest.lens.focus_distance_m == 0.8)
-            # A camera at (1, 2, 3) of a world with y up and z backward stands at (1, -2, -3) of ours.
-            np.testing.assert_allclose(reader.newest.camera_from_world[:3, 3], (-1.0, 2.0, 3.0))
-            for bad in ("no json", "[]", '{"focusDistance": -1}', "x" * (LONGEST_MESSAGE + 1)):
-                sender.channel.send(bad)
-            await comes_true(lambda: len(sender.answers) == 4)
-            assert all(list(each) == ["error"] for each in sender.answers)
-            assert reader.newest.lens.focus_distance_m == 0.8
-            await sender.peer.close()
-
-    in_time(work)
+async def test_focus_and_pose_travel_with_the_frames() -> None:
+    async with serving(BrowserCameraSource()) as (url, reader), sending(url, Canvas(RED)) as sender:
+        await comes_true(lambda: sender.channel.readyState == "open" and reader.shows(RED))
+        assert reader.newest.camera_from_world is None
+        identity = [float(i % 5 == 0) for i in range(16)]
+        sender.channel.send(json.dumps({"focusDistance": 0.8, "pose": [*identity[:12], 1.0, 2.0, 3.0, 1.0]}))
+        await comes_true(lambda: reader.newest.lens.focus_distance_m == 0.8)
+        # A camera at (1, 2, 3) of a world with y up and z backward stands at (1, -2, -3) of ours.
+        np.testing.assert_allclose(reader.newest.camera_from_world[:3, 3], (-1.0, 2.0, 3.0))
+        for bad in ("no json", "[]", '{"focusDistance": -1}', "x" * (LONGEST_MESSAGE + 1)):
+            sender.channel.send(bad)
+        await comes_true(lambda: len(sender.answers) == 4)
+        assert all(list(each) == ["error"] for each in sender.answers)
+        assert reader.newest.lens.focus_distance_m == 0.8
 
 
-def test_a_camera_goes_is_replaced_and_comes_again() -> None:
-    async def work() -> None:
-        source = BrowserCameraSource()
-        async with serving(source) as (url, session, reader):
-            first = Sender(url, Canvas(RED))
-            await first.start(session)
+async def test_a_camera_goes_is_replaced_and_comes_again() -> None:
+    source = BrowserCameraSource()
+    async with serving(source) as (url, reader), aiohttp.ClientSession() as session:
+        async with sending(url, Canvas(RED)) as first:
             await comes_true(lambda: reader.shows(RED))
             # The page is loaded anew without a good-bye: the newer camera counts.
-            second = Sender(url, Canvas(GREEN))
-            await second.start(session)
-            await comes_true(lambda: reader.shows(GREEN))
-            assert first.location != second.location
-            await comes_true(lambda: first.peer.connectionState in ("closed", "failed"))
-            async with session.delete(url + first.location) as answer:
-                assert answer.status == 404
-            async with session.delete(url + second.location) as answer:
-                assert answer.status == 200
-            await comes_true(lambda: source.status is not None)
-            assert "waiting" in str(source.status)
-            third = Sender(url, Canvas(RED))
-            await third.start(session)
-            await comes_true(lambda: reader.shows(RED) and source.status is None)
-            for each in (first, second, third):
-                await each.peer.close()
-            await comes_true(lambda: "waiting" in str(source.status))
-
-    in_time(work)
+            async with sending(url, Canvas(GREEN)) as second:
+                await comes_true(lambda: reader.shows(GREEN))
+                assert first.location != second.location
+                await comes_true(lambda: first.peer.connectionState in ("closed", "failed"))
+                for sender, status in ((first, 404), (second, 200)):
+                    async with session.delete(url + sender.location) as answer:
+                        assert answer.status == status
+                await comes_true(lambda: "waiting" in str(source.status))
+                async with sending(url, Canvas(RED)):
+                    await comes_true(lambda: reader.shows(RED) and source.status is None)
+        await comes_true(lambda: "waiting" in str(source.status))
 
 
-def test_offers_that_make_no_sense_change_nothing() -> None:
-    async def work() -> None:
-        source = BrowserCameraSource()
-        async with serving(source) as (url, session, reader):
-            sender = Sender(url, Canvas(RED))
-            await sender.start(session)
-            await comes_true(lambda: reader.shows(RED))
-            sdp = {"Content-Type": "application/sdp"}
-            listener = aiortc.RTCPeerConnection(aiortc.RTCConfiguration(iceServers=[]))
-            listener.addTransceiver("audio", direction="sendrecv")
-            await listener.setLocalDescription(await listener.createOffer())
-            sound_only = listener.localDescription.sdp.encode()
-            cases = [
-                (b"v=0", sdp, 400),
-                (b"\xff\xfe not sdp", sdp, 400),
-                (b"", sdp, 400),
-                (b"v=0\r\nm=video x y\r\n", sdp, 400),
-                (sound_only, sdp, 400),
-                (b"x" * (LONGEST_OFFER_BYTES + 1), sdp, 413),
-                (b"{}", {"Content-Type": "application/json"}, 415),
-            ]
-            for body, headers, status in cases:
-                async with session.post(url + "/whip", data=body, headers=headers) as answer:
-                    assert answer.status == status, body[:30]
-                    assert "expected" in await answer.text()
-            async with session.patch(url + sender.location, data=b"") as answer:
-                assert answer.status == 405
-            before = reader.sequences[-1]
-            await comes_true(lambda: reader.sequences[-1] > before + 2)
-            await listener.close()
-            await sender.peer.close()
-
-    in_time(work)
+async def test_offers_that_make_no_sense_change_nothing() -> None:
+    source = BrowserCameraSource()
+    async with serving(source) as (url, reader), sending(url, Canvas(RED)) as sender, aiohttp.ClientSession() as session:
+        await comes_true(lambda: reader.shows(RED))
+        sdp = {"Content-Type": "application/sdp"}
+        listener = aiortc.RTCPeerConnection(aiortc.RTCConfiguration(iceServers=[]))
+        listener.addTransceiver("audio", direction="sendrecv")
+        await listener.setLocalDescription(await listener.createOffer())
+        sound_only = listener.localDescription.sdp.encode()
+        cases = [
+            (b"v=0", sdp, 400),
+            (b"\xff\xfe not sdp", sdp, 400),
+            (b"", sdp, 400),
+            (b"v=0\r\nm=video x y\r\n", sdp, 400),
+            (sound_only, sdp, 400),
+            (b"x" * (LONGEST_OFFER_BYTES + 1), sdp, 413),
+            (b"{}", {"Content-Type": "application/json"}, 415),
+        ]
+        for body, headers, status in cases:
+            async with session.post(url + "/whip", data=body, headers=headers) as answer:
+                assert answer.status == status, body[:30]
+                assert "expected" in await answer.text()
+        async with session.patch(url + sender.location, data=b"") as answer:
+            assert answer.status == 405
+        before = reader.sequences[-1]
+        await comes_true(lambda: reader.sequences[-1] > before + 2)
+        await listener.close()
 
 
 def test_orientations_point_where_the_camera_looks() -> None:
     """A phone held upright towards the north has its screen's z to the south: turned about x by 90 degrees. Its camera looks north."""
     known = CameraKnowledge().told(json.dumps({"orientation": [math.sin(math.pi / 4), 0, 0, math.cos(math.pi / 4)]}))
-    assert known.camera_from_world is not None
     np.testing.assert_allclose(known.camera_from_world, np.eye(4), atol=1e-12)
     # Flat on a table, screen up, its top to the north, the camera looks down (+y of ours), the picture's top is north (+z).
     flat = CameraKnowledge().told('{"orientation": [0, 0, 0, 1]}').camera_from_world
-    assert flat is not None
     np.testing.assert_allclose(flat[:3, :3] @ (0, 1, 0), (0, 0, 1), atol=1e-12)
     np.testing.assert_allclose(flat[:3, :3] @ (0, 0, 1), (0, -1, 0), atol=1e-12)
 
@@ -282,7 +226,6 @@ def test_webxr_poses_become_ours() -> None:
     """A camera that WebXR turned 90 degrees to the left (about y up) looks along -x; what lies there is ahead of it."""
     turned = [0, 0, -1, 0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 1]
     pose = CameraKnowledge().told(json.dumps({"pose": turned})).camera_from_world
-    assert pose is not None
     np.testing.assert_allclose(pose @ (-2, 0, 0, 1), (0, 0, 2, 1), atol=1e-12)
 
 

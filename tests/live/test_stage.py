@@ -19,9 +19,8 @@ from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.system.errors import InputError
 from tests.objects.test_scene_gltf import GlbWriter
-from tests.scenes.stage_scenes import FOCAL_PX, HEIGHT, LENS, ONE_CARD, WIDTH, backend, camera, scene_file
-from viewfinder.stage.drawing_thread import AdaptiveResolution
-from viewfinder.stage.stage import Fade, Stage
+from tests.scenes.stage_scenes import FOCAL_PX, HEIGHT, LENS, ONE_CARD, WIDTH, backend, camera, centroid, scene_file
+from viewfinder.stage.stage import AdaptiveResolution, Fade, Stage
 from viewfinder.stage.stage_setup import live_renderer
 from viewfinder.tracking.tracker import TrackedPose
 
@@ -58,7 +57,6 @@ class Stream:
         return self.until(lambda: self.stage.seen is not None and self._is_fresh())
 
     def _is_fresh(self) -> bool:
-        assert self.stage.seen is not None
         request = self.stage.seen.drawing.request
         same_pose = np.array_equal(request.camera.camera_from_world, self.view.camera_from_world)
         return same_pose and request.camera.width_px == self.view.width_px and request.lens == self.lens
@@ -72,9 +70,7 @@ def stage(tmp_path: Path) -> Iterator[Stage]:
 
 
 def centre_px(overlay: Overlay, view: Camera) -> tuple[float, float]:
-    light = overlay.over(np.zeros((view.height_px, view.width_px, 3), np.float32))[..., 0]
-    columns, rows = np.meshgrid(np.arange(view.width_px) + 0.5, np.arange(view.height_px) + 0.5)
-    return float((light * columns).sum() / light.sum()), float((light * rows).sum() / light.sum())
+    return centroid(overlay.over(np.zeros((view.height_px, view.width_px, 3), np.float32))[..., 0])
 
 
 def rewrite(path: Path, text: str) -> None:
@@ -96,7 +92,6 @@ def test_the_object_appears_where_it_stands_and_moves_with_every_frame(stage: St
 def test_nothing_is_drawn_again_when_nothing_moved(stage: Stage) -> None:
     stream = Stream(stage, camera())
     stream.settled()
-    assert stage.seen is not None
     drawing = stage.seen.drawing
     for _ in range(60):
         stream.frame()

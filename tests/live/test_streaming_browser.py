@@ -4,28 +4,24 @@ import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from aiohttp import web
 
-from datasets_scripts.gallery.headless_chromium import CHROMIUM, chromium_page
+from datasets_scripts.gallery.pictures import Page, chromium_page
 from mrbokeh.compositing.overlay import Overlay
 from mrbokeh.video.color import code_from_linear
-from tests.scenes.streaming_viewers import BARS, Feed, bars, output, streaming
-from tests.scenes.waiting import in_time
+from tests.live.test_page_browser import IN_CHROMIUM
+from tests.scenes.streaming_viewers import BARS, Feed, bars, output, serving_routes, streaming
 from viewfinder.streaming.other_programs import AlphaStream, obs_routes
 from viewfinder.streaming.whep import Whep
 
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed; the page is tested by clients in Python only"),
-]
+pytestmark = IN_CHROMIUM
 
 PAGE = """<video autoplay muted playsinline></video><script>
 const video = document.querySelector("video");
-window.shown = []; window.messages = []; window.failure = null;
+window.shown = []; window.messages = [];
 const next = (_, picture) => { shown.push(picture.rtpTimestamp); video.requestVideoFrameCallback(next); };
 video.requestVideoFrameCallback(next);
 async function play() {
@@ -38,7 +34,7 @@ async function play() {
   const answer = await fetch("whep", { method: "POST", headers: { "Content-Type": "application/sdp" }, body: peer.localDescription.sdp });
   await peer.setRemoteDescription({ type: "answer", sdp: await answer.text() });
 }
-play().catch((error) => { window.failure = String(error); });
+play();
 </script>"""
 # The middles of eight columns of what an element shows, as [red, green, blue, alpha].
 MIDDLES = """(() => { const shown = document.querySelector("ELEMENT"), copy = document.createElement("canvas");
@@ -47,51 +43,35 @@ MIDDLES = """(() => { const shown = document.querySelector("ELEMENT"), copy = do
 
 
 @asynccontextmanager
-async def page_of(routes: list[web.RouteDef], whep: Whep, path: str, profile: Path) -> AsyncIterator[Any]:
-    """A browser on a path of a server with these routes; gives a function that evaluates an expression."""
-    app = web.Application()
-    app.add_routes(routes)
-    runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
-    await runner.setup()
-    try:
-        await web.TCPSite(runner, "127.0.0.1", 0).start()
-        async with chromium_page(f"http://127.0.0.1:{runner.addresses[0][1]}{path}", profile, size_px=(800, 600)) as page:
-            yield page.value
-    finally:
-        await whep.close()
-        await runner.cleanup()
-
-
-async def comes_true(value: Any, expression: str) -> None:
-    for _ in range(300):
-        if await value(expression):
-            return
-        await asyncio.sleep(0.05)
-    raise AssertionError(f"never true: {expression}; {await value('window.failure')}")
+async def page_of(routes: list[web.RouteDef], whep: Whep, path: str, profile: Path) -> AsyncIterator[Page]:
+    """A browser on a path of a server with these routes."""
+    async with serving_routes(routes) as url:
+        try:
+            async with chromium_page(url + path, profile, size_px=(800, 600)) as page:
+                yield page
+        finally:
+            await whep.close()
 
 
 @pytest.mark.parametrize("codec", ["H264", "VP8"])
-def test_colours_are_right_on_the_screen_and_pictures_have_their_names(tmp_path: Path, codec: str) -> None:
+async def test_colours_are_right_on_the_screen_and_pictures_have_their_names(tmp_path: Path, codec: str) -> None:
     async def index(_request: web.Request) -> web.Response:
         return web.Response(text=PAGE.replace("CODEC", codec), content_type="text/html")
 
-    async def work() -> None:
-        # As large as HD, where browsers would take what is untagged for BT.709.
-        with streaming() as stream, Feed(stream, lambda _: bars(1280, 720), 20.0):
-            whep = Whep(stream)
-            async with page_of([web.get("/", index), *whep.routes()], whep, "/", tmp_path) as value:
-                await comes_true(value, "window.shown && shown.length > 20 && messages.length > 20")
-                seen = np.array(await value(MIDDLES.replace("ELEMENT", "video").replace("WIDTH", "1280").replace("HEIGHT", "720")))
-                # Limited range and whole codes of luma and chroma cost up to 2 (BT.709 shown as 601 would cost 39).
-                np.testing.assert_allclose(seen[:, 2::-1], BARS.astype(int), atol=3)
-                named = await value("shown.filter((each) => messages.some((message) => message.rtp_timestamp === each)).length")
-                assert named >= await value("shown.length") - 3
-                assert set(stream.encoded) == {codec}
-
-    in_time(work, 60.0)
+    # As large as HD, where browsers would take what is untagged for BT.709.
+    with streaming() as stream, Feed(stream, lambda _: bars(1280, 720), 20.0):
+        whep = Whep(stream)
+        async with page_of([web.get("/", index), *whep.routes()], whep, "/", tmp_path) as page:
+            await page.comes_true("window.shown && shown.length > 20 && messages.length > 20")
+            seen = np.array(await page.value(MIDDLES.replace("ELEMENT", "video").replace("WIDTH", "1280").replace("HEIGHT", "720")))
+            # Limited range and whole codes of luma and chroma cost up to 2 (BT.709 shown as 601 would cost 39).
+            np.testing.assert_allclose(seen[:, 2::-1], BARS.astype(int), atol=3)
+            named = await page.value("shown.filter((each) => messages.some((message) => message.rtp_timestamp === each)).length")
+            assert named >= await page.value("shown.length") - 3
+            assert set(stream.encoded) == {codec}
 
 
-def test_obs_gets_colour_and_alpha(tmp_path: Path) -> None:
+async def test_obs_gets_colour_and_alpha(tmp_path: Path) -> None:
     """Columns of the picture: nothing, an opaque surface of half the light, the same half covered, a glow without coverage."""
     width, height = 320, 180
     light = np.zeros((height, width, 3), np.float32)
@@ -112,22 +92,19 @@ def test_obs_gets_colour_and_alpha(tmp_path: Path) -> None:
                 sequence += 1
             await asyncio.sleep(0.05)
 
-    async def work() -> None:
-        with streaming() as stream:
-            alpha, whep = AlphaStream(stream, "srgb"), Whep(stream)
-            feeding = asyncio.ensure_future(feed(alpha))
-            async with page_of(obs_routes(whep), whep, "/obs", tmp_path) as value:
-                await comes_true(value, "document.querySelector('canvas')?.height === 180")
-                # Straight from the drawing buffer, which is premultiplied; the row in the middle, first column of each quarter's middle.
-                expression = """(() => { const gl = document.querySelector("canvas").getContext("webgl"), all = [];
-                  for (const x of [40, 120, 200, 280]) { const one = new Uint8Array(4);
-                    gl.readPixels(x, 90, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, one); all.push([...one]); } return all; })()"""
-                await comes_true(value, f"{expression}[1][3] > 200")
-                seen = np.array(await value(expression))
-            feeding.cancel()
-            alpha.close()
-        np.testing.assert_allclose(seen, expected, atol=5)
-        assert seen[0].tolist() == [0, 0, 0, 0]
-        assert seen[1, 3] == 255
-
-    in_time(work, 60.0)
+    with streaming() as stream:
+        alpha, whep = AlphaStream(stream, "srgb"), Whep(stream)
+        feeding = asyncio.ensure_future(feed(alpha))
+        async with page_of(obs_routes(whep), whep, "/obs", tmp_path) as page:
+            await page.comes_true("document.querySelector('canvas')?.height === 180")
+            # Straight from the drawing buffer, which is premultiplied; the row in the middle, first column of each quarter's middle.
+            expression = """(() => { const gl = document.querySelector("canvas").getContext("webgl"), all = [];
+              for (const x of [40, 120, 200, 280]) { const one = new Uint8Array(4);
+                gl.readPixels(x, 90, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, one); all.push([...one]); } return all; })()"""
+            await page.comes_true(f"{expression}[1][3] > 200")
+            seen = np.array(await page.value(expression))
+        feeding.cancel()
+        alpha.close()
+    np.testing.assert_allclose(seen, expected, atol=5)
+    assert seen[0].tolist() == [0, 0, 0, 0]
+    assert seen[1, 3] == 255

@@ -1,6 +1,7 @@
 """OpenTrackIO and FreeD: bytes, checksums, segments, axes and lens tables."""
 
 import csv
+import itertools
 import json
 import math
 import struct
@@ -16,7 +17,9 @@ from mrbokeh.tracking.world_axes import inverted, pan_tilt_roll_deg, rigid
 from tests.scenes.tracking_senders import encode_opentrackio, freed_message, opentrackio_document, packets, write_freed
 from viewfinder.frames import LensState
 from viewfinder.tracking.freed import FreeDMessage, FreeDReading, freed_sample, read_encoder_table, read_freed
-from viewfinder.tracking.opentrackio import (
+from viewfinder.tracking.phone_rig import rigid_of
+from viewfinder.tracking.pose_history import MalformedMessageError, TrackingSample, lens_between
+from viewfinder.tracking.socket_tracker import (
     CBOR,
     JSON,
     Reassembly,
@@ -25,8 +28,6 @@ from viewfinder.tracking.opentrackio import (
     fletcher16,
     read_packet,
 )
-from viewfinder.tracking.phone_rig import rigid_of
-from viewfinder.tracking.pose_history import MalformedMessageError, TrackingSample, lens_between
 
 IDENTITY = {"pan": 0.0, "tilt": 0.0, "roll": 0.0}
 
@@ -49,11 +50,6 @@ def seen_at(sample: TrackingSample, stage_m: tuple[float, float, float]) -> np.n
     """A point of the stage in camera axes. Ours: the stage's ground with y and z turned round (tracking/stage_axes)."""
     world = np.array([stage_m[0], -stage_m[1], -stage_m[2], 1.0])
     return (sample.camera_from_world @ world)[:3]
-
-
-def test_fletchers_checksum_is_that_of_the_specification() -> None:
-    """OpenTrackIO sums modulo 256: "abcde" gives 97, 195, 38, 138, 239 and 97, 36, 74, 212, 195; modulo 255 it would be 0xC8F0."""
-    assert fletcher16(b"abcde") == 0xC3EF
 
 
 # Where a point must be seen follows from the words: X right, Y forward, Z up; ours is x right, y down, z forward.
@@ -134,14 +130,13 @@ def test_random_bytes_are_malformed_and_nothing_worse() -> None:
 
 
 def fletcher_plainly(data: bytes) -> int:
-    first = second = 0
-    for byte in data:
-        first = (first + byte) % 256
-        second = (second + first) % 256
-    return second << 8 | first
+    sums = list(itertools.accumulate(data))
+    return sum(sums) % 256 << 8 | sums[-1] % 256
 
 
 def test_fletcher() -> None:
+    """OpenTrackIO sums modulo 256: "abcde" gives 97, 195, 38, 138, 239 and 97, 36, 74, 212, 195; modulo 255 it would be 0xC8F0."""
+    assert fletcher16(b"abcde") == 0xC3EF
     # By hand: 1, 1+2, 1+2+3 = 6; second 1+3+6 = 10.
     assert fletcher16(b"\x01\x02\x03") == 10 << 8 | 6
     data = np.random.default_rng(1).bytes(70_000)

@@ -1,9 +1,9 @@
 """A camera found and followed in a map that COLMAP made: of a drawn room with known poses; of real pictures (slow)."""
 
+import itertools
 import json
 import shutil
 import tempfile
-import time
 from pathlib import Path
 
 import cv2
@@ -15,10 +15,10 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import inverted, rigid
 from tests.scenes.immediate_detections import ImmediateDetections
-from tests.scenes.textured_room import FOCAL_PX, HEIGHT_PX, WIDTH_PX, picture, room_camera
+from tests.scenes.textured_room import FOCAL_PX, HEIGHT_PX, WIDTH_PX, picture, room_camera, similarity
+from tests.scenes.waiting import wait_until
 from viewfinder.frames import CameraFrame, Pose
-from viewfinder.tracking.map_localiser import MapLocaliser, matches, pose_in_map, pose_refined
-from viewfinder.tracking.map_tracker import MapTracker
+from viewfinder.tracking.map_tracker import MapLocaliser, MapTracker, matches, pose_in_map, pose_refined
 from viewfinder.tracking.phone_rig import angle_deg
 from viewfinder.tracking.sparse_map import CACHE_NAME, SparseMap, read_sparse_map
 
@@ -172,11 +172,10 @@ def test_tracker_with_its_thread(room: tuple[Path, float, Pose], room_map: Spars
     camera = walk(1)[0]
     tracker = MapTracker(MapLocaliser(room_map, INTRINSICS), room[2])
     try:
-        found, number, deadline = None, 0, time.monotonic() + 20.0
-        while found is None and time.monotonic() < deadline:
-            found = tracker.track(frame(number, camera), INTRINSICS)
-            number += 1
-        assert found is not None and off(found.camera_from_world, camera.camera_from_world)[1] < 0.012
+        numbers = itertools.count()
+        wait_until(lambda: tracker.track(frame(next(numbers), camera), INTRINSICS) is not None)
+        found = tracker.track(frame(next(numbers), camera), INTRINSICS)
+        assert off(found.camera_from_world, camera.camera_from_world)[1] < 0.012
     finally:
         tracker.close()
 
@@ -262,12 +261,8 @@ def test_held_out_pictures_of_the_fox(shared_data: Path) -> None:
 
 
 def alignment(of_map: dict[str, Pose], truth: dict[str, Pose]) -> tuple[float, Pose]:
-    """(scale, rigid motion) that take the truth's world to the map's, by the camera's places (Umeyama 1991)."""
+    """(scale, rigid motion) that take the truth's world to the map's, by the camera's places."""
     names = sorted(set(of_map) & set(truth))
     to, start = (np.array([centre(poses[name]) for name in names]) for poses in (of_map, truth))
-    to_mean, start_mean = to.mean(axis=0), start.mean(axis=0)
-    u, sizes, v = np.linalg.svd((to - to_mean).T @ (start - start_mean))
-    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ v))])
-    scale = float((sizes * np.diag(flip)).sum() / ((start - start_mean) ** 2).sum())
-    rotation = u @ flip @ v
-    return scale, rigid(rotation, to_mean - scale * rotation @ start_mean)
+    scale, rotation = similarity(to, start)
+    return scale, rigid(rotation, to.mean(axis=0) - scale * rotation @ start.mean(axis=0))

@@ -15,10 +15,9 @@ from tests.scenes.waiting import wait_until
 from viewfinder.focus.sources import TrackedLensFocus
 from viewfinder.frames import CameraFrame, LensState
 from viewfinder.tracking.freed import FreeDMessage, FreeDReading
-from viewfinder.tracking.opentrackio import CBOR, JSON
 from viewfinder.tracking.phone_rig import rigid_of
 from viewfinder.tracking.pose_history import PoseHistory, SenderClock, TrackingSample
-from viewfinder.tracking.socket_tracker import Decoder, SocketTracker, TrackingAddress, freed_decoder, opentrackio_decoder
+from viewfinder.tracking.socket_tracker import CBOR, JSON, Decoder, SocketTracker, TrackingAddress, freed_decoder, opentrackio_decoder
 
 CAMERA = Camera(64, 48, (60.0, 60.0), (32.0, 24.0))
 PATIENCE_S = 5.0
@@ -82,7 +81,6 @@ def test_silence_is_a_lost_track() -> None:
         send(*datagrams(TrackingSample(pose_at(1.0), LensState(2.0))))
         wait_until(lambda: tracker._history.newest_s)
         newest_s = tracker._history.newest_s
-        assert newest_s is not None
         close = tracker.track(frame_at(newest_s + 0.01), CAMERA)
         assert close is not None and close.quality == pytest.approx(0.8)  # 10 of 50 ms
         assert tracker.track(frame_at(newest_s + 0.06), CAMERA) is None

@@ -1,14 +1,9 @@
-"""The viewfinder with a finished layer: a real server and real WebSocket clients, also as a process of its own."""
+"""The viewfinder with a finished layer: a real server and real WebSocket clients."""
 
 import json
-import os
-import signal
-import socket
-import subprocess
-import sys
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -19,16 +14,13 @@ import numpy as np
 import pytest
 
 from mrbokeh.compositing.overlay import Overlay, code_tables
-from mrbokeh.images.image_io import write_layer
 from mrbokeh.images.layer import clear
 from mrbokeh.optics.camera import Camera
-from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.color import code_from_linear, linear_from_code
 from tests.scenes.layer_viewfinder import HEIGHT, LENS, WIDTH, bright_square, running, set_focus, until, viewfinder, watching
-from tests.scenes.waiting import in_time
-from viewfinder.app.pipeline import Pipeline
+from viewfinder.app.running import Pipeline
 from viewfinder.frames import CameraFrame, FrameStatus, Newest, OutputFrame
 from viewfinder.sources.choose import open_source
 from viewfinder.sources.frame_source import ExactSize, SizeLimit
@@ -36,57 +28,47 @@ from viewfinder.sources.playback import PatternSource, VideoFileSource
 from viewfinder.stage.static_layer import StaticLayer
 
 
-def test_frames_are_pictures_of_the_right_size_and_grow_in_number(plate: tuple[Path, np.ndarray]) -> None:
-    async def work() -> None:
-        async with running(VideoFileSource(plate[0], SizeLimit(WIDTH, HEIGHT))) as url, watching(url) as viewer:
-            shown = [await viewer.frame() for _ in range(40)]
-        assert all(each.bgr.shape == (HEIGHT, WIDTH, 3) for each in shown)
-        # 40 frames of a clip of 25: it goes round, and no frame comes twice.
-        assert np.all(np.diff([each.header["sequence"] for each in shown]) >= 1)
-        captured_ms = np.array([each.header["captured_ms"] for each in shown])
-        assert np.all(np.diff(captured_ms) > 0)
-        # The clip has 50 frames per second, of which a quick viewer gets nearly all.
-        assert np.median(np.diff(captured_ms)) == pytest.approx(20.0, abs=5.0)
-
-    in_time(work)
+async def test_frames_are_pictures_of_the_right_size_and_grow_in_number(plate: tuple[Path, np.ndarray]) -> None:
+    async with running(VideoFileSource(plate[0], SizeLimit(WIDTH, HEIGHT))) as url, watching(url) as viewer:
+        shown = [await viewer.frame() for _ in range(40)]
+    assert all(each.bgr.shape == (HEIGHT, WIDTH, 3) for each in shown)
+    # 40 frames of a clip of 25: it goes round, and no frame comes twice.
+    assert np.all(np.diff([each.header["sequence"] for each in shown]) >= 1)
+    captured_ms = np.array([each.header["captured_ms"] for each in shown])
+    assert np.all(np.diff(captured_ms) > 0)
+    # The clip has 50 frames per second, of which a quick viewer gets nearly all.
+    assert np.median(np.diff(captured_ms)) == pytest.approx(20.0, abs=5.0)
 
 
-def test_the_plate_stays_and_the_object_is_laid_over_in_linear_light(plate: tuple[Path, np.ndarray]) -> None:
+async def test_the_plate_stays_and_the_object_is_laid_over_in_linear_light(plate: tuple[Path, np.ndarray]) -> None:
     path, bgr = plate
-
-    async def work() -> None:
-        async with running(VideoFileSource(path, SizeLimit(WIDTH, HEIGHT))) as url, watching(url) as viewer:
-            picture = (await viewer.frame()).bgr
-        jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
-        same_through_jpeg = cv2.imdecode(jpeg, cv2.IMREAD_COLOR)
-        away = np.ones((HEIGHT, WIDTH), bool)
-        away[16:80, 48:112] = False  # whole JPEG blocks (16 px) around the square
-        np.testing.assert_array_equal(picture[away], same_through_jpeg[away])
-        inside = code_from_linear(np.array([0.05, 0.1, 0.9]), "bt709") * 255
-        np.testing.assert_allclose(picture[40:50, 74:86].reshape(-1, 3).mean(axis=0), inside, atol=2.0)
-
-    in_time(work)
+    async with running(VideoFileSource(path, SizeLimit(WIDTH, HEIGHT))) as url, watching(url) as viewer:
+        picture = (await viewer.frame()).bgr
+    jpeg = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, 85])[1]
+    same_through_jpeg = cv2.imdecode(jpeg, cv2.IMREAD_COLOR)
+    away = np.ones((HEIGHT, WIDTH), bool)
+    away[16:80, 48:112] = False  # whole JPEG blocks (16 px) around the square
+    np.testing.assert_array_equal(picture[away], same_through_jpeg[away])
+    inside = code_from_linear(np.array([0.05, 0.1, 0.9]), "bt709") * 255
+    np.testing.assert_allclose(picture[40:50, 74:86].reshape(-1, 3).mean(axis=0), inside, atol=2.0)
 
 
-def test_the_focus_changes_the_object_and_nothing_else(plate: tuple[Path, np.ndarray]) -> None:
-    async def work() -> None:
-        async with running(VideoFileSource(plate[0], SizeLimit(WIDTH, HEIGHT))) as url, watching(url) as viewer:
-            sharp = await viewer.frame()
-            assert sharp.header["focus_distance_m"] == 2.0
-            assert (await set_focus(url, 1.0))[0] == 200
-            soft = await until(viewer, lambda shown: shown.header["focus_distance_m"] == 1.0)
-            assert (await set_focus(url, None))[0] == 200
-            await until(viewer, lambda shown: shown.header["focus_distance_m"] is None)
-            assert (await set_focus(url, 2.0))[0] == 200
-            again = await until(viewer, lambda shown: shown.header["focus_distance_m"] == 2.0)
-        np.testing.assert_array_equal(again.bgr, sharp.bgr)
-        change = np.abs(soft.bgr.astype(float) - sharp.bgr).max(axis=2)
-        # Light leaves the square's rim: 3 px outside the edge it gets redder, by far more than JPEG does.
-        assert soft.bgr[40:50, 64, 2].mean() > sharp.bgr[40:50, 64, 2].mean() + 40
-        # The blur of 13.7 px reaches 7 px beyond rows 33 to 56; JPEG carries it to the end of its blocks at 16 and 79, chroma 1 px farther.
-        assert change[:15].max() == change[81:].max() == 0
-
-    in_time(work)
+async def test_the_focus_changes_the_object_and_nothing_else(plate: tuple[Path, np.ndarray]) -> None:
+    async with running(VideoFileSource(plate[0], SizeLimit(WIDTH, HEIGHT))) as url, watching(url) as viewer:
+        sharp = await viewer.frame()
+        assert sharp.header["focus_distance_m"] == 2.0
+        assert (await set_focus(url, 1.0))[0] == 200
+        soft = await until(viewer, lambda shown: shown.header["focus_distance_m"] == 1.0)
+        assert (await set_focus(url, None))[0] == 200
+        await until(viewer, lambda shown: shown.header["focus_distance_m"] is None)
+        assert (await set_focus(url, 2.0))[0] == 200
+        again = await until(viewer, lambda shown: shown.header["focus_distance_m"] == 2.0)
+    np.testing.assert_array_equal(again.bgr, sharp.bgr)
+    change = np.abs(soft.bgr.astype(float) - sharp.bgr).max(axis=2)
+    # Light leaves the square's rim: 3 px outside the edge it gets redder, by far more than JPEG does.
+    assert soft.bgr[40:50, 64, 2].mean() > sharp.bgr[40:50, 64, 2].mean() + 40
+    # The blur of 13.7 px reaches 7 px beyond rows 33 to 56; JPEG carries it to the end of its blocks at 16 and 79, chroma 1 px farther.
+    assert change[:15].max() == change[81:].max() == 0
 
 
 def test_a_blur_that_ends_while_a_frame_is_made_is_told_of_with_the_next() -> None:
@@ -102,7 +84,7 @@ def test_a_blur_that_ends_while_a_frame_is_made_is_told_of_with_the_next() -> No
         assert still.status.lens == nearer and not still.pending
 
 
-def test_a_failing_camera_says_so() -> None:
+async def test_a_failing_camera_says_so() -> None:
     class Unplugged:
         name, transfer, status = "camera 7", "srgb", None
 
@@ -111,15 +93,12 @@ def test_a_failing_camera_says_so() -> None:
             assert not stopping.is_set()
             raise InputError("camera 7 stopped giving pictures")
 
-    async def work() -> None:
-        async with running(Unplugged()) as url, watching(url) as viewer:
-            # The one picture may come before.
-            messages = [await viewer.stream.receive(timeout=5)]
-            if messages[0].type is not aiohttp.WSMsgType.TEXT:
-                messages.append(await viewer.stream.receive(timeout=5))
-            assert json.loads(messages[-1].data) == {"failure": "camera 7 stopped giving pictures"}
-
-    in_time(work)
+    async with running(Unplugged()) as url, watching(url) as viewer:
+        # The one picture may come before.
+        messages = [await viewer.stream.receive(timeout=5)]
+        if messages[0].type is not aiohttp.WSMsgType.TEXT:
+            messages.append(await viewer.stream.receive(timeout=5))
+        assert json.loads(messages[-1].data) == {"failure": "camera 7 stopped giving pictures"}
 
 
 @pytest.mark.parametrize("trouble", [None, InputError("the layer is missing")])
@@ -205,63 +184,7 @@ def test_a_file_plays_in_its_own_time(plate: tuple[Path, np.ndarray]) -> None:
         frames.close()
 
 
-def test_sources_are_named_or_refused(plate: tuple[Path, np.ndarray], tmp_path: Path) -> None:
-    assert open_source("test", SizeLimit(WIDTH, HEIGHT)).name == "test pattern"
-    assert open_source(str(plate[0]), SizeLimit(2 * WIDTH, 2 * HEIGHT)).name == "plate.mkv"
+def test_a_source_is_fitted_to_an_exact_size(plate: tuple[Path, np.ndarray]) -> None:
     with pytest.raises(InputError, match="aspect ratio"):
         next(ExactSize(open_source(str(plate[0])), 100, 100).frames(Event()))
     assert next(ExactSize(open_source(str(plate[0])), 320, 180).frames(Event())).bgr.shape == (180, 320, 3)
-    with pytest.raises(InputError, match="none of them"):
-        open_source(str(tmp_path / "absent.mp4"), SizeLimit(WIDTH, HEIGHT))
-    with pytest.raises(InputError, match="--fps"):
-        open_source("test", SizeLimit(WIDTH, HEIGHT), 0.0)
-    with pytest.raises(InputError, match="cannot be opened"):
-        open_source("987", SizeLimit(WIDTH, HEIGHT))
-
-
-@contextmanager
-def command(tmp_path: Path, *extra: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """`mrbokeh viewfinder` as a process, and the address that it prints."""
-    write_layer(tmp_path / "layer.exr", bright_square())
-    write_lens(tmp_path / "lens.json", LENS)
-    files = ["--layer", str(tmp_path / "layer.exr"), "--lens", str(tmp_path / "lens.json")]
-    arguments = [sys.executable, "-u", "-m", "mrbokeh.cli", "viewfinder", "--source", "test", *files, *extra]
-    root = Path(__file__).parents[2]
-    with subprocess.Popen(arguments, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
-        try:
-            assert process.stdout is not None
-            line = process.stdout.readline()
-            yield process, next((word for word in line.split() if word.startswith("http://")), "")
-        finally:
-            process.kill()
-
-
-@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for another process")
-def test_the_command_serves_until_ctrl_c(tmp_path: Path) -> None:
-    with command(tmp_path, "--port", "0") as (process, url):
-        assert url.startswith("http://127.0.0.1:")
-
-        async def work() -> None:
-            async with watching(url) as viewer, aiohttp.ClientSession() as session:
-                assert (await viewer.frame()).bgr.shape == (HEIGHT, WIDTH, 3)
-                async with session.get(url) as page:
-                    assert "viewport" in await page.text()
-                process.send_signal(signal.SIGINT)
-                while (await viewer.stream.receive(timeout=5)).type is aiohttp.WSMsgType.BINARY:
-                    pass
-                assert viewer.stream.close_code == aiohttp.WSCloseCode.GOING_AWAY
-
-        in_time(work)
-        output, errors = process.communicate(timeout=10)
-        assert (process.returncode, output, errors) == (0, "viewfinder stopped\n", "")
-
-
-def test_a_taken_port_ends_the_command_with_a_sentence(tmp_path: Path) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        with command(tmp_path, "--port", str(taken.getsockname()[1])) as (process, _):
-            _, errors = process.communicate(timeout=20)
-    assert process.returncode == 2
-    assert "choose another one with --port" in errors
-    assert "Traceback" not in errors

@@ -13,8 +13,7 @@ from capture.photos.photo_metadata import PhotoMetadata
 from capture.photos.sidecar import StatedFocus
 from capture.report.findings import focus_spacing
 from capture.scale.focus import FocusSample, focus_scale, sharpness_peaks, stated_sigma_dioptre
-from capture.scale.focus_calibration import FOCUS_SIGMA_DIOPTRE, FocusFit
-from capture.scale.focus_calibration_stacks import StackFocus, focus_start, lens_calibrations
+from capture.scale.focus_calibration import FOCUS_SIGMA_DIOPTRE, FocusFit, StackFocus, focus_start, lens_calibrations
 from capture.stacks.ingest import ingest
 from capture.stacks.slice_files import bounded_focus_records, stated_by_sentinel
 from mrbokeh.optics.lens import Lens, lens_distance_m

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.psf_models.lens_prescription import LINE_C_UM, LINE_D_UM, LINE_F_UM, LensPrescription, Surface, estimated_abbe_number, index_at
-from mrbokeh.psf_models.lens_prescription_file import biconvex_lens, read_prescription
+from mrbokeh.psf_models.physical_lens import biconvex_lens, read_prescription
 from mrbokeh.system.errors import InputError
 
 # An air-spaced pair that is easy to do by hand: two equal thin-ish lenses with the stop in the middle.

@@ -14,8 +14,7 @@ from mrbokeh.psf_models._lens_beam import BANDS_UM, GREEN_UM
 from mrbokeh.psf_models._physical_lens_numba import trace_ray
 from mrbokeh.psf_models.base import sobol_blocks
 from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface, cauchy_coefficients, index_at
-from mrbokeh.psf_models.lens_prescription_file import biconvex_lens
-from mrbokeh.psf_models.physical_lens import PhysicalLens
+from mrbokeh.psf_models.physical_lens import PhysicalLens, biconvex_lens
 from mrbokeh.system.errors import InputError
 
 RAYS = 1 << 15

@@ -9,8 +9,7 @@ import pytest
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.kernels.low_rank_kernel import decompose
 from mrbokeh.renderers.low_rank import exact_scatter as _low_rank_exact
-from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter, tilt_shift
-from mrbokeh.renderers.low_rank.per_pixel import depth_edge_mask
+from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter, depth_edge_mask, tilt_shift
 from mrbokeh.renderers.scatter_reference import scatter
 from mrbokeh.system.errors import InputError
 

@@ -30,9 +30,13 @@ from tests.scenes.sampled_planes import LENS, Plane, checker, even, fence_scene,
 torch = pytest.importorskip("torch")
 
 from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import DeviceSamples, TorchReconstruction, _picture  # noqa: E402
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._kernels import PupilTables, line_kernels, pupil_kernels  # noqa: E402
 from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._light import TileLight, morton, tile_light  # noqa: E402
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._screen import transform_size  # noqa: E402
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._screen import (  # noqa: E402
+    PupilTables,
+    line_kernels,
+    pupil_kernels,
+    transform_size,
+)
 from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._statistics import (  # noqa: E402  # noqa: E402
     Slopes,
     chance,

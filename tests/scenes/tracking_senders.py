@@ -8,8 +8,8 @@ from typing import Any
 from mrbokeh.tracking.camera_track.opentrackio_file import lens_numbers, pose_document
 from mrbokeh.tracking.world_axes import CAMERA_FROM_STAGE_CAMERA, inverted, pan_tilt_roll_deg
 from viewfinder.tracking.freed import _FIELD_BYTES, _PER_DEGREE, _PER_M, _TYPE, FreeDMessage, checksum
-from viewfinder.tracking.opentrackio import _HEADER, _IDENTIFIER, _LAST, CBOR, StageReading, fletcher16, require_cbor
 from viewfinder.tracking.pose_history import STAGE_FROM_BOARD, TrackingSample
+from viewfinder.tracking.socket_tracker import _HEADER, _IDENTIFIER, _LAST, CBOR, StageReading, fletcher16, require_cbor
 
 
 def write_freed(message: FreeDMessage) -> bytes:

@@ -10,27 +10,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from capture.commands.shoot import shoot_command
 from capture.photos.metadata import read_metadata
 from capture.stacks.ingest import ingest
 from capture.tether.camera_driver import CameraError, CameraSettings, FocusSteps, Shot, Stop, read_focus_steps
 from capture.tether.focus_plan import FocusPlan, FocusRange, plan_focus, write_plan
-from capture.tether.saved_shot import save_shot
 from capture.tether.shoot import ShootOptions, Surroundings, shoot
-from capture.tether.shoot_log import read_log
+from capture.tether.shoot_files import read_log, save_shot
 from capture.tether.simulated_camera import SimulatedCamera
 from datasets_scripts.made_sets.simulated_camera import SensorModel, ShotMetadata, write_dng
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.system.errors import InputError
+from tests.scenes.commands import printed_by
 
 LENS = Lens(35.0, 2.0, 1.0, 23.5)
 NEAR_M, FAR_M = 0.5, 2.5
-APP = typer.Typer()
-APP.command()(shoot_command)
 
 
 def small_plan(width_px: int = 160, residual_px: float = 1.2) -> FocusPlan:
@@ -76,9 +72,6 @@ def taken(plan: FocusPlan, camera: SimulatedCamera, out: Path, **options: object
 def real_dioptres(document: dict, camera: SimulatedCamera) -> list[float]:
     """What was in focus, from the steps in the log and the camera's true scale."""
     return [camera.motor.focus_steps.dioptre_at(each["steps"]) for each in document["slices"]]
-
-
-# --- the whole way -------------------------------------------------------------------------------------------------
 
 
 def test_from_plan_to_depth(tmp_path: Path) -> None:
@@ -134,11 +127,7 @@ def test_raw_all_the_way(tmp_path: Path) -> None:
     assert said == [] and [each["file"] for each in document["slices"]] == [f"slice_{index:02d}.dng" for index in range(len(plan))]
     assert not (tmp_path / "view" / "lens.toml").exists()
     stack = ingest([tmp_path / "view"], tmp_path / "scene").stacks[0].stack
-    assert stack is not None
     assert [1.0 / each for each in stack.focus_distances_m if each] == pytest.approx(plan.dioptres, abs=6e-4)
-
-
-# --- interruption --------------------------------------------------------------------------------------------------
 
 
 def test_a_pulled_cable(tmp_path: Path) -> None:
@@ -198,9 +187,6 @@ def test_a_shoot_goes_on_only_as_it_was(tmp_path: Path) -> None:
     (tmp_path / "shoot.json").write_text('{"format": "mrbokeh-shoot", "version": 1}')
     with pytest.raises(InputError, match="damaged"):
         taken(plan, camera, tmp_path)
-
-
-# --- the checks ----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("bump_gaps", "warned"), [(0.0, False), (0.1, False), (0.5, True), (1.0, True), (-0.6, True)])
@@ -278,9 +264,6 @@ def test_another_lens_than_planned_is_told(tmp_path: Path) -> None:
     assert said == ["the plan is for f_number 2, the photographs state 4: plan again, or set the lens"]
 
 
-# --- distances that the photographs lack ---------------------------------------------------------------------------
-
-
 def test_planned_distances_where_the_camera_is_silent(tmp_path: Path) -> None:
     """lens.toml counts from the lens and names the files; ingest reads it."""
     plan = small_plan(96, 2.0)
@@ -290,7 +273,6 @@ def test_planned_distances_where_the_camera_is_silent(tmp_path: Path) -> None:
     written = tomllib.loads((tmp_path / "view" / "lens.toml").read_text())
     assert set(written) == {"focus_origin", "focus_distances_m"} and written["focus_origin"] == "lens"
     stack = ingest([tmp_path / "view"], tmp_path / "scene").stacks[0].stack
-    assert stack is not None
     assert [1.0 / each for each in stack.focus_distances_m if each] == pytest.approx(plan.dioptres, abs=6e-4)
 
 
@@ -311,9 +293,6 @@ def test_planned_distances_on_request_and_a_foreign_sidecar(tmp_path: Path) -> N
     (tmp_path / "c" / "lens.toml").write_text("blades = 7\n")
     taken(plan, camera_for(plan, lambda _: None), tmp_path / "c", check=False, planned_distances=True)
     assert (tmp_path / "c" / "lens.toml").read_text() == "blades = 7\n"
-
-
-# --- by hand, and what the steps mean ------------------------------------------------------------------------------
 
 
 def test_by_hand(tmp_path: Path) -> None:
@@ -350,29 +329,27 @@ def test_from_the_infinity_stop(tmp_path: Path) -> None:
     assert dioptres[:-1] == pytest.approx(plan.dioptres, abs=6e-4) and dioptres[-1] == dioptres[0]
 
 
-# --- the command ---------------------------------------------------------------------------------------------------
+def shoot_by(folder: Path, *more: str) -> str:
+    """What the command prints, which takes the plan of the folder with the simulated camera."""
+    words = ["--plan", folder / "plan.json", "--camera", "simulated", "--out", folder / "view", "--settle", "0"]
+    return printed_by(shoot_command, *words, *more, answer="\n")
 
 
 def test_the_command(tmp_path: Path) -> None:
     write_plan(tmp_path / "plan.json", small_plan(96, 2.0))
-    arguments = ["--plan", str(tmp_path / "plan.json"), "--camera", "simulated", "--out", str(tmp_path / "view"), "--settle", "0"]
-    result = CliRunner().invoke(APP, [*arguments, "--exposure-time", "1/60", "--live", "--spot", "0.5,0.5"], input="\n")
-    assert result.exit_code == 0, result.output
-    assert "3 slices" in result.output and "mrbokeh capture ingest" in result.output
+    told = shoot_by(tmp_path, "--exposure-time", "1/60", "--live", "--spot", "0.5,0.5")
+    assert "3 slices" in told and "mrbokeh capture ingest" in told
     assert read_metadata(tmp_path / "view" / "slice_00.tif").exposure_time_s == pytest.approx(1 / 60, rel=1e-3)
 
 
 def test_the_command_measures_steps_once(tmp_path: Path) -> None:
     write_plan(tmp_path / "plan.json", small_plan(240, 2.0))
-    arguments = ["--plan", str(tmp_path / "plan.json"), "--camera", "simulated", "--out", str(tmp_path / "view"), "--settle", "0"]
     targets = ["--target", "0.5,0.92=2.5", "--target", "0.73,0.44=0.83333", "--sweep-step", "200", "--no-check"]
-    result = CliRunner().invoke(APP, [*arguments, *targets])
-    assert result.exit_code == 0, result.output
-    assert "dioptres per step" in result.output
+    assert "dioptres per step" in shoot_by(tmp_path, *targets)
     scale = read_focus_steps(tmp_path / "view" / "focus_steps.json")
     # 2.4 D to 0 in 2400 steps, after 40 steps of play; the gap between slices is 0.53 D.
     assert [scale.dioptre_at(40 + each) for each in (1200, 2000)] == pytest.approx([1.2, 0.4], abs=0.053)
-    assert "dioptres per step" not in CliRunner().invoke(APP, [*arguments, *targets]).output
+    assert "dioptres per step" not in shoot_by(tmp_path, *targets)
 
 
 @pytest.mark.parametrize(
@@ -388,6 +365,5 @@ def test_the_command_measures_steps_once(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_mistakes_of_the_command(tmp_path: Path, more: list[str], said: str) -> None:
     write_plan(tmp_path / "plan.json", small_plan(96, 2.0))
-    arguments = ["--plan", str(tmp_path / "plan.json"), "--out", str(tmp_path / "view"), "--settle", "0"]
     with pytest.raises(InputError, match=said):
-        CliRunner().invoke(APP, [*arguments, *(["--camera", "simulated"] if "--camera" not in more else []), *more], catch_exceptions=False)
+        shoot_by(tmp_path, *more)

@@ -242,7 +242,7 @@ def test_opentrackio_distortion_is_in_millimetres(tmp_path: Path) -> None:
 
 def test_the_viewfinder_reads_the_same_pose_from_our_samples(tmp_path: Path) -> None:
     """Samples are read by one code; what is the viewfinder's own is its world, which has -z up, as a board does."""
-    opentrackio = pytest.importorskip("viewfinder.tracking.opentrackio")
+    opentrackio = pytest.importorskip("viewfinder.tracking.socket_tracker")
     track = moving(plain=False)
     write_track(tmp_path / "a.jsonl", track)
     for number, line in enumerate((tmp_path / "a.jsonl").read_text().splitlines()):

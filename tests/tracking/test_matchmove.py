@@ -8,13 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 from capture.cli import app
-from capture.matchmove.clip_matchmove import MatchmoveSettings, chosen_keyframes, matchmove_clip, motion_of_clip
+from capture.matchmove.clip_matchmove import (
+    MatchmoveSettings,
+    chosen_keyframes,
+    matchmove_clip,
+    model_residual_px,
+    motion_of_clip,
+    rotation_only_residual_px,
+)
 from capture.matchmove.frame_poses import poses_between
 from capture.matchmove.ground import GroundPicks, Ruler, on_ground, parse_frame_distance, parse_ground, parse_ruler, ruler_scale
-from capture.matchmove.quality_warnings import model_residual_px, rotation_only_residual_px
 from capture.poses.sparse_model import SparseModel, SparseView
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
@@ -22,7 +27,8 @@ from mrbokeh.tracking.camera_track.formats import read_track
 from mrbokeh.tracking.camera_track.track import CameraTrack
 from mrbokeh.video.clip import probe
 from mrbokeh.video.writer import VideoWriter
-from tests.scenes.textured_room import picture, room_camera
+from tests.scenes.commands import printed_by
+from tests.scenes.textured_room import picture, room_camera, similarity
 
 
 def walking(count: int) -> list[Camera]:
@@ -70,12 +76,8 @@ def errors(cameras: Sequence[Camera], track: CameraTrack) -> tuple[float, float]
     numbers = track.numbers
     true = np.array([cameras[n].world_from_camera[:3, 3] for n in numbers])
     found = np.array([track.at(n).camera.world_from_camera[:3, 3] for n in numbers])
-    middle, other = true.mean(axis=0), found.mean(axis=0)
-    u, sizes, vt = np.linalg.svd((true - middle).T @ (found - other))
-    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
-    turn = u @ flip @ vt
-    scale = np.trace(np.diag(sizes) @ flip) / np.sum((found - other) ** 2)
-    off_m = scale * (found - other) @ turn.T + middle - true
+    scale, turn = similarity(true, found)
+    off_m = scale * (found - found.mean(axis=0)) @ turn.T + true.mean(axis=0) - true
     turns = [
         Rotation.from_matrix(cameras[n].camera_from_world[:3, :3] @ turn @ track.at(n).camera.camera_from_world[:3, :3].T).magnitude()
         for n in numbers
@@ -217,8 +219,8 @@ def test_a_walk_is_matchmoved(tmp_path: Path) -> None:
     pytest.importorskip("pycolmap")
     cameras = walking(25)
     clip = write_clip(tmp_path / "clip.mkv", cameras)
-    result = CliRunner().invoke(app, ["matchmove", str(clip), "--out", str(tmp_path / "track.json"), "--keyframes", "8"])
-    assert result.exit_code == 0 and "25 of 25 frames" in result.output and "scale arbitrary" in result.output
+    told = printed_by(app, "matchmove", clip, "--out", tmp_path / "track.json", "--keyframes", 8)
+    assert "25 of 25 frames" in told and "scale arbitrary" in told
     track = read_track(tmp_path / "track.json")
     off_m, off_deg = errors(cameras, track)
     assert off_m < 0.005 and off_deg < 0.5 and not track.metric
@@ -226,9 +228,9 @@ def test_a_walk_is_matchmoved(tmp_path: Path) -> None:
     assert (tmp_path / "track_matchmove" / "poses.json").exists()
     pixels = ["/".join(f"{x:.1f},{y:.1f}" for x, y in cameras[0].project(each)[0]) for each in (FLOOR_POINTS[:3], FLOOR_POINTS[:2])]
     true_m = float(np.linalg.norm(FLOOR_POINTS[1] - FLOOR_POINTS[0]))
-    told = ["--ground", f"0:{pixels[0]}", "--ruler", f"0:{pixels[1]}/{true_m}", "--work", str(tmp_path / "track_matchmove")]
-    again = CliRunner().invoke(app, ["matchmove", str(clip), "--out", str(tmp_path / "stands.json"), "--keyframes", "8", *told])
-    assert again.exit_code == 0 and "in metres, by the ruler" in again.output
+    picks = ["--ground", f"0:{pixels[0]}", "--ruler", f"0:{pixels[1]}/{true_m}", "--work", tmp_path / "track_matchmove"]
+    again = printed_by(app, "matchmove", clip, "--out", tmp_path / "stands.json", "--keyframes", 8, *picks)
+    assert "in metres, by the ruler" in again
     stands = read_track(tmp_path / "stands.json")
     # Picks of 0.1 px on a floor seen from 0.8 m above: 2 mm, and what the model itself is off.
     heights_m = np.array([0.8 - camera.world_from_camera[1, 3] for camera in cameras])
@@ -241,9 +243,9 @@ def test_a_camera_on_a_tripod_is_refused(tmp_path: Path) -> None:
     """COLMAP fails, or finds a model of one point, or one of thousands at 500 px for 380 with a parallax of 6 degrees."""
     pytest.importorskip("pycolmap")
     clip = write_clip(tmp_path / "clip.mkv", turning(25))
-    result = CliRunner().invoke(app, ["matchmove", str(clip), "--out", str(tmp_path / "track.json"), "--keyframes", "8"])
-    assert result.exit_code == 1 and not (tmp_path / "track.json").exists()
-    assert any(text in str(result.exception) for text in ("only to rotate", "no match-move", "too few to trust"))
+    with pytest.raises(InputError, match="only to rotate|no match-move|too few to trust"):
+        printed_by(app, "matchmove", clip, "--out", tmp_path / "track.json", "--keyframes", 8)
+    assert not (tmp_path / "track.json").exists()
 
 
 @pytest.mark.slow

@@ -12,9 +12,9 @@ from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import read_frames
 from mrbokeh.video.image_sequence import NumberedFiles, is_pattern, numbered, pattern_of_folder
-from mrbokeh.video.picture_source import PictureSource, open_source, parse_rate
-from mrbokeh.video.video_source import FrameIndex, VideoSource
+from mrbokeh.video.picture_source import FrameIndex, PictureSource, VideoSource, open_source, parse_rate
 from mrbokeh.video.writer import VideoWriter
+from tests.scenes.video_files import encoded
 
 CLIPS = ("iphone_xr_chart.mov", "ducks_720p.mp4", "nikon_d90_chart.avi")
 
@@ -93,18 +93,11 @@ def test_every_encoding_can_be_entered_anywhere(tmp_path: Path, encoding: str, s
 
 def test_groups_of_pictures_that_refer_to_others_are_entered_exactly(tmp_path: Path) -> None:
     """H.265 with open groups of 6 pictures, as phones and broadcasters write: pictures before a keyframe need the group before it."""
-    path = tmp_path / "open.mp4"
     rng = np.random.default_rng(2)
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream(
-            "libx265", rate=25, options={"x265-params": "open-gop=1:keyint=6:min-keyint=6:scenecut=0:bframes=3:log-level=none"}
-        )
-        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p"
-        for i in range(40):
-            frame = av.VideoFrame.from_ndarray(np.clip(rng.normal(4 * i + 40, 9, (96, 64)), 0, 255).astype(np.uint8), "yuv420p")
-            frame.pts = i
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
+    planes = [np.clip(rng.normal(4 * i + 40, 9, (96, 64)), 0, 255).astype(np.uint8) for i in range(40)]
+    options = {"x265-params": "open-gop=1:keyint=6:min-keyint=6:scenecut=0:bframes=3:log-level=none"}
+    frames = [av.VideoFrame.from_ndarray(each, "yuv420p") for each in planes]
+    path = encoded(tmp_path / "open.mp4", "libx265", "yuv420p", *frames, options=options)
     source, whole = VideoSource.open(path), list(read_frames(path))
     assert len(source.index.keys_before(39)) > 4
     for start in range(40):
@@ -215,12 +208,8 @@ def test_a_folder_whose_numbers_grow_longer_is_one_sequence(tmp_path: Path) -> N
 
 
 def test_rates_are_understood(tmp_path: Path) -> None:
-    assert [parse_rate(text) for text in ("25", "23.976", "24000/1001", "12.5")] == [
-        25,
-        Fraction(24000, 1001),
-        Fraction(24000, 1001),
-        Fraction(25, 2),
-    ]
+    film = Fraction(24000, 1001)
+    assert [parse_rate(text) for text in ("25", "23.976", "24000/1001", "12.5")] == [25, film, film, Fraction(25, 2)]
     for text in ("0", "-3", "fast", "1/0"):
         with pytest.raises(InputError, match="frames per second"):
             parse_rate(text)

@@ -8,11 +8,9 @@ from pathlib import Path
 import av
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 import mrbokeh.video.image_sequence as image_sequence
-import mrbokeh.video.video_source as video_source
-from mrbokeh.commands.video import app
+import mrbokeh.video.picture_source as video_source
 from mrbokeh.images.alpha_io import write_finished
 from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.images.exr_io import read_exr
@@ -21,16 +19,16 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.shots.executors import ProcessExecutor, SerialExecutor
-from mrbokeh.shots.render_shot import render_shot
+from mrbokeh.shots.render_shot import SequenceTarget, VideoTarget, render_shot
 from mrbokeh.shots.shot import Shot
-from mrbokeh.shots.targets import SequenceTarget, VideoTarget
 from mrbokeh.video.clip import read_frames
 from mrbokeh.video.color import color_of
 from mrbokeh.video.frames import has_alpha, linear_rgb, stored_alpha
 from mrbokeh.video.picture_source import PictureSource, open_source
 from mrbokeh.video.writer import VideoWriter
 from tests.scenes.shot_makers import Brighter
-from tests.scenes.video_files import turned_clip
+from tests.scenes.video_files import encoded, turned_clip
+from tests.scenes.video_files import video as run
 
 WIDTH, HEIGHT, COUNT = 96, 64, 5
 LENS = Lens(focal_length_mm=50.0, f_number=2.0, focus_distance_m=2.0, sensor_width_mm=6.0)
@@ -73,12 +71,6 @@ def settings(tmp_path: Path) -> list[str]:
     write_layer(tmp_path / "layer.exr", Layer(alpha[..., None] * LIGHT, alpha, depth_m), half=False)
     write_lens(tmp_path / "lens.json", LENS)
     return ["--layer", str(tmp_path / "layer.exr"), "--lens", str(tmp_path / "lens.json"), "--workers", "1", "--segment", "0.08"]
-
-
-def run(*arguments: object) -> str:
-    result = CliRunner().invoke(app, [*map(str, arguments)], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 def frames_of(source: PictureSource) -> tuple[np.ndarray, np.ndarray]:
@@ -211,15 +203,10 @@ def test_what_cannot_hold_alpha_is_told_and_black(settings: list[str], tmp_path:
 
 def test_alpha_that_is_not_decoded_is_told(settings: list[str], tmp_path: Path) -> None:
     """VP9 keeps it in a second stream inside its packets."""
-    with av.open(str(tmp_path / "in.webm"), "w") as container:
-        stream = container.add_stream("libvpx-vp9", rate=25)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuva420p"
-        frame = av.VideoFrame(WIDTH, HEIGHT, "yuva420p")
-        for plane in frame.planes:
-            np.frombuffer(plane, np.uint8)[:] = 128  # type: ignore[call-overload]
-        frame.pts = 0
-        container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
+    frame = av.VideoFrame(WIDTH, HEIGHT, "yuva420p")
+    for plane in frame.planes:
+        np.frombuffer(plane, np.uint8)[:] = 128  # type: ignore[call-overload]
+    encoded(tmp_path / "in.webm", "libvpx-vp9", "yuva420p", frame)
     output = run(tmp_path / "in.webm", *settings, "--out", tmp_path / "out.mkv")
     assert f"warning: {tmp_path / 'in.webm'} keeps its alpha apart (VP8, VP9), where it is not read: it is taken as opaque" in output
     assert not open_source(tmp_path / "out.mkv").info.has_alpha
@@ -293,13 +280,7 @@ def test_other_codecs_of_editors_keep_alpha_too(tmp_path: Path, codec: str, pixe
     for plane, values in zip(frame.planes, (np.full_like(codes, largest),) * 3 + (codes,), strict=True):
         stored = np.frombuffer(plane, np.uint8 if bits == 8 else "<u2").reshape(HEIGHT, -1)  # type: ignore[call-overload]
         stored[:, :WIDTH] = values
-    with av.open(str(tmp_path / "in.mov"), "w") as container:
-        stream = container.add_stream(codec, rate=25)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, pixels
-        given = frame.reformat(format=pixels)
-        given.pts = 0
-        container.mux(stream.encode(given))
-        container.mux(stream.encode(None))
+    encoded(tmp_path / "in.mov", codec, pixels, frame.reformat(format=pixels))
     rgb, alpha = frames_of(open_source(tmp_path / "in.mov"))
     np.testing.assert_allclose(alpha[0], codes / largest, atol=1e-7)
     np.testing.assert_allclose(rgb[0], np.repeat(alpha[0][..., None], 3, axis=2), atol=1e-6)

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from mrbokeh.shots.executors import SerialExecutor
-from mrbokeh.shots.render_shot import render_shot
+from mrbokeh.shots.render_shot import VideoTarget, held_pictures, render_shot
 from mrbokeh.shots.shot import Shot
-from mrbokeh.shots.targets import VideoTarget, held_pictures
 from mrbokeh.video.clip import read_frames
 from mrbokeh.video.picture_source import open_source
 from mrbokeh.video.writer import VideoWriter

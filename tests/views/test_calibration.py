@@ -6,8 +6,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from capture.commands.scale import scale_command
 from capture.poses.lens_calibration import (
@@ -19,14 +17,24 @@ from capture.poses.lens_calibration import (
     stated_distances_m,
     write_lens_calibration,
 )
-from capture.scale.focus_calibration import BlurSamples, FocusStart, _Fit, calibrate_focus, measure_blur
-from capture.scale.focus_calibration_stacks import StackFocus, lens_calibrations, reduced, spread_points
+from capture.scale.focus_calibration import (
+    BlurSamples,
+    FocusStart,
+    StackFocus,
+    _Fit,
+    calibrate_focus,
+    lens_calibrations,
+    measure_blur,
+    reduced,
+    spread_points,
+)
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from mrbokeh.system.errors import InputError
+from tests.scenes.commands import printed_by
 
 FOCUS = np.linspace(1.6, 0.5, 10)
 LENS = Lens(35.0, 2.0, 1.0, 23.5)
@@ -228,8 +236,5 @@ def test_the_command_applies_a_calibration_without_poses(tmp_path: Path) -> None
     scene, path = tmp_path / "scene", tmp_path / "lens_calibration.json"
     write_focal_stack(stack_at(scene / "a", (1.0, 2.0)))
     write_lens_calibration(path, CALIBRATION)
-    app = typer.Typer()
-    app.command()(scale_command)
-    answer = CliRunner().invoke(app, [str(scene), "--lens-calibration", str(path)], catch_exceptions=False)
-    assert answer.exit_code == 0 and "calibrated by" in answer.output
+    assert "calibrated by" in printed_by(scale_command, scene, "--lens-calibration", path)
     assert read_focal_stack(scene / "a").focus_distances_m[1] == pytest.approx(1.96)

@@ -18,7 +18,7 @@ from capture.dense.guided_depth import (
     smooth,
     weighted_medians,
 )
-from capture.dense.patch_match import on_original_pixels, patch_match_obstacle, patch_match_prior
+from capture.dense.scene_depth import on_original_pixels, patch_match_obstacle, patch_match_prior
 from capture.dense.sweep_view import SweepView
 from mrbokeh.optics.camera import Camera
 from tests.scenes.dense_references import aggregate_reference, weighted_medians_reference

@@ -6,12 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from capture.cli import app
 from capture.dataset.stack_writer import require_usable
-from capture.dense.patch_match import PatchMatchScene
-from capture.dense.scene_depth import DEPTH_SOURCE, SceneDepthSettings, deepen_scene
+from capture.dense.scene_depth import DEPTH_SOURCE, PatchMatchScene, SceneDepthSettings, deepen_scene
 from capture.dense.sweep_view import nearest_views
 from capture.merging.merge import merge_scene
 from capture.poses.colmap_job import ColmapJob, ColmapPicture, job_to_json
@@ -25,6 +23,7 @@ from mrbokeh.stacks.focal_stack import find_focal_stacks, read_focal_stack
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.errors import InputError
 from tests.scenes.capture_truth import ViewTruth, picture_db, view_truth
+from tests.scenes.commands import printed_by
 
 RAW = DATA / "raw_stack"
 POINTS_A_VIEW = 400
@@ -163,8 +162,8 @@ def test_a_stack_without_a_pose_keeps_its_depth_from_focus(merged: Path, truths:
 def test_what_is_missing_is_said_in_one_sentence(merged: Path, tmp_path: Path) -> None:
     scene = tmp_path / "desk"
     shutil.copytree(merged, scene, ignore=shutil.ignore_patterns("reconstruction"))
-    result = CliRunner().invoke(app, ["depth", str(scene)])
-    assert isinstance(result.exception, InputError) and "capture poses" in str(result.exception)
+    with pytest.raises(InputError, match="capture poses"):
+        printed_by(app, "depth", scene)
     model = true_model([reduced(view_truth(RAW, index)) for index in range(3)])
     write_sparse_model(scene / "reconstruction", model)
     with pytest.raises(InputError, match="capture scale"):
@@ -187,9 +186,9 @@ def test_depths_of_patch_match_come_in_metres(merged: Path, tmp_path: Path, monk
     job = ColmapJob((ColmapPicture(VIEWS[0], f"{VIEWS[0]}.png", "", 0),), (None,))
     write_json(scene / "reconstruction" / "colmap_job.json", job_to_json(job))
     ran: list[Path] = []
-    monkeypatch.setattr("capture.dense.patch_match.patch_match_obstacle", lambda: None)
-    monkeypatch.setattr("capture.dense.patch_match.run_patch_match", lambda _s, _p, folder: (folder.mkdir(), ran.append(folder)))
-    monkeypatch.setattr("capture.dense.patch_match.read_patch_match", lambda *_: np.full((2, 3), 3.0, np.float32))
+    monkeypatch.setattr("capture.dense.scene_depth.patch_match_obstacle", lambda: None)
+    monkeypatch.setattr("capture.dense.scene_depth.run_patch_match", lambda _s, _p, folder: (folder.mkdir(), ran.append(folder)))
+    monkeypatch.setattr("capture.dense.scene_depth.read_patch_match", lambda *_: np.full((2, 3), 3.0, np.float32))
     for _ in range(2):
         found = PatchMatchScene(scene, model).depths_in(VIEWS[0])
     np.testing.assert_array_equal(found.depth_m, 1.5)

@@ -11,9 +11,8 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
 from tests.scenes.thin_lens_board import DARK, LIGHT, Shot, camera_over, display_bgr, photograph
-from viewfinder.focus.board_focus import BlurOfBoardFocus, BlurSettings
+from viewfinder.focus.board_focus import BlurOfBoardFocus, BlurSettings, FocusEvidence, focus_candidates, settled
 from viewfinder.focus.edge_blur import EdgeBlurs, board_edges, edge_blurs, edge_rise
-from viewfinder.focus.focus_from_blur import FocusEvidence, focus_candidates, settled
 from viewfinder.frames import CameraFrame, LensState
 from viewfinder.tracking.tracker import TrackedPose
 

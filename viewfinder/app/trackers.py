@@ -70,8 +70,7 @@ def _pose(options: TrackingOptions) -> Tracker:
 
 
 def _map(options: TrackingOptions) -> Tracker:
-    from viewfinder.tracking.map_localiser import MapLocaliser
-    from viewfinder.tracking.map_tracker import MapTracker
+    from viewfinder.tracking.map_tracker import MapLocaliser, MapTracker
     from viewfinder.tracking.sparse_map import read_sparse_map
 
     assert options.map is not None, "chosen"

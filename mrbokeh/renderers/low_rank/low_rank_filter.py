@@ -1,9 +1,8 @@
 """Low-rank filters: every pixel's PSF as a sum of few separable kernels (McGraw, Fast Bokeh Effects Using Low-Rank Linear Filters).
 
-The blur of a picture changes from pixel to pixel, and a separable filter whose width changes between its two passes is
-not the blur that was asked for (McGraw therefore goes back to 2D filtering near depth edges; see mrbokeh.renderers.low_rank.per_pixel).
-Here the pixels are sorted by diameter instead: each gives its light to the two tabulated kernels next to its own, and all
-light of one kernel is an even, truly separable scatter. Edges of depth need no mask then, and no light is lost or doubled.
+The blur of a picture changes from pixel to pixel, and a separable filter whose width changes between its two passes is not the blur
+that was asked for. Here the pixels are sorted by diameter instead: each gives its light to the two tabulated kernels next to its own,
+and all light of one kernel is an even, truly separable scatter. Edges of depth need no mask then, and no light is lost or doubled.
 
 What it costs: the light of a pixel is not exactly its PSF. The low-rank sum ripples within the square around the kernel
 (in the corners too, where the kernel has ended) with a norm of `relative_error` of the kernel's, and blending two kernels
@@ -12,6 +11,9 @@ within 0.003 of its exact blur at the default. They do not average out for highl
 see mrbokeh.renderers.low_rank.exact_scatter. Beside a bright area that just fails to count as one, the dark is off by a tenth of its
 own light.
 
+McGraw's own way is kept to compare with: two passes whose width changes from pixel to pixel. The second knows the pixels that the first
+reached, not where their light came from, and filters by the diameter found there, which is wrong near an edge of depth. As in the paper,
+edges are found by finite differences, grown by the blur and left to full 2D filtering.
 `tilt_shift` blurs a photograph by a map that somebody drew, without any depth (McGraw, Section 4 and Fig. 14): a tilted lens keeps a
 wedge of space sharp, and a gradient of blur drawn over a photograph looks alike and makes the subject seem small.
 """
@@ -22,7 +24,7 @@ from dataclasses import dataclass, field
 from functools import cached_property, partial
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Bool, Float32, Float64, Int
 
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.layering import Layering, render_layers
@@ -33,9 +35,110 @@ from mrbokeh.optics.psf_bank import PsfBank
 from mrbokeh.renderers.bank.renderers import BankRenderer, BankTerms, KernelOpening, by_low_rank
 from mrbokeh.renderers.kernels.low_rank_kernel import Levels, LowRankKernel, Taps, decompose, levels_of, taps_of
 from mrbokeh.renderers.low_rank.exact_scatter import LEAST_RADIUS_PX, exact_share, scatter_exactly
-from mrbokeh.renderers.low_rank.per_pixel import depth_edge_mask, scatter_per_pixel
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import cores
+
+EDGE_PX = 1.0
+"""Where neighbouring pixels differ by more than this in signed diameter, there is an edge."""
+_STEP_PX = 0.5
+_PIECE_PX = 64
+
+
+def depth_edge_mask(
+    coc_px: Float32[np.ndarray, "height width"], lit: Bool[np.ndarray, "height width"], unit_radius: float
+) -> Bool[np.ndarray, "height width"]:
+    """Return a mask of the pixels within whose reach there is an edge: an abrupt change of the (signed) diameter, or a pixel without light.
+
+    The reach of a pixel is the square around it that its kernel takes, rounded up to a power of two.
+    """
+    import cv2
+
+    edges = ~lit
+    signed_px = np.where(lit, coc_px, np.float32(0.0))
+    for axis in (0, 1):
+        steep = np.abs(np.diff(signed_px, axis=axis)) > EDGE_PX
+        pad = [(0, 1) if axis == each else (0, 0) for each in (0, 1)]
+        edges |= np.pad(steep, pad) | np.pad(steep, [each[::-1] for each in pad])
+    radii_px = 0.5 * unit_radius * np.abs(signed_px) + 0.5
+    mask = edges.copy()
+    radius_px = 1
+    while radius_px < 2.0 * radii_px.max():
+        window = np.ones((2 * radius_px + 1, 2 * radius_px + 1), np.uint8)
+        near = cv2.dilate(edges.astype(np.uint8), window, borderType=cv2.BORDER_CONSTANT, borderValue=0) > 0
+        mask |= near & (radii_px > radius_px / 2) & (radii_px <= radius_px)
+        radius_px *= 2
+    return mask & lit
+
+
+def scatter_per_pixel(
+    out: Float32[np.ndarray, "height width channels"],
+    values: Float32[np.ndarray, "height width channels"],
+    shares: Float32[np.ndarray, "height width"],
+    diameters_px: Float32[np.ndarray, "height width"],
+    kernel_at: Callable[[float], LowRankKernel],
+    mirrored: bool,
+    each: Callable[[Callable, Iterable], Iterable] = map,
+) -> None:
+    """Add share * value of every pixel to out, term by term, across and then down; diameters_px unsigned."""
+    from mrbokeh.renderers.low_rank._filter_numba import across, down
+
+    columns, rows, radii_px = _tables(float(diameters_px.max()), kernel_at, mirrored)
+    positions = diameters_px / np.float32(_STEP_PX)
+    middle = np.empty_like(values)
+    height, width = diameters_px.shape
+    for term in range(columns.shape[0]):
+
+        def run_across(top: int, table: np.ndarray = rows[term]) -> None:
+            part = slice(top, top + _PIECE_PX)
+            across(middle[part], values[part], shares[part], positions[part], table, radii_px)
+
+        def run_down(left: int, table: np.ndarray = columns[term]) -> None:
+            part = np.s_[:, left : left + _PIECE_PX]
+            down(out[part], middle[part], positions[part], table, radii_px)
+
+        list(each(run_across, range(0, height, _PIECE_PX)))
+        list(each(run_down, range(0, width, _PIECE_PX)))
+
+
+def _tables(
+    largest_px: float, kernel_at: Callable[[float], LowRankKernel], mirrored: bool
+) -> tuple[Float32[np.ndarray, "terms levels size"], Float32[np.ndarray, "terms levels size"], Int[np.ndarray, " levels"]]:
+    """Return scaled columns and rows of the kernels at all steps up to the largest diameter, term by term in step with one another."""
+    kernels = [kernel_at(_STEP_PX * i) for i in range(int(np.ceil(largest_px / _STEP_PX)) + 2)]
+    terms, size = max(kernel.rank for kernel in kernels), 2 * max(kernel.radius_px for kernel in kernels) + 1
+    columns, rows = np.zeros((len(kernels), terms, size)), np.zeros((len(kernels), terms, size))
+    for i in reversed(range(len(kernels))):
+        kernel = kernels[i]
+        inset = size // 2 - kernel.radius_px
+        part = np.s_[i, : kernel.rank, inset : size - inset]
+        columns[part], rows[part] = kernel.scaled_columns, kernel.scaled_rows
+        if i + 1 < len(kernels):
+            _put_in_step(columns[i], rows[i], columns[i + 1], rows[i + 1])
+    order = slice(None, None, -1) if mirrored else slice(None)
+    by_term = [np.ascontiguousarray(each.transpose(1, 0, 2)[..., order], np.float32) for each in (columns, rows)]
+    return by_term[0], by_term[1], np.array([kernel.radius_px for kernel in kernels])
+
+
+def _put_in_step(
+    columns: Float64[np.ndarray, "terms size"],
+    rows: Float64[np.ndarray, "terms size"],
+    next_columns: Float64[np.ndarray, "terms size"],
+    next_rows: Float64[np.ndarray, "terms size"],
+) -> None:
+    """Reorder terms and flip signs so that every term is most like the same term of the next larger kernel; in place.
+
+    Singular vectors come in any order of nearly equal weights and with any sign, which would make a blend of two meaningless.
+    """
+    likeness = (next_columns @ columns.T) * (next_rows @ rows.T)
+    free = list(range(len(columns)))
+    order = np.zeros(len(columns), int)
+    for term in range(len(columns)):
+        order[term] = free.pop(int(np.argmax(likeness[term, free])))
+    columns[:], rows[:] = columns[order], rows[order]
+    signs = np.where(np.sum(columns * next_columns, axis=1) < 0, -1.0, 1.0)[:, None]
+    columns *= signs
+    rows *= signs
+
 
 _PIECE_ROWS, _PIECE_TILES = 192, 4  # fixed pieces of work: the result does not depend on the number of threads
 _MOST_CHANNELS = 16  # at once
@@ -185,16 +288,16 @@ def _scatter_levels(
 ) -> None:
     """Add share * value of every pixel that has a level, blurred by its low-rank kernels, to out."""
     from mrbokeh.renderers.kernels._low_rank_numba import level_spans
-    from mrbokeh.renderers.low_rank._filter_numba import TILE_FLOATS, scatter_piece
+    from mrbokeh.renderers.low_rank._filter_numba import TILE_FLOATS, Kernels, Source, scatter_piece
 
     spans = level_spans(levels.level, levels.upper, TILE_FLOATS // values.shape[2])
     height, tiles = spans.shape[:2]
-    source = (values, shares, levels.level, levels.upper, spans)
-    kernels = (taps.columns, taps.rows, taps.ranks, taps.radii_px)
+    source = Source(values=values, shares=shares, levels=levels.level, uppers=levels.upper, spans=spans)
+    kernels = Kernels(taps.columns, taps.rows, taps.ranks, taps.radii_px)
 
     def run(piece: tuple[int, int]) -> None:
         top, first = piece
-        scatter_piece(out, *source, *kernels, top, min(height, top + _PIECE_ROWS), first, min(tiles, first + _PIECE_TILES))
+        scatter_piece(out, source, kernels, top, min(height, top + _PIECE_ROWS), first, min(tiles, first + _PIECE_TILES))
 
     list(each(run, [(top, first) for top in range(0, height, _PIECE_ROWS) for first in range(0, tiles, _PIECE_TILES)]))
 
