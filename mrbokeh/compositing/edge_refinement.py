@@ -95,7 +95,7 @@ def _certain(mask: Mask) -> tuple[Mask, Mask]:
 
 
 def _nearness(rgb: Picture, sides: UInt8[np.ndarray, "height width"], places: Int64[np.ndarray, " n"]) -> Float32[np.ndarray, " n"]:
-    from mrbokeh.compositing._edge_colours_numba import nearness
+    from mrbokeh.compositing._between_numba import nearness
 
     found = np.zeros((len(places), 2), np.float32)
     with workers(len(places) * 100) as pool:

@@ -1,7 +1,7 @@
 """Grids over the coordinates of a bank of PSFs, whose cells each share one kernel: nested and proportional.
 
 `NestedGrid` has few cells with a finer end: cells grow with their smallest coordinate (Leimkuehler et al. 2018, Section 5.2). If one
-coordinate is small it takes small steps of both; mrbokeh.psf_models.combined says what that costs.
+coordinate is small it takes small steps of both; mrbokeh.psf_models.build says what that costs.
 
 `ProportionalGrid` covers two lengths in pixels with cells that grow in proportion to the kernels that they stand for. How much of a
 kernel's light lies elsewhere after a small step depends on the step over the size of what changes. For a disc of diameter d, swept by a

@@ -13,8 +13,7 @@ from jaxtyping import Float64
 
 from mrbokeh.optics.psf_bank import physical_boxes
 from mrbokeh.psf_models.base import centred
-from mrbokeh.psf_models.build import bank_head
-from mrbokeh.psf_models.combined import PAPER_COUNTS, Combined
+from mrbokeh.psf_models.build import PAPER_COUNTS, Combined, bank_head
 
 LARGEST_PX, LEAST_PX, PLACES = 256.0, 0.5, 1000
 BORDERS_PX = (0.5, 2.0, 8.0, 32.0, 256.0)

@@ -16,7 +16,7 @@ import typer
 
 from mrbokeh.optics.psf_bank import physical_boxes
 from mrbokeh.optics.psf_grid import NestedGrid
-from mrbokeh.psf_models.combined import Combined
+from mrbokeh.psf_models.build import Combined
 from mrbokeh.renderers.kernels.laplacian_integration import laplacian
 from mrbokeh.renderers.kernels.spreadlets import (
     Sparsification,

@@ -16,8 +16,7 @@ import torch
 
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.optics.psf_bank import PsfBank
-from mrbokeh.psf_models.build import build_bank
-from mrbokeh.psf_models.combined import Combined
+from mrbokeh.psf_models.build import Combined, build_bank
 from mrbokeh.renderers.bank.tables import Place
 from mrbokeh.renderers.kernels.laplacian_integration import laplacian
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets

@@ -30,8 +30,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.psf_bank import PsfBank
 from mrbokeh.optics.psf_bank_file import HEAD, missing_cells, read_bank, read_head
 from mrbokeh.psf_models.base import PsfModel
-from mrbokeh.psf_models.build import bank_head, build_bank
-from mrbokeh.psf_models.combined import Combined
+from mrbokeh.psf_models.build import Combined, bank_head, build_bank
 from mrbokeh.psf_models.physical_lens import PhysicalLens, biconvex_lens
 from mrbokeh.psf_models.simple_lens import SimpleLens
 from mrbokeh.psf_models.stylized import Stylized

@@ -16,7 +16,7 @@ from jaxtyping import Float, Float64, Int64
 from mrbokeh.images.image_metrics import ssim
 from mrbokeh.optics.psf_bank import physical_boxes
 from mrbokeh.optics.psf_grid import NestedGrid
-from mrbokeh.psf_models.combined import Combined
+from mrbokeh.psf_models.build import Combined
 from mrbokeh.renderers.kernels.laplacian_integration import integrate, laplacian
 from mrbokeh.renderers.kernels.spreadlets import Spreadlet, fitted_values, potential_of, table_for, whole_laplacian
 

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.depth.depth_map import DepthSettings, KnownDistance
-from mrbokeh.depth.depth_network import IMAGENET_MEAN, IMAGENET_STD, NetworkInput, predicted, read_network_input
-from mrbokeh.depth.open_depth import open_depth
+from mrbokeh.depth.open_depth import IMAGENET_MEAN, IMAGENET_STD, NetworkInput, open_depth, predicted, read_network_input
 from mrbokeh.images.color import srgb_to_linear
 from mrbokeh.system.errors import InputError
 

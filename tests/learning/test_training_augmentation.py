@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from training.data.augmentation import augmented, octaves, smooth_noise
+from training.data.batches import augmented, octaves, smooth_noise
 from training.data.pairs import Pair
 
 PX_PER_DIOPTRE, FOCUS_DIOPTRES = 40.0, 1.2

@@ -11,10 +11,10 @@ import pytest
 
 from mrbokeh.system.errors import InputError
 from tests.scenes.made_viewfinder import MadeControls, made_viewfinder
-from tests.scenes.waiting import in_time
-from viewfinder.server.control_messages import (
+from viewfinder.server.controls import (
     Capture,
     Choose,
+    Dispatcher,
     FocusAtDistance,
     FocusAtPoint,
     MoveObject,
@@ -23,7 +23,6 @@ from viewfinder.server.control_messages import (
     Switch,
     control_message,
 )
-from viewfinder.server.controls import Dispatcher
 from viewfinder.server.sessions import Role
 
 GOOD = [
@@ -67,17 +66,13 @@ NO_JSON = ["", "no json", "[" * 600, '{"f_number": NaN}', '{"f_number": Infinity
 
 
 @pytest.mark.parametrize(("value", "message", "asked"), GOOD)
-def test_each_message_is_read_and_carried_out(value: Any, message: Any, asked: tuple[Any, ...]) -> None:
+async def test_each_message_is_read_and_carried_out(value: Any, message: Any, asked: tuple[Any, ...]) -> None:
     assert control_message(value) == message
     controls = MadeControls()
-
-    async def work() -> None:
-        dispatcher = Dispatcher(controls)
-        answer = await dispatcher.answer(json.dumps(value), Role.CONTROL, "here")
-        assert answer["done"] == next(iter(value))
-        dispatcher.close()
-
-    in_time(work)
+    dispatcher = Dispatcher(controls)
+    answer = await dispatcher.answer(json.dumps(value), Role.CONTROL, "here")
+    assert answer["done"] == next(iter(value))
+    dispatcher.close()
     assert controls.asked[0] == asked
 
 
@@ -88,102 +83,84 @@ def test_malformed_messages_are_named(value: Any) -> None:
     assert len(str(problem.value)) < 300
 
 
-def test_what_makes_no_sense_changes_nothing_whichever_way_it_comes() -> None:
+async def test_what_makes_no_sense_changes_nothing_whichever_way_it_comes() -> None:
     texts = NO_JSON + [json.dumps(value) for value in MALFORMED + UNKNOWN]
-
-    async def work() -> None:
-        async with made_viewfinder() as made, aiohttp.ClientSession() as session:
+    async with made_viewfinder() as made, aiohttp.ClientSession() as session:
+        for text in texts:
+            # The limit per address has tests of its own.
+            made.site.dispatcher._limit._left.clear()
+            async with session.post(made.url + "control", data=text.encode("utf-8", "surrogatepass")) as answer:
+                expected = 413 if len(text) > 1024 else 400
+                assert answer.status == expected, text
+                assert list(await answer.json()) == ["error"]
+        async with session.ws_connect(made.url + "stream") as stream:
+            await stream.receive(timeout=5)  # without its acknowledgement no other picture comes
             for text in texts:
-                # The limit per address has tests of its own.
                 made.site.dispatcher._limit._left.clear()
-                async with session.post(made.url + "control", data=text.encode("utf-8", "surrogatepass")) as answer:
-                    expected = 413 if len(text) > 1024 else 400
-                    assert answer.status == expected, text
-                    assert list(await answer.json()) == ["error"]
-            async with session.ws_connect(made.url + "stream") as stream:
-                await stream.receive(timeout=5)  # without its acknowledgement no other picture comes
-                for text in texts:
-                    made.site.dispatcher._limit._left.clear()
-                    if len(text) < 1024:
-                        await stream.send_str(text)
-                        assert list(await stream.receive_json(timeout=5)) == ["error"], text
-                await stream.send_bytes(b"\0\1\2")
-                await stream.send_json({"f_number": 2.8})
-                assert await stream.receive_json(timeout=5) == {"done": "f_number"}
-            assert made.controls.asked == [("f_number", 2.8)]
-
-    in_time(work)
+                if len(text) < 1024:
+                    await stream.send_str(text)
+                    assert list(await stream.receive_json(timeout=5)) == ["error"], text
+            await stream.send_bytes(b"\0\1\2")
+            await stream.send_json({"f_number": 2.8})
+            assert await stream.receive_json(timeout=5) == {"done": "f_number"}
+        assert made.controls.asked == [("f_number", 2.8)]
 
 
-def test_answers_tell_what_was_found_and_what_cannot_be() -> None:
-    async def work() -> None:
-        async with made_viewfinder() as made, aiohttp.ClientSession() as session:
+async def test_answers_tell_what_was_found_and_what_cannot_be() -> None:
+    async with made_viewfinder() as made, aiohttp.ClientSession() as session:
 
-            async def post(message: Any) -> tuple[int, Any]:
-                async with session.post(made.url + "control", json=message) as answer:
-                    return answer.status, await answer.json()
+        async def post(message: Any) -> tuple[int, Any]:
+            async with session.post(made.url + "control", json=message) as answer:
+                return answer.status, await answer.json()
 
-            assert await post({"focus": {"at": [0.2, 0.3]}}) == (200, {"done": "focus", "focus_distance_m": 1.5})
-            assert await post({"capture": {}}) == (200, {"done": "capture", "bundle": "bundle_0001"})
-            assert await post({"focus": {"distance_m": 0.1}}) == (400, {"error": "the lens cannot focus at 0.1 m: choose 0.3 m or more"})
-            assert await post({"focus": {"at": [0.9, 0.3]}}) == (400, {"error": "there is no depth there: tap another place"})
-            status, answer = await post({"lens": "none such"})
-            assert status == 400 and "choose one of fifty, eighty" in answer["error"]
-            async with session.get(made.url + "state") as state:
-                shown = await state.json()
-            assert (shown["focus_distance_m"], shown["lens"], shown["transports"], shown["matte"]) == (1.5, "fifty", ["jpeg"], True)
-
-    in_time(work)
+        assert await post({"focus": {"at": [0.2, 0.3]}}) == (200, {"done": "focus", "focus_distance_m": 1.5})
+        assert await post({"capture": {}}) == (200, {"done": "capture", "bundle": "bundle_0001"})
+        assert await post({"focus": {"distance_m": 0.1}}) == (400, {"error": "the lens cannot focus at 0.1 m: choose 0.3 m or more"})
+        assert await post({"focus": {"at": [0.9, 0.3]}}) == (400, {"error": "there is no depth there: tap another place"})
+        status, answer = await post({"lens": "none such"})
+        assert status == 400 and "choose one of fifty, eighty" in answer["error"]
+        async with session.get(made.url + "state") as state:
+            shown = await state.json()
+        assert (shown["focus_distance_m"], shown["lens"], shown["transports"], shown["matte"]) == (1.5, "fifty", ["jpeg"], True)
 
 
-def test_a_control_that_breaks_says_so_and_the_next_one_works(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_control_that_breaks_says_so_and_the_next_one_works(caplog: pytest.LogCaptureFixture) -> None:
     class Broken(MadeControls):
         def capture(self) -> str:
             raise OSError("/secret/path is full")
 
-    async def work() -> None:
-        dispatcher = Dispatcher(Broken())
-        answer = await dispatcher.answer('{"capture": {}}', Role.CONTROL, "here")
-        # The page learns nothing of this machine's paths.
-        assert answer == {"error": "this failed in the viewfinder; see its terminal"}
-        assert await dispatcher.answer('{"record": true}', Role.CONTROL, "here") == {"done": "record"}
-        dispatcher.close()
-
-    in_time(work)
+    dispatcher = Dispatcher(Broken())
+    answer = await dispatcher.answer('{"capture": {}}', Role.CONTROL, "here")
+    # The page learns nothing of this machine's paths.
+    assert answer == {"error": "this failed in the viewfinder; see its terminal"}
+    assert await dispatcher.answer('{"record": true}', Role.CONTROL, "here") == {"done": "record"}
+    dispatcher.close()
     assert "/secret/path" in caplog.text
 
 
-def test_messages_are_carried_out_in_order_and_only_so_many_wait() -> None:
+async def test_messages_are_carried_out_in_order_and_only_so_many_wait() -> None:
     class Slow(MadeControls):
         def set_f_number(self, f_number: float) -> None:
             time.sleep(0.02)
             super().set_f_number(f_number)
 
     controls = Slow()
-
-    async def work() -> None:
-        dispatcher = Dispatcher(controls)
-        texts = [json.dumps({"f_number": 1 + i}) for i in range(12)]
-        answers = await asyncio.gather(*(dispatcher.answer(text, Role.CONTROL, "here") for text in texts))
-        assert answers[:8] == [{"done": "f_number"}] * 8
-        assert all("still busy" in answer["error"] for answer in answers[8:])
-        assert controls.asked == [("f_number", 1.0 + i) for i in range(8)]
-        dispatcher.close()
-
-    in_time(work)
+    dispatcher = Dispatcher(controls)
+    texts = [json.dumps({"f_number": 1 + i}) for i in range(12)]
+    answers = await asyncio.gather(*(dispatcher.answer(text, Role.CONTROL, "here") for text in texts))
+    assert answers[:8] == [{"done": "f_number"}] * 8
+    assert all("still busy" in answer["error"] for answer in answers[8:])
+    assert controls.asked == [("f_number", 1.0 + i) for i in range(8)]
+    dispatcher.close()
 
 
-def test_a_flood_of_messages_is_refused() -> None:
+async def test_a_flood_of_messages_is_refused() -> None:
     controls = MadeControls()
-
-    async def work() -> None:
-        dispatcher = Dispatcher(controls)
-        answers = [await dispatcher.answer('{"record": true}', Role.CONTROL, "one") for _ in range(200)]
-        refused = sum("too many" in answer.get("error", "") for answer in answers)
-        # 80 at once and 40 per second; 200 take well below two seconds.
-        assert 40 < refused <= 120
-        assert await dispatcher.answer('{"record": true}', Role.CONTROL, "another") == {"done": "record"}
-        dispatcher.close()
-
-    in_time(work)
+    dispatcher = Dispatcher(controls)
+    answers = [await dispatcher.answer('{"record": true}', Role.CONTROL, "one") for _ in range(200)]
+    refused = sum("too many" in answer.get("error", "") for answer in answers)
+    # 80 at once and 40 per second; 200 take well below two seconds.
+    assert 40 < refused <= 120
+    assert await dispatcher.answer('{"record": true}', Role.CONTROL, "another") == {"done": "record"}
+    dispatcher.close()
     assert 81 <= len(controls.asked) < 162

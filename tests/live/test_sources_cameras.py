@@ -2,11 +2,9 @@
 camera as far as it goes (it has no live view), a stand-in for its live view, and the pauses between attempts."""
 
 import json
-import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Generator
+from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 from threading import Event, Thread
@@ -20,10 +18,11 @@ import pytest
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.color import linear_from_code
 from mrbokeh.video.writer import VideoWriter
+from tests.tether.test_gphoto2 import StandIn, Widget, gp, in_own_interpreter
 from viewfinder.frames import LensState
 from viewfinder.sources.attached_camera import WebcamSource
 from viewfinder.sources.frame_source import CameraAwayError, SizeLimit, reconnecting
-from viewfinder.sources.network_stream import newest_of
+from viewfinder.sources.playback import newest_of
 
 WIDTH, HEIGHT = 160, 112
 
@@ -36,9 +35,6 @@ def clip(tmp_path: Path) -> Path:
         for index in range(3):
             writer.write(linear_from_code(np.full((HEIGHT, WIDTH, 3), 0.2 + 0.2 * index), "bt709"), index / 25)
     return path
-
-
-# --- webcam ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_webcam_is_pulled_out_and_plugged_in_again(clip: Path) -> None:
@@ -70,9 +66,6 @@ def test_a_webcam_is_pulled_out_and_plugged_in_again(clip: Path) -> None:
 def test_a_webcam_that_is_not_there_at_the_start_is_refused() -> None:
     with pytest.raises(InputError, match="camera 987 cannot be opened"):
         WebcamSource(987)
-
-
-# --- pauses and threads ---------------------------------------------------------------------------------------------
 
 
 def test_pauses_grow_and_start_again_after_success() -> None:
@@ -141,8 +134,6 @@ def test_the_thread_ends_when_nobody_asks_any_more() -> None:
     assert ended.wait(5)
 
 
-# --- gphoto2 --------------------------------------------------------------------------------------------------------
-
 SCRIPT = """
 import json, sys, threading, warnings
 warnings.simplefilter("error")
@@ -167,17 +158,8 @@ print(json.dumps({
 """
 
 
-def in_own_interpreter(script: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    """libgphoto2 looks for VCAMERADIR when it is loaded."""
-    root = str(Path(__file__).resolve().parents[2])
-    search = os.pathsep.join([root, os.environ.get("PYTHONPATH", "")])
-    environment = os.environ | {"PYTHONPATH": search} | environment
-    return subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment, timeout=120)
-
-
 def test_the_virtual_camera_is_opened_and_tells_its_f_number(tmp_path: Path) -> None:
     """It sets out at some f-number above 1, has no focus distance, and refuses a live view, which is no reason to wait."""
-    pytest.importorskip("gphoto2", reason="the extra 'tether' is not installed")
     cv2.imwrite(str(tmp_path / "GPH_0001.JPG"), np.zeros((48, 64, 3), np.uint8))
     done = in_own_interpreter(SCRIPT, VCAMERADIR=str(tmp_path))
     if "no camera found" in done.stderr:
@@ -190,32 +172,17 @@ def test_the_virtual_camera_is_opened_and_tells_its_f_number(tmp_path: Path) -> 
     assert "no camera at usb:009,009, only at Nikon DSC D750 at usb:001,001" in answers["port"]
 
 
-class LiveCamera:
-    """Speaks as gphoto2.Camera does with a camera that has live view; `script` says what each look at it brings."""
+@dataclass
+class LiveCamera(StandIn):
+    """`script` says what each look at it brings: a picture, or an error of libgphoto2."""
 
-    def __init__(self, script: list[Any], settings: dict[str, Any]) -> None:
-        self.script, self.settings, self.calls = script, settings, list[str]()
+    script: list[Any] = field(default_factory=list)
 
     def capture_preview(self) -> Any:
-        import gphoto2 as gp
-
         step = self.script.pop(0)
         if isinstance(step, int):
             raise gp.GPhoto2Error(step)
         return SimpleNamespace(get_data_and_size=lambda: step)
-
-    def get_single_config(self, name: str) -> Any:
-        import gphoto2 as gp
-
-        if name not in self.settings:
-            raise gp.GPhoto2Error(gp.GP_ERROR_BAD_PARAMETERS)
-        return SimpleNamespace(get_value=lambda: self.settings[name], set_value=lambda value: self.settings.update({name: value}))
-
-    def set_single_config(self, name: str, _widget: Any) -> None:
-        self.calls.append(f"{name}={self.settings[name]}")
-
-    def exit(self) -> None:
-        self.calls.append("exit")
 
 
 def jpeg(level: int) -> bytes:
@@ -224,7 +191,6 @@ def jpeg(level: int) -> bytes:
 
 @pytest.fixture
 def preview_source() -> Callable[..., Any]:
-    pytest.importorskip("gphoto2", reason="the extra 'tether' is not installed")
     from viewfinder.sources.attached_camera import Gphoto2PreviewSource
 
     return Gphoto2PreviewSource
@@ -233,20 +199,20 @@ def preview_source() -> Callable[..., Any]:
 def test_live_view_brings_pictures_and_the_lens(preview_source: Callable[..., Any]) -> None:
     """Property 5009 of PTP is in mm, 5008 in 1/100 mm; busy (-110) and an empty picture are passed over; the mirror goes down again."""
     settings = {"viewfinder": 0, "f-number": "f/5.6", "5008": "3500", "5009": "1250"}
-    camera = LiveCamera([-110, b"", jpeg(40), jpeg(90)], settings)
+    camera = LiveCamera({name: Widget(value) for name, value in settings.items()}, script=[-110, b"", jpeg(40), jpeg(90)])
     source, stopping = preview_source(limit=SizeLimit(80), open_camera=lambda _port: camera), Event()
     frames = source.frames(stopping)
     first, second = next(frames), next(frames)
     assert first.lens == second.lens == LensState(1.25, 5.6, 35.0)
     assert first.bgr.shape == (56, 80, 3) and abs(int(first.bgr[5, 5, 0]) - 40) < 3 and abs(int(second.bgr[5, 5, 0]) - 90) < 3
     frames.close()
-    assert camera.calls == ["viewfinder=1", "viewfinder=0", "exit"]
+    assert camera.set_log == [("viewfinder", 1), ("viewfinder", 0)] and camera.exited
 
 
 def test_a_tethered_camera_is_switched_off_and_on_again(preview_source: Callable[..., Any]) -> None:
     """-52: the USB device is gone. While it is away opening fails; then it is there, focused at infinity."""
-    away = CameraAwayError("no camera is found")
-    cameras = [LiveCamera([jpeg(40), -52], {"5009": "65535"}), away, LiveCamera([jpeg(90), jpeg(90)], {"5009": "65535"})]
+    away, at_infinity = CameraAwayError("no camera is found"), {"5009": Widget("65535")}
+    cameras = [LiveCamera(at_infinity, script=[jpeg(40), -52]), away, LiveCamera(at_infinity, script=[jpeg(90), jpeg(90)])]
 
     def open_next(_port: str | None) -> Any:
         camera = cameras.pop(0)

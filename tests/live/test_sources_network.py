@@ -22,7 +22,7 @@ from aiortc.rtp import RtpPacket
 from tests.scenes.waiting import wait_until
 from viewfinder.frames import CameraFrame
 from viewfinder.sources.frame_source import SizeLimit
-from viewfinder.sources.network_stream import NetworkStreamSource
+from viewfinder.sources.playback import NetworkStreamSource
 
 WIDTH, HEIGHT, FPS = 160, 112, 25
 RED, GREEN = (40, 60, 200), (60, 190, 50)

@@ -16,8 +16,7 @@ from mrbokeh.scene import Scene, emitter, rectangle, shadow_catcher, sun, world_
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.gltf.gltf_loader import GltfAsset, load_glb
 from mrbokeh.scene.moving_layers import FilmedScene, ShutterTiming, accumulated, moving_layer, moving_shadow_layer
-from mrbokeh.scene.moving_layers.moving_layer import MotionQuality, ShadowCatcher
-from mrbokeh.scene.moving_layers.paths import SurfacePoints, paths_of
+from mrbokeh.scene.moving_layers.moving_layer import MotionQuality, ShadowCatcher, SurfacePoints, paths_of
 from mrbokeh.system.errors import InputError
 
 OBJECTS = Path(__file__).resolve().parents[2] / "mrbokeh" / "demo_data" / "objects"

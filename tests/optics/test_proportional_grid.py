@@ -7,8 +7,7 @@ from mrbokeh.figures.psf_bank_drawing import draw_bank, sampled_cells
 from mrbokeh.optics.psf_bank import Axis, PsfBank, grid_over
 from mrbokeh.optics.psf_bank_file import read_bank, write_bank
 from mrbokeh.optics.psf_grid import NestedGrid, ProportionalGrid
-from mrbokeh.psf_models.build import bank_head
-from mrbokeh.psf_models.combined import PAPER_COUNTS, PAPER_EXPONENTS, Combined
+from mrbokeh.psf_models.build import PAPER_COUNTS, PAPER_EXPONENTS, Combined, bank_head
 from mrbokeh.system.errors import InputError
 from tests.bench.bench_combined_bank import overlaps
 

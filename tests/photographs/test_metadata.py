@@ -10,8 +10,14 @@ from pathlib import Path
 import pytest
 
 import capture.photos.metadata
-from capture.photos.metadata import metadata_from_tags, read_metadata, read_tags
-from capture.photos.metadata_readers import metadata_from_exiftool, read_tags_with_exifread, read_with_exiftool
+from capture.photos.metadata import (
+    metadata_from_exiftool,
+    metadata_from_tags,
+    read_metadata,
+    read_tags,
+    read_tags_with_exifread,
+    read_with_exiftool,
+)
 from capture.photos.photo_metadata import PhotoMetadata
 from tests.scenes.made_photographs import make_raw_photo, scene_rgb
 

@@ -15,8 +15,7 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.optics.psf_bank_file import cell_path, missing_cells, read_bank, read_head
-from mrbokeh.psf_models.build import MODEL_NAMES, ModelOptions, build_bank, choose_model
-from mrbokeh.psf_models.combined import Combined
+from mrbokeh.psf_models.build import MODEL_NAMES, Combined, ModelOptions, build_bank, choose_model
 from mrbokeh.psf_models.physical_lens import PhysicalLens
 from mrbokeh.psf_models.simple_lens import SimpleLens
 from mrbokeh.renderers.bank.kernel_files import build_spreadlets, spreadlets_beside

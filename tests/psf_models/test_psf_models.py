@@ -7,7 +7,7 @@ from jaxtyping import Float
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.psf_bank import Axis
 from mrbokeh.psf_models.base import PsfModel, sobol_blocks
-from mrbokeh.psf_models.combined import PAPER_COUNTS, Combined
+from mrbokeh.psf_models.build import PAPER_COUNTS, Combined
 from mrbokeh.psf_models.simple_lens import SimpleLens, banded_edges
 from mrbokeh.psf_models.stylized import Stylized
 from mrbokeh.system.errors import InputError

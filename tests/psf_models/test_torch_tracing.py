@@ -20,8 +20,7 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.psf_bank_file import cell_path, read_bank
 from mrbokeh.psf_models import _volume_numba as compiled
 from mrbokeh.psf_models.base import PsfModel, sobol_blocks
-from mrbokeh.psf_models.build import bank_head, build_bank
-from mrbokeh.psf_models.combined import Combined
+from mrbokeh.psf_models.build import Combined, bank_head, build_bank
 from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface
 from mrbokeh.psf_models.physical_lens import PhysicalLens
 from mrbokeh.psf_models.simple_lens import SimpleLens

@@ -13,7 +13,7 @@ from mrbokeh.layering.motion import MOTION, with_motion
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.psf_bank import Axis, PsfBank
-from mrbokeh.psf_models.combined import Combined
+from mrbokeh.psf_models.build import Combined
 from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface
 from mrbokeh.psf_models.physical_lens import PhysicalLens
 from mrbokeh.psf_models.volume import Volume

@@ -11,7 +11,7 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.polygon import bands as _polygon_bands
+from mrbokeh.renderers.polygon import polygon_differences
 from mrbokeh.renderers.polygon.directional_differences import PolygonCorners, edge_profile, polygon_corners
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.polygon.rectification import PAPER_DIRECTIONS, rectify_aperture
@@ -242,8 +242,8 @@ def test_calls_from_several_threads_do_not_meet() -> None:
 def test_bands_and_parts_leave_no_seams(monkeypatch: pytest.MonkeyPatch) -> None:
     values, coc_px = picture(200, 700, seed=3), waves(200, 700, 0.0, 12.0)
     whole = DEFAULT.sum_kernels(values, coc_px, APERTURES["disc"])
-    monkeypatch.setattr(_polygon_bands, "BAND_ROWS", 16)
-    monkeypatch.setattr(_polygon_bands, "RING_BYTES", 1)
+    monkeypatch.setattr(polygon_differences, "BAND_ROWS", 16)
+    monkeypatch.setattr(polygon_differences, "RING_BYTES", 1)
     np.testing.assert_allclose(DEFAULT.sum_kernels(values, coc_px, APERTURES["disc"]), whole, atol=2e-6)
 
 
@@ -320,7 +320,7 @@ def test_parts_hold_all_light_once_and_are_as_small_as_can_be(step: int, margin:
     """Rows 8 to 150 of 211 columns of tiles: every lit tile is in the part of its column of `step` px, parts of a column lie
     more than two margins apart, and each begins and ends with light on all four sides."""
     occupied = np.random.default_rng(step).uniform(size=(19, 27)) < lit
-    parts = _polygon_bands.parts_of(occupied, 8, 150, 211, step, margin).tolist()
+    parts = polygon_differences.parts_of(occupied, 8, 150, 211, step, margin).tolist()
     pixels = np.kron(occupied, np.ones((8, 8), bool))[:150, :211]
     pixels[:8] = False
     held = np.zeros(pixels.shape, int)

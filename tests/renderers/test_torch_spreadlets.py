@@ -15,8 +15,7 @@ import pytest
 
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.psf_bank import Axis, PsfBank
-from mrbokeh.psf_models.build import build_bank
-from mrbokeh.psf_models.combined import Combined
+from mrbokeh.psf_models.build import Combined, build_bank
 from mrbokeh.renderers.bank.tables import BankTables, Place
 from mrbokeh.renderers.kernels.laplacian_integration import integrate as integrate_compiled
 from mrbokeh.renderers.kernels.laplacian_tables import Points, by_rows, joined_points, taps_of

@@ -33,7 +33,7 @@ class TrainSettings:
         radiance where that is above white (1.0), so that a few lights do not outweigh the picture.
     energy_weight: of a second term, the squared error of the light in each neighbourhood as large as the largest blur; 0 as published.
     edge_weight: of a third term, the squared error of the result's gradients; 0 as published.
-    depth_noise: how badly depth is made worse while training (training/data/augmentation.py): 1 as bad as multi-view stereo, 0 not at all.
+    depth_noise: how badly depth is made worse while training (training/data/batches.py): 1 as bad as multi-view stereo, 0 not at all.
     sensor_white: radiance at which the sensor of the photographs saturates; result and slice are both clipped there before they are
         compared, so that a light may be as bright as it is. None compares them as they are.
     radiance_scale: the radiance that is mapped to +1 (0 to -1); None takes that of the data set's manifest, or for scene folders the

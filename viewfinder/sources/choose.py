@@ -64,7 +64,7 @@ def _named(kind: str, rest: str | None, limit: SizeLimit, fps: float | None) -> 
 
 
 def _stream(url: str, limit: SizeLimit) -> FrameSource:
-    from viewfinder.sources.network_stream import SCHEMES, NetworkStreamSource
+    from viewfinder.sources.playback import SCHEMES, NetworkStreamSource
 
     scheme = urlsplit(url).scheme.lower()
     if scheme in _THROUGH_MEDIAMTX:

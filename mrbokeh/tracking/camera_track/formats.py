@@ -22,7 +22,8 @@ from typing import Any
 from mrbokeh.optics.camera import camera_from_json, camera_to_json
 from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track import chan_file, colmap_file, nerfstudio_file, opentrackio_file
+from mrbokeh.tracking.camera_track import colmap_file, opentrackio_file
+from mrbokeh.tracking.camera_track.program_files import read_chan, read_nerfstudio, write_chan, write_nerfstudio
 from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame, TrackOptions, fixed_track
 
 FORMAT = "mrbokeh-camera-track"
@@ -85,8 +86,8 @@ Write = Callable[[Path, CameraTrack, TrackOptions], tuple[str, ...]]
 FORMATS: MappingProxyType[str, tuple[Read, Write]] = MappingProxyType(
     {
         "json": (read_own, write_own),
-        "chan": (chan_file.read, chan_file.write),
-        "nerfstudio": (nerfstudio_file.read, nerfstudio_file.write),
+        "chan": (read_chan, write_chan),
+        "nerfstudio": (read_nerfstudio, write_nerfstudio),
         "opentrackio": (opentrackio_file.read, opentrackio_file.write),
         "colmap": (colmap_file.read, colmap_file.write_text),
         "colmap-binary": (colmap_file.read, colmap_file.write_binary),
