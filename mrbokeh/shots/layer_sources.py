@@ -13,7 +13,7 @@ from mrbokeh.scene.staging.scene_file import read_scene_file
 from mrbokeh.shots.inputs import CameraSource, Description, Kept, LayerSource, Moment
 from mrbokeh.stacks.exr_layers.cryptomatte import ObjectSplit
 from mrbokeh.stacks.exr_layers.deep_interleaved import interleaved
-from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces
+from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples
 from mrbokeh.stacks.exr_layers.sequence import ExrSequence
 from mrbokeh.system.errors import InputError
 
@@ -66,20 +66,15 @@ def sources_by_depth(files: Sequence[LayerFiles], others: Sequence[Description[L
 class _OpenedAmong:
     def __init__(self, deep: Sequence[ExrSequence], others: Sequence[LayerSource]) -> None:
         self._deep, self._others = deep, others
-        self._read, self._put = [Kept(_samples) for _ in deep], Kept(interleaved)
+        self._read, self._put = [Kept(DeepSamples.read) for _ in deep], Kept(interleaved)
 
     def layers_at(self, moment: Moment, cameras: CameraSource | None) -> Sequence[Layer]:
         samples = []
         for sequence, read in zip(self._deep, self._read, strict=True):
             path = sequence.path_of(moment.number)
-            samples.append(read(sequence, str(path)))
+            samples.append(read(str(path)))
             _require_size(path, (samples[-1].width_px, samples[-1].height_px), moment)
         return self._put(samples, [layer for each in self._others for layer in each.layers_at(moment, cameras)])
-
-
-def _samples(sequence: ExrSequence, path: str) -> DeepSamples:
-    assert isinstance(sequence.reader, DeepSurfaces)
-    return sequence.reader.samples(path)
 
 
 def _require_size(path: Path, size_px: tuple[int, int], moment: Moment) -> None:

@@ -1,4 +1,4 @@
-"""Deep EXR: samples are read, made tidy by OpenEXR's rules, and flattened by depth; laid over one another slices are the flat picture."""
+"""Deep EXR: samples are read, made tidy by OpenEXR's rules, and flattened by depth; laid over one another surfaces are the flat picture."""
 
 import itertools
 import math
@@ -13,7 +13,7 @@ from mrbokeh.images.layer import Layer, flatten
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.stacks.exr_layers.composite_exr import write_deep_exr
-from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSlices, DeepSurfaces, even_edges_m, is_deep, merged, peeled, sliced
+from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces, is_deep, merged, peeled
 from mrbokeh.stacks.exr_layers.flat_render import LayerReader
 from mrbokeh.stacks.exr_layers.sequence import ExrSequence
 from mrbokeh.system.errors import InputError
@@ -59,6 +59,11 @@ def random_pixels(seed: int, size: tuple[int, int]) -> Pixels:
     return pixels
 
 
+def flat_of(samples: DeepSamples) -> list[Layer]:
+    """All samples laid over one another."""
+    return peeled(samples, 1, 1.0)
+
+
 def test_fog_cut_in_two_looks_the_same() -> None:
     """Beer-Lambert: transparency of parts multiplies; at half its length a fog of alpha 0.75 has 0.5, for 0.5 * 0.5 = 0.25."""
     whole = fog(1.0, 3.0, 0.75)
@@ -96,36 +101,16 @@ def test_tidy_samples_are_sorted_and_do_not_overlap() -> None:
     assert flattened(tidy)[1] == pytest.approx(1 - 0.5 * 0.6 * 0.8 * 0.9)
 
 
-@pytest.mark.parametrize("edges", [(), (2.0,), (1.5, 2.25, 3.3), (0.5, 100.0)])
-def test_compiled_slices_agree_with_plain_ones(tmp_path: Path, edges: tuple[float, ...]) -> None:
-    size = (6, 9)
-    pixels = random_pixels(3, size)
-    samples = DeepSamples.read(write_deep(tmp_path / "a.exr", size, pixels))
-    layers = sliced(samples, np.array(edges, np.float64))
-    assert len(layers) == len(edges) + 1
-    bounds = [0.0, *edges, math.inf]
-    for layer, near_m, far_m in zip(layers, bounds[:-1], bounds[1:], strict=True):
-        for place in np.ndindex(*size):
-            tidy = [each for each in tidied(pixels.get(place, []), edges) if near_m <= each.front_m < far_m] if place in pixels else []
-            rgb, alpha = flattened(tidy)
-            np.testing.assert_allclose(layer.rgb[place], rgb, atol=2e-6)
-            assert layer.alpha[place] == pytest.approx(alpha, abs=2e-6)
-
-
 @pytest.mark.parametrize("seed", [0, 1])
-def test_slices_over_one_another_are_the_flat_picture(tmp_path: Path, seed: int) -> None:
+def test_surfaces_over_one_another_are_the_flat_picture(tmp_path: Path, seed: int) -> None:
     path = write_deep(tmp_path / "a.exr", (16, 16), random_pixels(seed, (16, 16)))
     samples = DeepSamples.read(path)
-    (flat,) = sliced(samples, np.zeros(0))
-    for count in (2, 5):
-        again = flatten(sliced(samples, even_edges_m(samples, count)))
-        np.testing.assert_allclose(again.rgb, flat.rgb, atol=1e-6)
-        np.testing.assert_allclose(again.alpha, flat.alpha, atol=1e-6)
+    (flat,) = flat_of(samples)
     for surfaces, apart in ((1, 0.02), (3, 0.02), (9, 1e-6)):
         again = flatten(peeled(samples, surfaces, apart))
         np.testing.assert_allclose(again.rgb, flat.rgb, atol=1e-6)
         np.testing.assert_allclose(again.alpha, flat.alpha, atol=1e-6)
-    assert isinstance(DeepSlices(), LayerReader) and isinstance(DeepSurfaces(), LayerReader)
+    assert isinstance(DeepSurfaces(), LayerReader)
 
 
 @pytest.mark.parametrize(("surfaces", "apart"), [(1, 0.1), (2, 0.1), (3, 1e-9), (4, 0.5)])
@@ -146,8 +131,8 @@ def test_compiled_surfaces_agree_with_plain_ones(tmp_path: Path, surfaces: int, 
             assert layer.alpha[place] == pytest.approx(alpha, abs=2e-6)
 
 
-def test_a_receding_surface_stays_whole_in_surfaces_and_is_cut_by_slices(tmp_path: Path) -> None:
-    """An opaque card from 1 to 3 m, focus 1.5 m: blurred as one layer it is opaque inside; cut at 2.5 m light comes through the seam."""
+def test_a_receding_surface_stays_whole(tmp_path: Path) -> None:
+    """An opaque card from 1 to 3 m, focus 1.5 m: blurred as one layer it is opaque inside."""
     height, width = 40, 120
     depths_m = np.linspace(1.0, 3.0, 100)
     pixels = {(y, 10 + x): [point(z, 1.0)] for y in range(5, 35) for x, z in enumerate(depths_m)}
@@ -155,10 +140,8 @@ def test_a_receding_surface_stays_whole_in_surfaces_and_is_cut_by_slices(tmp_pat
     lens, inside = Lens(50.0, 1.4, 1.5, 36.0), np.s_[15:25, 30:90]
     renderer = PolygonDifferences()
     whole = renderer.render(DeepSurfaces().layers(path), lens).alpha[inside].min()
-    cut = renderer.render(DeepSlices(edges_m=(2.5,)).layers(path), lens).alpha[inside].min()
     assert len(DeepSurfaces().layers(path)) == 1
     assert whole > 0.99
-    assert cut < 0.9
 
 
 def test_silhouettes_before_something_have_both_surfaces(tmp_path: Path) -> None:
@@ -173,9 +156,6 @@ def test_silhouettes_before_something_have_both_surfaces(tmp_path: Path) -> None
     np.testing.assert_allclose(first.alpha, [[1.0, 0.5, 1.0, 0.6]], rtol=1e-6)
     np.testing.assert_allclose(first.depth_m[0, :3], [1, 1, 3])
     np.testing.assert_allclose(second.alpha, [[0, 1, 0, 0]])
-    for wrong in ({"surfaces": 0}, {"apart": 0.0}, {"metres_per_unit": -1.0}):
-        with pytest.raises(InputError, match="above 0"):
-            DeepSurfaces(**wrong)
 
 
 def test_depth_is_the_mean_in_dioptres_of_what_is_seen(tmp_path: Path) -> None:
@@ -186,38 +166,10 @@ def test_depth_is_the_mean_in_dioptres_of_what_is_seen(tmp_path: Path) -> None:
         (0, 2): [fog(1, 3, 0.5)],
         (1, 0): [DeepSample((1.0, 0.0, 0.0), 0.0, 4.0, 4.0)],
     }
-    (layer,) = sliced(DeepSamples.read(write_deep(tmp_path / "a.exr", (2, 3), pixels)), np.zeros(0))
+    (layer,) = flat_of(DeepSamples.read(write_deep(tmp_path / "a.exr", (2, 3), pixels)))
     np.testing.assert_allclose(layer.depth_m, [[4 / 3, 1.0, 2.0], [4.0, np.inf, np.inf]], rtol=1e-6)
     # Light without alpha has a place too.
     assert layer.alpha[1, 0] == 0 and layer.rgb[1, 0, 0] == 1
-
-
-def test_edges_lie_in_gaps_and_share_the_coverage(tmp_path: Path) -> None:
-    """Three cards at about 1, 2 and 5 m of equal size: two edges, one in each gap, half way in dioptres."""
-    rng = np.random.default_rng(0)
-    pixels = {
-        (y, x): [point(z + rng.uniform(0, 0.01), 1.0)] for (y, x), z in zip(np.ndindex(3, 8), [1] * 8 + [2] * 8 + [5] * 8, strict=True)
-    }
-    path = write_deep(tmp_path / "a.exr", (3, 8), pixels)
-    edges_m = even_edges_m(DeepSamples.read(path), 3)
-    np.testing.assert_allclose(1 / edges_m, [0.75, 0.35], atol=0.01)
-    layers = DeepSlices(slices=3).layers(path)
-    assert [int(layer.alpha.sum()) for layer in layers] == [8, 8, 8]
-    # One card cannot be cut in gaps that it does not have: all in one place gives one layer.
-    same = write_deep(tmp_path / "b.exr", (1, 4), {(0, x): [point(2, 0.5)] for x in range(4)})
-    assert len(DeepSlices(slices=4).layers(same)) == 1
-
-
-def test_edges_may_be_stated(tmp_path: Path) -> None:
-    path = write_deep(tmp_path / "a.exr", (1, 2), {(0, 0): [point(1, 0.5), point(2, 0.5)], (0, 1): [point(300, 1.0)]})
-    assert [float(layer.alpha[0, 0]) for layer in DeepSlices(edges_m=(2.0, 10.0)).layers(path)] == [0.5, 0.5, 0.0]
-    # In centimetres it is all nearer than 10 m: slices without anything are left out.
-    assert len(DeepSlices(edges_m=(10.0,), metres_per_unit=0.01).layers(path)) == 1
-    for edges in ((2.0, 1.0), (1.0, 1.0), (0.0, 1.0)):
-        with pytest.raises(InputError, match="ascend"):
-            DeepSlices(edges_m=edges)
-    with pytest.raises(InputError, match="above 0"):
-        DeepSlices(slices=0)
 
 
 def test_windows_and_parts(tmp_path: Path) -> None:
@@ -226,13 +178,11 @@ def test_windows_and_parts(tmp_path: Path) -> None:
     display = {"displayWindow": (np.array([0, 0], np.int32), np.array([3, 2], np.int32))}
     pixels = {(y, x): [point(1 + y, 1.0, x)] for y, x in np.ndindex(3, 3)}
     samples = DeepSamples.read(write_deep(tmp_path / "a.exr", (3, 3), pixels, **window, **display))
-    (layer,) = sliced(samples, np.zeros(0))
+    (layer,) = flat_of(samples)
     assert layer.alpha.shape == (3, 4)
     np.testing.assert_array_equal(layer.alpha, [[0, 0, 1, 1], [0, 0, 1, 1], [0, 0, 0, 0]])
     np.testing.assert_allclose(layer.depth_m[:2, 2:], [[2, 2], [3, 3]])
     np.testing.assert_allclose(layer.rgb[0, 2:, 0], [0, 1])
-    with pytest.raises(InputError, match="expected the deep part 'other', but it has deep"):
-        DeepSamples.read(tmp_path / "a.exr", part="other")
 
 
 def test_what_cannot_be_read_says_so(tmp_path: Path) -> None:
@@ -272,7 +222,7 @@ def test_real_deep_files(shared_data: Path) -> None:
     balls, trunks = (DeepSamples.read(folder / f"{name}_lowres.exr") for name in ("balls", "trunks"))
     both = merged([balls, trunks])
     assert both.starts[-1] == balls.starts[-1] + trunks.starts[-1] == 212029
-    (flat,) = sliced(both, np.zeros(0))
+    (flat,) = flat_of(both)
     # The composite's data window lacks one pixel at each border.
     inner = np.s_[1:-1, 1:-1]
     truth = read_exr(folder / "composited_lowres.exr")[0].stacked("RGBA")[inner]
@@ -281,13 +231,13 @@ def test_real_deep_files(shared_data: Path) -> None:
     is_same = np.abs(truth - ours).max(axis=2) < 1e-3
     covered = ours[..., 3] > 0.999
     assert is_same[covered].mean() > 0.4
-    meeting = (sliced(balls, np.zeros(0))[0].alpha[inner] > 0.1) & (sliced(trunks, np.zeros(0))[0].alpha[inner] > 0.1)
+    meeting = (flat_of(balls)[0].alpha[inner] > 0.1) & (flat_of(trunks)[0].alpha[inner] > 0.1)
     assert is_same[meeting].sum() > 500
-    trunks_first = flatten([sliced(trunks, np.zeros(0))[0], sliced(balls, np.zeros(0))[0]])
+    trunks_first = flatten([flat_of(trunks)[0], flat_of(balls)[0]])
     wrong = np.abs(truth - np.dstack([trunks_first.rgb, trunks_first.alpha])[inner]).max(axis=2)
     assert (wrong[meeting & is_same] > 1e-3).all()
-    again = flatten(DeepSlices(slices=4).layers(folder / "balls_lowres.exr"))
-    np.testing.assert_allclose(again.rgb, sliced(balls, np.zeros(0))[0].rgb, atol=1e-6)
+    again = flatten(DeepSurfaces().layers(folder / "balls_lowres.exr"))
+    np.testing.assert_allclose(again.rgb, flat_of(balls)[0].rgb, atol=1e-6)
 
 
 @pytest.mark.parametrize("half", [True, False])
@@ -307,11 +257,10 @@ def test_layers_written_deep_flatten_to_the_same(tmp_path: Path, half: bool) -> 
     samples = DeepSamples.read(tmp_path / "a.exr")
     assert samples.starts[-1] == sum(int((layer.alpha > 0).sum()) for layer in layers) + 1
     assert samples.counts[:11].max() == 0
-    flat, (read,) = flatten(written), sliced(samples, np.zeros(0))
+    flat, (read,) = flatten(written), flat_of(samples)
     tolerance = 2**-10 if half else 1e-6
     np.testing.assert_allclose(read.rgb, flat.rgb, rtol=tolerance, atol=tolerance)
     np.testing.assert_allclose(read.alpha, flat.alpha, atol=tolerance)
-    np.testing.assert_array_equal(DeepSlices(edges_m=(1.5,)).layers(tmp_path / "a.exr")[0].depth_m, layers[0].depth_m)
     for wrong in ([], [layers[0], Layer(flame.rgb[:3], flame.alpha[:3], flame.depth_m[:3])]):
         with pytest.raises(InputError, match="layers of one size"):
             write_deep_exr(tmp_path / "b.exr", wrong)

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from mrbokeh.commands.composite import app
 from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer
@@ -14,8 +13,9 @@ from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.shots.inputs import Moment
 from mrbokeh.shots.layer_sources import AmongDeep, LayerFiles, sources_by_depth
 from mrbokeh.stacks.exr_layers.deep_interleaved import cut_at, interleaved
-from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, merged, peeled, sliced
+from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, merged, peeled
 from mrbokeh.system.errors import InputError
+from tests.scenes.command_line import printed_by
 from tests.scenes.deep_pixels_reference import DeepSample, flattened, tidied
 from tests.stacks.test_exr_layers_deep import Pixels, fog, point, random_pixels, write_deep
 
@@ -97,7 +97,7 @@ def test_real_deep_pictures_by_the_command(shared_data: Path, tmp_path: Path) ->
     That it agrees with the composite that came with them is in test_exr_layers_deep.test_real_deep_files.
     """
     folder = shared_data / "deep"
-    (truth,) = sliced(merged([DeepSamples.read(folder / f"{name}_lowres.exr") for name in ("balls", "trunks")]), np.zeros(0))
+    (truth,) = peeled(merged([DeepSamples.read(folder / f"{name}_lowres.exr") for name in ("balls", "trunks")]), 1, 1.0)
     height, width = truth.alpha.shape
     write_image(tmp_path / "black.exr", np.zeros((height, width, 3), np.float32))
     write_lens(tmp_path / "lens.json", Lens(50.0, 1000.0, 100.0, 36.0))
@@ -105,9 +105,7 @@ def test_real_deep_pictures_by_the_command(shared_data: Path, tmp_path: Path) ->
     for names in (("balls", "trunks"), ("trunks", "balls")):
         out = tmp_path / f"{names[0]}.exr"
         layers = [word for name in names for word in ("--layer", str(folder / f"{name}_lowres.exr"))]
-        arguments = [str(tmp_path / "black.exr"), *layers, "--lens", str(tmp_path / "lens.json"), "--out", str(out), "--mode", "front"]
-        result = CliRunner().invoke(app, arguments, catch_exceptions=False)
-        assert result.exit_code == 0, result.output
+        printed_by(app, tmp_path / "black.exr", *layers, "--lens", tmp_path / "lens.json", "--out", out, "--mode", "front")
         pictures.append(read_layer(out, extra=True).extra)
     for picture in pictures:
         np.testing.assert_allclose(picture["sharp.G"][..., 0], truth.rgb[..., 1], atol=2e-3)
@@ -121,9 +119,8 @@ def test_a_deep_file_stands_behind_a_flat_one_that_is_nearer(tmp_path: Path) -> 
     write_layer(tmp_path / "near.exr", sheet(2.0, grey=0.9, size=size), half=False)
     write_image(tmp_path / "photo.exr", np.zeros((*size, 3), np.float32))
     write_lens(tmp_path / "lens.json", Lens(50.0, 100.0, 2.0, 36.0))
-    arguments = (tmp_path / "photo.exr", "--layer", tmp_path / "deep.exr", "--layer", tmp_path / "near.exr")
-    words = [*map(str, arguments), "--lens", str(tmp_path / "lens.json"), "--out", str(tmp_path / "out.exr")]
-    assert CliRunner().invoke(app, words, catch_exceptions=False).exit_code == 0
+    layers = ("--layer", tmp_path / "deep.exr", "--layer", tmp_path / "near.exr")
+    printed_by(app, tmp_path / "photo.exr", *layers, "--lens", tmp_path / "lens.json", "--out", tmp_path / "out.exr")
     np.testing.assert_allclose(read_image(tmp_path / "out.exr")[8:-8, 8:-8], 0.9, atol=2e-3)
 
 

@@ -18,7 +18,6 @@ def flatten_layers(
     rgba: np.ndarray,
     front_m: np.ndarray,
     back_m: np.ndarray,
-    edges_m: np.ndarray,
     apart: float,
     marks: np.ndarray,
     out: np.ndarray,
@@ -26,13 +25,13 @@ def flatten_layers(
 ) -> None:
     """Lay RGBA over one another per layer and pixel, front first, into out (N, P, 4), and the mean of 1 / depth into dioptres (N, P).
 
-    rgba: (S, 4) float64. With apart = 0 layers lie between edges_m (N - 1,), ascending; else there are no edges and a pixel's next layer
-    begins where the depth is farther by more than that part. marks: room for two numbers per sample of a pixel and the edges.
+    rgba: (S, 4) float64. A pixel's next layer begins where the depth is farther by more than the part `apart`. marks: room for two
+    numbers per sample of a pixel.
     """
     weights = np.zeros(out.shape[0])
     for pixel in range(starts.size - 1):
         first, end = starts[pixel], starts[pixel + 1]
-        count = _marks(first, end, front_m, back_m, edges_m, marks)
+        count = _marks(first, end, front_m, back_m, marks)
         weights[:] = 0.0
         index, begin_m = 0, math.inf
         for i in range(count):
@@ -47,9 +46,7 @@ def flatten_layers(
             fog = _volumes(first, end, here_m, next_m, rgba, front_m, back_m) if following < count else _NOTHING
             if not (_is_there(points) or _is_there(fog)):
                 continue
-            if apart == 0.0:
-                index = np.searchsorted(edges_m, here_m, side="right")
-            elif here_m > begin_m * (1.0 + apart) and index + 1 < weights.size:
+            if here_m > begin_m * (1.0 + apart) and index + 1 < weights.size:
                 index, begin_m = index + 1, here_m
             begin_m = min(begin_m, here_m)
             _put(points, here_m, pixel, index, out, dioptres, weights)
@@ -65,19 +62,14 @@ def _is_there(piece: tuple) -> bool:
 
 
 @njit(cache=True, nogil=True)
-def _marks(first: int, end: int, front_m: np.ndarray, back_m: np.ndarray, edges_m: np.ndarray, marks: np.ndarray) -> int:
-    """Fill marks with where anything begins or ends, sorted; edges only where they may cut something. Returns how many there are."""
-    count, is_thick = 0, False
+def _marks(first: int, end: int, front_m: np.ndarray, back_m: np.ndarray, marks: np.ndarray) -> int:
+    """Fill marks with where anything begins or ends, sorted. Returns how many there are."""
+    count = 0
     for s in range(first, end):
         marks[count] = front_m[s]
         count += 1
         if back_m[s] > front_m[s]:
             marks[count] = back_m[s]
-            count += 1
-            is_thick = True
-    if is_thick:
-        for edge in edges_m:
-            marks[count] = edge
             count += 1
     marks[:count].sort()
     return count

@@ -13,7 +13,7 @@ import difflib
 import json
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float32, UInt32
 
 from mrbokeh.images.layer import Layer
-from mrbokeh.stacks.exr_layers.flat_render import FlatRender, nearest_depth
+from mrbokeh.stacks.exr_layers.flat_render import layer_of, nearest_depth
 from mrbokeh.stacks.exr_layers.render_channels import RenderChannels
 from mrbokeh.system.errors import InputError
 
@@ -171,41 +171,32 @@ _WHOLLY = 0.999
 class ObjectSplit:
     """Reader of a render as layers of its objects.
 
-    objects: names, one layer each; empty takes none apart. without: names left out. with_rest: what belongs to neither, as a layer.
-
-    matte: name of the Cryptomatte, such as "CryptoObject", where a file has several; its end is enough.
+    objects: names, one layer each. with_rest: what belongs to none of them, as a layer.
     """
 
-    objects: tuple[str, ...] = ()
-    without: tuple[str, ...] = ()
+    objects: tuple[str, ...]
     with_rest: bool = True
-    matte: str = ""
-    render: FlatRender = field(default_factory=FlatRender)
 
     def __post_init__(self) -> None:
-        names = (*self.objects, *self.without)
-        if len(set(names)) < len(names):
-            raise InputError(f"every object can be named once, but came {', '.join(names)}")
-        if not self.objects and not self.with_rest:
-            raise InputError("nothing of the render would be left: name objects, or keep the rest")
+        if len(set(self.objects)) < len(self.objects):
+            raise InputError(f"every object can be named once, but came {', '.join(self.objects)}")
 
     def layers(self, path: Path | str) -> list[Layer]:
         """Return the layers, front first by their mean depth in dioptres."""
-        channels = RenderChannels.read(path, self.render.view)
-        picture, matte = self.render.layer_of(channels), self._matte(channels)
+        channels = RenderChannels.read(path)
+        picture, matte = layer_of(channels), _only_matte(channels)
         total = np.maximum(picture.alpha, matte.covered)
         shares = [_share(matte.matte(name), total) for name in self.objects]
         if self.with_rest:
-            left_out = [_share(matte.matte(name), total) for name in self.without]
-            shares.append(np.maximum(1.0 - np.sum([np.zeros_like(total), *shares, *left_out], axis=0), 0.0).astype(np.float32))
+            shares.append(np.maximum(1.0 - np.sum([np.zeros_like(total), *shares], axis=0), 0.0).astype(np.float32))
         return in_order([part_of(picture, share) for share in shares])
 
-    def _matte(self, channels: RenderChannels) -> Cryptomatte:
-        found = cryptomattes(channels)
-        named = [each for name, each in found.items() if name.endswith(self.matte)]
-        if len(named) != 1:
-            raise InputError(f"{channels.path}: choose one of its Cryptomattes {', '.join(found)}, not {self.matte or 'none'!r}")
-        return named[0]
+
+def _only_matte(channels: RenderChannels) -> Cryptomatte:
+    found = cryptomattes(channels)
+    if len(found) != 1:
+        raise InputError(f"{channels.path}: expected one Cryptomatte, got {', '.join(found)}: write the render with that of objects alone")
+    return next(iter(found.values()))
 
 
 def part_of(picture: Layer, share: Float32[np.ndarray, "height width"]) -> Layer:

@@ -12,16 +12,15 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from mrbokeh.images.layer import Layer, clear
-from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces, merged, peeled
+from mrbokeh.stacks.exr_layers.deep_layers import APART, SURFACES, DeepSamples, merged, peeled
 from mrbokeh.stacks.exr_layers.flat_render import nearest_depth
 from mrbokeh.system.errors import InputError
 
-_USUAL = DeepSurfaces()
 _THIN = 1e-30
 
 
-def interleaved(deep: Sequence[DeepSamples], flat: Sequence[Layer], reading: DeepSurfaces = _USUAL) -> list[Layer]:
-    """Return sharp layers, front first. flat: front first where they are in one place; reading: how samples become surfaces.
+def interleaved(deep: Sequence[DeepSamples], flat: Sequence[Layer]) -> list[Layer]:
+    """Return sharp layers, front first. flat: front first where they are in one place.
 
     Raises InputError where sizes differ, or there is no deep picture.
     """
@@ -40,7 +39,7 @@ def interleaved(deep: Sequence[DeepSamples], flat: Sequence[Layer], reading: Dee
     behind = _behind(samples, planes_m)
     layers = []
     for number in range(len(flat) + 1):
-        found = peeled(_only(samples, behind == number), reading.surfaces, reading.apart)
+        found = peeled(_only(samples, behind == number), SURFACES, APART)
         layers += [layer for layer in found if (layer.alpha != 0).any() or (layer.rgb != 0).any()]
         layers += flat[number : number + 1]
     return layers or [clear(samples.height_px, samples.width_px)]

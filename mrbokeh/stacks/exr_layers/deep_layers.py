@@ -3,16 +3,13 @@
 All layers laid over one another are the flat picture. Each keeps one depth per pixel, the mean in dioptres of what is seen of it, because
 blur grows evenly with dioptres.
 
-- DeepSurfaces: each pixel's first surface is in the first layer, its second in the second. A surface that recedes stays whole.
-- DeepSlices: layers lie between depths. A surface that goes through such a depth is cut in two, and blurred it lets light through along
-  the cut (0.21 of it in tests): edges belong into gaps. For fog and for things that stand apart.
+Each pixel's first surface is in the first layer, its second in the second. A surface that recedes stays whole.
 
 A sample with thickness is fog of even density ("Interpreting OpenEXR Deep Pixels", openexr.com): a part r of its length has alpha
 1 - (1 - a)^r and colour in that proportion. Two samples in one place mix, each by how much of the light it stops. An opaque one stays
 opaque however it is cut.
 """
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -52,15 +49,15 @@ class DeepSamples:
         return np.diff(self.starts)
 
     @classmethod
-    def read(cls, path: Path | str, part: str = "", metres_per_unit: float = 1.0) -> "DeepSamples":
-        """Read the deep part of that name, or the only one. Raises InputError without R, G, B, A and Z in a deep part."""
+    def read(cls, path: Path | str) -> "DeepSamples":
+        """Read the only deep part. Raises InputError without R, G, B, A and Z in it."""
         import OpenEXR
 
         if not Path(path).is_file():
             raise InputError(f"expected a deep EXR file at {path}, but there is none")
         try:
             with OpenEXR.File(str(path), separate_channels=True) as file:
-                return _from_part(Path(path), _chosen(Path(path), file.parts, part), metres_per_unit)
+                return _from_part(Path(path), _deep_part(Path(path), file.parts))
         except (RuntimeError, OSError) as error:
             raise InputError(f"{path} cannot be read as EXR: {error}") from None
 
@@ -94,16 +91,15 @@ def _is_deep_part(part: Any) -> bool:
     return part.type() in (OpenEXR.deepscanline, OpenEXR.deeptile)
 
 
-def _chosen(path: Path, parts: Sequence[Any], name: str) -> Any:
+def _deep_part(path: Path, parts: Sequence[Any]) -> Any:
     deep = [part for part in parts if _is_deep_part(part)]
-    named = [part for part in deep if not name or part.header.get("name") == name]
-    if not named or (len(named) > 1 and not name):
+    if len(deep) != 1:
         told = ", ".join(str(part.header.get("name", "")) for part in deep) or "flat parts only"
-        raise InputError(f"{path}: expected {f'the deep part {name!r}' if name else 'one deep part'}, but it has {told}")
-    return named[0]
+        raise InputError(f"{path}: expected one deep part, but it has {told}")
+    return deep[0]
 
 
-def _from_part(path: Path, part: Any, metres_per_unit: float) -> DeepSamples:
+def _from_part(path: Path, part: Any) -> DeepSamples:
     missing = [name for name in (*_COLOURS, "A", "Z") if name not in part.channels]
     if missing:
         raise InputError(f"{path}: expected deep R, G, B, A and Z, but {', '.join(missing)} are missing; it has {', '.join(part.channels)}")
@@ -115,8 +111,8 @@ def _from_part(path: Path, part: Any, metres_per_unit: float) -> DeepSamples:
             values[name] = _listed(pixels)
     counts[rows[0], columns[0]] = np.frompyfunc(lambda each: 0 if each is None else len(each), 1, 1)(pixels).astype(np.int64)
     rgb = np.stack([values[name] for name in _COLOURS], axis=1).astype(np.float32)
-    front_m = values["Z"].astype(np.float64) * metres_per_unit
-    back_m = np.maximum(values["ZBack"].astype(np.float64) * metres_per_unit, front_m) if "ZBack" in values else front_m
+    front_m = values["Z"].astype(np.float64)
+    back_m = np.maximum(values["ZBack"].astype(np.float64), front_m) if "ZBack" in values else front_m
     alpha = values["A"].astype(np.float32)
     _check(path, np.isfinite(rgb).all(axis=1) & np.isfinite(alpha) & (front_m > 0) & ~np.isnan(back_m))
     return DeepSamples(
@@ -155,106 +151,31 @@ def _check(path: Path, is_good: Bool[np.ndarray, " samples"]) -> None:
         raise InputError(f"{path}: {int((~is_good).sum())} deep samples have NaN, infinite colour or a depth not above 0: render it again")
 
 
-@dataclass(frozen=True)
+SURFACES = 4
+"""Layers at most; the last one takes all that is left."""
+APART = 0.02
+"""Samples belong to one surface as long as their depth exceeds that of its first by no more than this part of it."""
+
+
 class DeepSurfaces:
-    """Reader of a deep EXR as layers of what is first, second and so on at each pixel.
-
-    surfaces: layers at most; the last one takes all that is left. apart: samples belong to one surface as long as their depth exceeds
-    that of its first by no more than this part of it. part: name of the deep part, where there are several.
-    """
-
-    surfaces: int = 4
-    apart: float = 0.02
-    part: str = ""
-    metres_per_unit: float = 1.0
-
-    def __post_init__(self) -> None:
-        if self.surfaces < 1 or not self.metres_per_unit > 0 or not self.apart > 0:
-            raise InputError(
-                f"surfaces, apart and metres per unit must be above 0, got {self.surfaces}, {self.apart}, {self.metres_per_unit}"
-            )
+    """Reader of a deep EXR as layers of what is first, second and so on at each pixel."""
 
     def layers(self, path: Path | str) -> list[Layer]:
-        """Return layers, front first, without empty ones."""
-        return _full(peeled(self.samples(path), self.surfaces, self.apart))
-
-    def samples(self, path: Path | str) -> DeepSamples:
-        """Read the samples, in metres."""
-        return DeepSamples.read(path, self.part, self.metres_per_unit)
-
-
-@dataclass(frozen=True)
-class DeepSlices:
-    """Reader of a deep EXR as slices of depth.
-
-    edges_m: depths between which slices lie, ascending; one more slice than edges. Without them `slices` of about equal coverage
-    are made, cut in gaps where there are any. part: name of the deep part, where there are several.
-    """
-
-    edges_m: tuple[float, ...] | None = None
-    slices: int = 4
-    part: str = ""
-    metres_per_unit: float = 1.0
-
-    def __post_init__(self) -> None:
-        if self.slices < 1 or not self.metres_per_unit > 0:
-            raise InputError(f"expected slices and metres per unit above 0, got {self.slices} and {self.metres_per_unit}")
-        if self.edges_m is not None and (list(self.edges_m) != sorted(set(self.edges_m)) or min(self.edges_m, default=1.0) <= 0):
-            raise InputError(f"edges of depth slices must be above 0 and ascend, got {', '.join(f'{each:g}' for each in self.edges_m)}")
-
-    def layers(self, path: Path | str) -> list[Layer]:
-        """Return slices, front first, without empty ones."""
-        samples = DeepSamples.read(path, self.part, self.metres_per_unit)
-        edges_m = even_edges_m(samples, self.slices) if self.edges_m is None else np.array(self.edges_m, np.float64)
-        return _full(sliced(samples, edges_m))
-
-
-def sliced(samples: DeepSamples, edges_m: Float64[np.ndarray, " edges"]) -> list[Layer]:
-    """Return one layer for each slice of depth, front first, also if it is empty. What lies at an edge belongs behind it."""
-    return _flattened(samples, np.asarray(edges_m, np.float64), len(edges_m) + 1, 0.0)
+        """Return layers, front first, without empty ones, or an empty one if none holds anything."""
+        layers = peeled(DeepSamples.read(path), SURFACES, APART)
+        return [layer for layer in layers if (layer.alpha != 0).any() or (layer.rgb != 0).any()] or [clear(*layers[0].alpha.shape)]
 
 
 def peeled(samples: DeepSamples, surfaces: int, apart: float) -> list[Layer]:
-    """Return one layer for the first, second, ... surface of every pixel, front first, also if it is empty; see DeepSurfaces."""
-    return _flattened(samples, np.zeros(0), surfaces, apart)
-
-
-def _flattened(samples: DeepSamples, edges_m: Float64[np.ndarray, " edges"], count: int, apart: float) -> list[Layer]:
+    """Return one layer for the first, second, ... surface of every pixel, front first, also if it is empty; see SURFACES and APART."""
     from mrbokeh.stacks.exr_layers._deep_numba import flatten_layers
 
     size = (samples.height_px, samples.width_px)
-    out, dioptres = np.zeros((count, size[0] * size[1], 4)), np.zeros((count, size[0] * size[1]))
+    out, dioptres = np.zeros((surfaces, size[0] * size[1], 4)), np.zeros((surfaces, size[0] * size[1]))
     rgba = np.column_stack([samples.rgb, samples.alpha]).astype(np.float64)
-    marks = np.empty(2 * int(samples.counts.max(initial=0)) + len(edges_m))
-    flatten_layers(samples.starts, rgba, samples.front_m, samples.back_m, edges_m, apart, marks, out, dioptres)
+    marks = np.empty(2 * int(samples.counts.max(initial=0)))
+    flatten_layers(samples.starts, rgba, samples.front_m, samples.back_m, apart, marks, out, dioptres)
     return [_layer(rgba_of, dioptres_of, size) for rgba_of, dioptres_of in zip(out, dioptres, strict=True)]
-
-
-def _full(layers: list[Layer]) -> list[Layer]:
-    """Return the layers that hold anything, or an empty one if none does."""
-    return [layer for layer in layers if (layer.alpha != 0).any() or (layer.rgb != 0).any()] or [clear(*layers[0].alpha.shape)]
-
-
-def even_edges_m(samples: DeepSamples, slices: int) -> Float64[np.ndarray, " edges"]:
-    """Return edges of slices of about equal coverage, each moved to the widest gap in dioptres near it; fewer if all lies in one place."""
-    middle_dioptres = 2.0 / (samples.front_m + samples.back_m)
-    is_seen = samples.alpha > 0
-    order = np.argsort(-middle_dioptres[is_seen])
-    dioptres, coverage = middle_dioptres[is_seen][order], np.cumsum(samples.alpha[is_seen][order], dtype=np.float64)
-    if not len(dioptres):
-        return np.zeros(0)
-    bounds = np.searchsorted(coverage / coverage[-1], (np.arange(slices) + 0.5) / slices)
-    edges = [_widest_gap(dioptres, int(first), int(last)) for first, last in itertools.pairwise(bounds)]
-    return np.unique([1.0 / each for each in edges if each is not None]).astype(np.float64)
-
-
-def _widest_gap(dioptres: Float64[np.ndarray, " samples"], first: int, last: int) -> float | None:
-    """Return the middle of the widest gap among falling dioptres from one sample to another; None if there is no gap at all."""
-    gaps = -np.diff(dioptres[first : last + 1])
-    if not len(gaps) or gaps.max() <= 0:
-        return None
-    before = first + int(np.argmax(gaps))
-    return float(0.5 * (dioptres[before] + dioptres[before + 1]))
 
 
 def _layer(rgba: Float64[np.ndarray, "pixels 4"], dioptres: Float64[np.ndarray, " pixels"], size: Sequence[int]) -> Layer:

@@ -1,25 +1,20 @@
 """All channels of an EXR file by their full name, whatever parts and views they are spread over, and the names that programs give them.
 
-One table; a name that is not in it has to be stated.
+| program | colour | depth along the axis |
+|---|---|---|
+| EXR itself, Nuke, mrbokeh | R G B A without a layer | Z or depth.Z |
+| Blender, multilayer | VIEWLAYER.Combined.* | VIEWLAYER.Depth.Z, 1e10 is background |
+| Houdini, Mantra and Karma | R G B A, or C.* | Pz (part Pz) |
+| Arnold, V-Ray, Redshift | R G B A, or beauty.*, RGBA.* in parts | Z, depth.Z |
 
-| program | colour | depth along the axis | motion |
-|---|---|---|---|
-| EXR itself, Nuke, mrbokeh | R G B A without a layer | Z or depth.Z | forward.u right, forward.v up |
-| Blender, multilayer | VIEWLAYER.Combined.* | VIEWLAYER.Depth.Z, 1e10 is background | VIEWLAYER.Vector.Z, W: minus forward |
-| Houdini, Mantra and Karma | R G B A, or C.* | Pz (part Pz) | motion.u, motion.v if so named |
-| Arnold, V-Ray, Redshift | R G B A, or beauty.*, RGBA.* in parts | Z, depth.Z | by name |
-
-Blender 4 writes one part, 5 one for each layer if not told otherwise; its File Output node calls depth Depth.V. Its Vector holds X, Y
-from here to the frame before and Z, W from the frame after to here, so that both count against time when something moves evenly
-(Cycles, geom/primitive.h; checked on renders of Blender 4.2 and 5.0); y goes up. Some of these programs write a depth that is not
-along the axis (Nuke 1/z, Arnold and Karma if asked the distance along the ray): nobody can tell from the numbers, so
-`FlatRender.depth_is` says it.
+Blender 4 writes one part, 5 one for each layer if not told otherwise; its File Output node calls depth Depth.V. Some of these programs
+can write a depth that is not along the axis (Nuke 1/z, Arnold and Karma the distance along the ray): nobody can tell from the numbers.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -29,23 +24,9 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.layering.motion import with_motion
 from mrbokeh.system.errors import InputError
 
-
-class MotionNames(NamedTuple):
-    """Channels that hold motion to the right and up, and the factor that makes forward motion of them."""
-
-    right: str
-    up: str
-    factor: float
-
-
 COLOUR_LAYERS = ("", "Combined", "C", "RGBA", "rgba", "beauty", "Beauty")
-"""Layers that are taken as the picture where none is stated; the unnamed one goes before all others."""
+"""Layers that are taken as the picture; the unnamed one goes before all others."""
 DEPTH_NAMES = ("Z", "depth.Z", "Depth.Z", "Depth.V", "depth.z", "Pz", "Pz.Z", "Pz.z", "Pz.Pz", "z")
-MOTION_NAMES = (
-    MotionNames("forward.u", "forward.v", 1.0),
-    MotionNames("motion.u", "motion.v", 1.0),
-    MotionNames("Vector.Z", "Vector.W", -1.0),
-)
 BACKGROUND_FROM = 1e9
 """Depths from here on are background: Blender writes 1e10 (inf as half)."""
 
@@ -85,7 +66,7 @@ MULTI_VIEW = "multiView"
 
 @dataclass(frozen=True)
 class RenderChannels:
-    """Channels of a file for one view (eye).
+    """Channels of a file; of a stereo file those of its first view (eye).
 
     channels: full name to (H, W), as stored; a channel of a named part can also be had as PART.CHANNEL. stored: the names as the
     file has them, for errors. primaries: what R, G and B are, if stated. metadata: all strings and numbers of the headers.
@@ -98,55 +79,41 @@ class RenderChannels:
     metadata: dict[str, Any]
 
     @classmethod
-    def read(cls, path: Path | str, view: str = "") -> "RenderChannels":
-        """Read a file. view: "left", "right" or another that the file names; "" is its first."""
+    def read(cls, path: Path | str) -> "RenderChannels":
+        """Read a file; of a stereo file its first view."""
         path = Path(path)
         parts = read_exr(path)
         of_parts = _views_of_parts(parts)
         views = of_parts or _views_of_names(path)
-        if view and view not in views:
-            raise InputError(f"{path}: expected the view {view!r}, but it has {', '.join(views) if views else 'only one, without a name'}")
-        chosen = view or (views[0] if views else "")
+        chosen = views[0] if views else ""
         mine = [part for part in parts if part.attributes.get("view", chosen) == chosen]
-        by_part = [(part.name, part.channels if of_parts else _of_view(part.channels, chosen, views)) for part in mine]
+        by_part = [(part.name, part.channels if of_parts else _of_first_view(part.channels, views)) for part in mine]
         metadata = {key: value for part in reversed(parts) for key, value in part.attributes.items()}
         stored = tuple(sorted({name for part in mine for name in part.channels}))
         return cls(path=path, channels=_named(by_part), stored=stored, primaries=stated_primaries(mine[0], parts), metadata=metadata)
 
-    def colour_layer(self, wanted: str | None = None) -> str:
-        """Return the layer whose R, G and B are the picture. Raises InputError if none is stated and several or none could be meant."""
+    def colour_layer(self) -> str:
+        """Return the layer whose R, G and B are the picture. Raises InputError if several or none could be meant."""
         layers = [layer for layer in self._layers() if all(joined(layer, name) in self.channels for name in "RGB")]
-        if wanted is not None:
-            found = [layer for layer in layers if layer == wanted] or [layer for layer in layers if layer.endswith(f".{wanted}")]
-        else:
-            known = [layer for layer in layers if layer.rpartition(".")[2] in COLOUR_LAYERS]
-            found = [layer for layer in known if layer == ""] or self._distinct(known)
+        known = [layer for layer in layers if layer.rpartition(".")[2] in COLOUR_LAYERS]
+        found = [layer for layer in known if layer == ""] or self._distinct(known)
         if len(found) == 1:
             return found[0]
-        said = "R, G and B" if wanted is None else f"R, G and B in the layer {wanted!r}"
         if found:
-            raise InputError(f"{self.path}: {said} could be any of the layers {', '.join(found)}: state the layer by its full name")
-        raise InputError(f"{self.path}: expected {said}, but it has {', '.join(self.stored)}: state the layer that holds the picture")
-
-    def depth_name(self, colour_layer: str, wanted: str | None = None) -> str:
-        """Return the channel that holds depth. Raises InputError if there is none."""
-        names = (wanted,) if wanted else DEPTH_NAMES
-        found = self._first([(name,) for name in names], colour_layer)
-        if found is None:
             raise InputError(
-                f"{self.path}: expected depth in a channel {', '.join(names)}, but it has {', '.join(self.stored)}: "
-                f"render with depth, or state the channel that holds it"
+                f"{self.path}: R, G and B could be any of the layers {', '.join(found)}: write the picture without a layer's name"
             )
-        return found[0]
+        raise InputError(f"{self.path}: expected R, G and B, but it has {', '.join(self.stored)}: write the picture without a layer's name")
 
-    def motion_names(self, colour_layer: str) -> MotionNames:
-        """Return the channels that hold motion. Raises InputError if there are none."""
-        for names in MOTION_NAMES:
-            found = self._first([(names.right, names.up)], colour_layer)
-            if found is not None:
-                return MotionNames(found[0], found[1], names.factor)
-        wanted = ", ".join(f"{names.right} and {names.up}" for names in MOTION_NAMES)
-        raise InputError(f"{self.path}: expected motion in {wanted}, but it has {', '.join(self.stored)}: render with motion vectors")
+    def depth_name(self, colour_layer: str) -> str:
+        """Return the channel that holds depth: beside the colour layer, else anywhere at the top. Raises InputError if there is none."""
+        for parent in dict.fromkeys([colour_layer, colour_layer.rpartition(".")[0], ""]):
+            for name in DEPTH_NAMES:
+                if joined(parent, name) in self.channels:
+                    return joined(parent, name)
+        raise InputError(
+            f"{self.path}: expected depth in a channel {', '.join(DEPTH_NAMES)}, but it has {', '.join(self.stored)}: render with depth"
+        )
 
     def plane(self, name: str) -> Float[np.ndarray, "height width"]:
         return self.channels[name]
@@ -160,16 +127,6 @@ class RenderChannels:
         for layer in sorted(layers, key=len):
             kept.setdefault(id(self.channels[joined(layer, "R")]), layer)
         return list(kept.values())
-
-    def _first(self, choices: Sequence[tuple[str, ...]], colour_layer: str) -> tuple[str, ...] | None:
-        """Return the first choice that exists: beside the colour layer, else anywhere at the top."""
-        parents = [colour_layer, colour_layer.rpartition(".")[0], ""]
-        for parent in dict.fromkeys(parents):
-            for choice in choices:
-                names = tuple(joined(parent, name) for name in choice)
-                if all(name in self.channels for name in names):
-                    return names
-        return None
 
 
 def _views_of_parts(parts: Sequence[ExrPart]) -> list[str]:
@@ -201,18 +158,15 @@ def _named(by_part: Sequence[tuple[str, Channels]]) -> Channels:
     return channels
 
 
-def _of_view(channels: Channels, view: str, views: Sequence[str]) -> Channels:
+def _of_first_view(channels: Channels, views: Sequence[str]) -> Channels:
     """Return channels under the names that they would have if there were one view (Multi-View OpenEXR: LAYER.VIEW.CHANNEL)."""
-    if len(views) < 2:
-        return channels
-    others = {each for each in views if each != view}
     result: Channels = {}
     for name, pixels in channels.items():
         *layer, channel = name.split(".")
-        owner = layer[-1] if layer and layer[-1] in views else None
-        if owner == view:
-            result[".".join([*layer[:-1], channel])] = pixels
-        elif owner not in others and (layer or view == views[0]):
-            # Channels at the top belong to the default view; other layers without a view belong to all.
+        owner = layer[-1] if len(views) > 1 and layer and layer[-1] in views else None
+        if owner is None:
+            # Layers without a view belong to all.
             result.setdefault(name, pixels)
+        elif owner == views[0]:
+            result[".".join([*layer[:-1], channel])] = pixels
     return result

@@ -4,14 +4,11 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, get_args
 
 from mrbokeh.images.layer import Layer
 from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces, is_deep
 from mrbokeh.stacks.exr_layers.flat_render import FlatRender, LayerReader
 from mrbokeh.system.errors import InputError
-
-Gaps = Literal["error", "hold"]
 
 _PLACE = re.compile(r"%0?(\d*)d|(#+)|\$F(\d*)")
 # A hyphen is a minus after . or _ only: shot-0001.exr is frame 1.
@@ -23,8 +20,7 @@ _NAMED_GAPS = 12
 class ExrSequence:
     """Files by frame number, read when a frame is asked for; a still stands for every frame.
 
-    paths: of all frames that are there, within the range. frames: the numbers from the first to the last. gaps: "hold" shows the
-    frame before for one that is missing.
+    paths: of all frames. frames: the numbers from the first to the last.
     """
 
     paths: Mapping[int, Path]
@@ -33,43 +29,26 @@ class ExrSequence:
     is_still: bool = False
 
     @classmethod
-    def of(
-        cls,
-        where: Path | str,
-        reader: LayerReader | None = None,
-        *,
-        first: int | None = None,
-        last: int | None = None,
-        gaps: Gaps = "error",
-    ) -> "ExrSequence":
-        """Find the files of a sequence.
+    def of(cls, where: Path | str, reader: LayerReader | None = None) -> "ExrSequence":
+        """Find the files of a sequence. Raises InputError if nothing is found, or frames between the first and the last are missing.
 
         where: beauty.%04d.exr, beauty.####.exr, beauty.$F4.exr, a folder with one sequence, or a single file.
         reader: how files are understood; None takes FlatRender, or DeepSurfaces if they are deep.
-        first, last: the frames wanted, both included. Raises InputError if nothing is found, frames are missing (gaps="error"), or
-        the range reaches beyond the files.
         """
-        if gaps not in get_args(Gaps):
-            raise InputError(f"gaps in a sequence can be {', '.join(get_args(Gaps))}, not {gaps!r}")
         found, is_still = _found(Path(where))
-        begin, end = min(found) if first is None else first, max(found) if last is None else last
-        if begin > end:
-            raise InputError(f"{where}: the first frame {begin} comes after the last {end}: exchange them")
-        frames = range(begin, end + 1)
-        if not is_still:
-            _check_range(where, found, frames, gaps)
-            found = {number: path for number, path in found.items() if number <= end}
+        frames = range(min(found), max(found) + 1)
+        _require_all(where, found, frames)
         return cls(found, frames, reader or _reader_for(next(iter(found.values()))), is_still)
 
     def path_of(self, frame: int) -> Path:
-        """Return the file that shows a frame: its own, or the one before it that is held."""
+        """Return the file that shows a frame."""
         if self.is_still:
             return next(iter(self.paths.values()))
         if frame not in self.frames:
             raise InputError(
                 f"the render has frames {self.frames[0]} to {self.frames[-1]}, not {frame}: render that one, or take its range"
             )
-        return self.paths[max(number for number in self.paths if number <= frame)]
+        return self.paths[frame]
 
     def layers(self, frame: int) -> list[Layer]:
         """Return sharp layers of a frame, front first."""
@@ -84,7 +63,7 @@ class ExrSequence:
         """Return the samples of a deep frame. Raises InputError if the files are flat."""
         if not isinstance(self.reader, DeepSurfaces):
             raise InputError(f"expected deep pictures, but {self.path_of(frame)} is read as flat: take its layers")
-        return self.reader.samples(self.path_of(frame))
+        return DeepSamples.read(self.path_of(frame))
 
 
 def _reader_for(path: Path) -> LayerReader:
@@ -132,12 +111,8 @@ def _files(folder: Path) -> Sequence[Path]:
     return sorted(path for path in folder.iterdir() if not path.name.startswith(".")) if folder.is_dir() else []
 
 
-def _check_range(where: Path | str, found: Mapping[int, Path], frames: range, gaps: Gaps) -> None:
+def _require_all(where: Path | str, found: Mapping[int, Path], frames: range) -> None:
     missing = [number for number in frames if number not in found]
-    if not missing or (gaps == "hold" and missing[0] > min(found) and frames[-1] <= max(found)):
-        return
-    named = ", ".join(str(number) for number in missing[:_NAMED_GAPS]) + (" and more" if len(missing) > _NAMED_GAPS else "")
-    raise InputError(
-        f"{where}: frames {frames[0]} to {frames[-1]} were asked for, of which {len(missing)} are missing ({named}); "
-        f"there are {min(found)} to {max(found)}: render them, choose another range or hold the frame before a gap"
-    )
+    if missing:
+        named = ", ".join(str(number) for number in missing[:_NAMED_GAPS]) + (" and more" if len(missing) > _NAMED_GAPS else "")
+        raise InputError(f"{where}: of the frames {frames[0]} to {frames[-1]} {len(missing)} are missing ({named}): render them")
