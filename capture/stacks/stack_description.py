@@ -13,7 +13,7 @@ from capture.stacks.grouping import Photo, in_focus_order
 from capture.stacks.session import GIVEN, CameraChoice
 from capture.stacks.slice_files import FOLDER, arrange_slices, bounded_focus_records, source_record
 from capture.stacks.stack_ingest import PROCESS_VERSION, Development, FinishedSlice, StackWork
-from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.camera import camera_of_lens
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import lens_to_json
 from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, Slice, read_focal_stack, write_focal_stack
@@ -163,12 +163,6 @@ def _why_no_focus(photo: Photo) -> str:
     if focal_length_mm is None:
         return f" ({focus.source} counts from the film plane; the lens's distance follows once the focal length is known)"
     return f" ({focus.source} from the film plane is nearer than a thin lens of {focal_length_mm:g} mm can focus)"
-
-
-def camera_of_lens(lens: Lens, width_px: int, height_px: int) -> Camera:
-    """Return a camera with square pixels and the principal point in the middle of the picture."""
-    focal_px = lens.focal_px(width_px)
-    return Camera(width_px, height_px, (focal_px, focal_px), (width_px / 2.0, height_px / 2.0))
 
 
 def reference_index(focus_distances_m: Sequence[float | None]) -> int:

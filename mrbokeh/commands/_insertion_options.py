@@ -197,15 +197,5 @@ class LookGroup:
     def wanted(self) -> "LookOptions":
         from mrbokeh.compositing.plate_look.finishing import LookOptions
 
-        return LookOptions(
-            match_grey=self.match_grey,
-            grey_value=self.grey_value,
-            match_exposure=self.match_exposure,
-            match_white_k=self.match_white,
-            match_black=self.match_black,
-            vignetting=self.vignetting,
-            grain=self.grain,
-            light_wrap=self.light_wrap,
-            seed=self.seed,
-            plate_exposure=self.plate_exposure,
-        )
+        rest = {name: value for name, value in vars(self).items() if name != "match_white"}
+        return LookOptions(match_white_k=self.match_white, **rest)

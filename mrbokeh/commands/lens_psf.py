@@ -19,8 +19,10 @@ class BankOptions:
 
     lens: Annotated[Path | None, typer.Option(help="Lens file whose opening is used (model simple; a disc without).")] = None
     image: Annotated[Path | None, typer.Option(help="The picture of a PSF (model stylized).")] = None
-    diameter: Annotated[float | None, typer.Option(help="Largest circle of confusion in px (simple, combined, stylized).")] = None
-    motion: Annotated[float | None, typer.Option(help="Longest motion in px per shutter (combined).")] = None
+    diameter_px: Annotated[
+        float | None, typer.Option("--diameter", help="Largest circle of confusion in px (simple, combined, stylized).")
+    ] = None
+    motion_px: Annotated[float | None, typer.Option("--motion", help="Longest motion in px per shutter (combined).")] = None
     prescription: Annotated[Path | None, typer.Option(help="A .dat file of lens surfaces (model physical; a bi-convex lens without).")] = (
         None
     )
@@ -58,27 +60,8 @@ class BankOptions:
         """Return the options as the models take them. Raises InputError if the steps are no numbers."""
         from mrbokeh.psf_models.build import ModelOptions
 
-        return ModelOptions(
-            lens=self.lens,
-            image=self.image,
-            diameter_px=self.diameter,
-            motion_px=self.motion,
-            prescription=self.prescription,
-            focus_distance_m=self.focus_distance_m,
-            f_number=self.f_number,
-            sensor_width_mm=self.sensor_width_mm,
-            sensor_height_mm=self.sensor_height_mm,
-            image_width_px=self.image_width_px,
-            nearest_m=self.nearest_m,
-            farthest_m=self.farthest_m,
-            vignetting=self.vignetting,
-            density_per_m=self.density_per_m,
-            anisotropy=self.anisotropy,
-            focal_px=self.focal_px,
-            counts=None if self.counts is None else _steps(self.counts),
-            cells=self.cells,
-            device=self.device or None,
-        )
+        counts = None if self.counts is None else _steps(self.counts)
+        return ModelOptions(**vars(self) | {"counts": counts, "device": self.device or None})
 
 
 @dataclass(frozen=True)

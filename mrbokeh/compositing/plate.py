@@ -22,7 +22,7 @@ from mrbokeh.depth.open_depth import open_depth
 from mrbokeh.images.alpha_io import is_straight, read_alpha
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
-from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.camera import Camera, camera_of_lens
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.stacks.capture_bundle import CaptureBundle
@@ -103,7 +103,7 @@ def open_plate(photo: Path, slice_index: int | None = None, lens: Lens | None = 
 
 def plate_of(rgb: Float32[np.ndarray, "height width 3"], lens: Lens, depth_m: Float32[np.ndarray, "height width"] | None = None) -> Plate:
     """A picture through the pinhole of its lens, which looks at its middle."""
-    return Plate(rgb, depth_m, lens, _pinhole(lens, rgb))
+    return Plate(rgb, depth_m, lens, camera_of_lens(lens, rgb.shape[1], rgb.shape[0]))
 
 
 def with_own_alpha(plate: Plate, path: Path, alpha: Float32[np.ndarray, "height width"] | None) -> Plate:
@@ -141,17 +141,11 @@ def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus
     focused = stack.registered_lens_of(slice_index) if lens is None else lens.focused_at(stack.lens_of(slice_index).focus_distance_m)
     focused = focused if focus_m is None else focused.focused_at(focus_m)
     rgb = stack.slice_rgb(slice_index)
-    camera = stack.camera or _pinhole(stack.lens_of(stack.reference), rgb)
+    camera = stack.camera or camera_of_lens(stack.lens_of(stack.reference), rgb.shape[1], rgb.shape[0])
     # A stack of a scene knows where its camera stood; objects are placed in camera axes.
     upright = replace(camera, camera_from_world=np.eye(4))
     plate = Plate(rgb=rgb, depth_m=stack.depth_m(), lens=focused, camera=upright, sharp_rgb=stack.all_in_focus())
     return replace(plate, metres_guessed=not stack.metres_known, lens_guessed=lens is None and is_lens_guessed(stack))
-
-
-def _pinhole(lens: Lens, rgb: Float32[np.ndarray, "height width 3"]) -> Camera:
-    height, width = rgb.shape[:2]
-    focal_px = lens.focal_px(width)
-    return Camera(width, height, (focal_px, focal_px), (width / 2, height / 2))
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float, Float64
 
 from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.aperture_shapes import closed
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.kernels.low_rank_kernel import aperture_errors
 from mrbokeh.renderers.polygon.rectification import rectify
@@ -97,14 +98,14 @@ def draw_outlines(axes: "Axes", aperture: Aperture) -> None:
     opening = aperture.seen(1)
     for index, (outline, weight) in enumerate(zip(opening.outlines, opening.weights, strict=True)):
         label = f"{len(outline)} vertices, weight {weight:+.3g}" if index < _MOST_NAMED else None
-        axes.plot(*_closed(outline).T, color="tab:blue" if weight > 0 else "tab:red", lw=1.2, marker=".", ms=3, label=label)
+        axes.plot(*closed(outline).T, color="tab:blue" if weight > 0 else "tab:red", lw=1.2, marker=".", ms=3, label=label)
     if len(opening.outlines) > _MOST_NAMED:
         axes.plot([], [], " ", label=f"and {len(opening.outlines) - _MOST_NAMED} more")
     edges = []
     for outline in opening.outlines[:_MOST_RECTIFIED]:
         with suppress(InputError):
             simple = rectify(outline)
-            axes.plot(*_closed(simple).T, color="black", lw=0.8, ls="--")
+            axes.plot(*closed(simple).T, color="black", lw=0.8, ls="--")
             edges.append(str(len(simple)))
     axes.plot([], [], color="black", lw=0.8, ls="--", label=f"rectified: {', '.join(edges) or 'not possible with so few'} edges")
     axes.plot(0, 0, "+", color="grey")
@@ -112,10 +113,6 @@ def draw_outlines(axes: "Axes", aperture: Aperture) -> None:
     axes.invert_yaxis()
     axes.set_title("opening behind the focus (unit pupil)", fontsize=9)
     axes.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.08))
-
-
-def _closed(outline: Float64[np.ndarray, "vertices 2"]) -> Float64[np.ndarray, "points 2"]:
-    return np.concatenate([outline, outline[:1]])
 
 
 def draw_low_rank_error(axes: "Axes", aperture: Aperture) -> None:

@@ -244,6 +244,11 @@ def clipped_by_rim(opening: WeightedOutlines, centre_xy: tuple[float, float]) ->
     return joined(parts)
 
 
+def closed(outline: Float64[np.ndarray, "vertices 2"]) -> Float64[np.ndarray, "points 2"]:
+    """Return an outline that ends where it began, as lines are drawn."""
+    return np.concatenate([outline, outline[:1]])
+
+
 def joined(parts: list[WeightedOutlines]) -> WeightedOutlines:
     return tuple(outline for part in parts for outline in part[0]), tuple(weight for part in parts for weight in part[1])
 

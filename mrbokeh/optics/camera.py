@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
+from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 
 
@@ -89,6 +90,12 @@ class Camera:
 def have_same_shape(size_px: tuple[int, int], other_px: tuple[int, int], within: float = _SAME_SHAPE) -> bool:
     """Return whether two pictures (width, height) have one aspect ratio, up to rounding to whole or even pixels."""
     return abs(size_px[0] * other_px[1] / (size_px[1] * other_px[0]) - 1.0) <= within
+
+
+def camera_of_lens(lens: Lens, width_px: int, height_px: int) -> Camera:
+    """Return a camera with square pixels and the principal point in the middle of the picture."""
+    focal_px = lens.focal_px(width_px)
+    return Camera(width_px, height_px, (focal_px, focal_px), (width_px / 2.0, height_px / 2.0))
 
 
 def camera_to_json(camera: Camera) -> dict[str, Any]:

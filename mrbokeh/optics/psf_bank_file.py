@@ -7,7 +7,7 @@ Distances that are infinite are null. What is computed from the kernels and kept
 built, BANK/spreadlets.part) is removed when the bank is written anew; a kernel that changes otherwise is noticed by its hash.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -51,17 +51,8 @@ class BankHead:
 
 
 def head_of(bank: PsfBank) -> BankHead:
-    return BankHead(
-        model=bank.model,
-        channels=bank.channels,
-        axes=bank.axes,
-        counts=bank.counts,
-        nested=bank.nested,
-        turns=bank.turns,
-        near_side_turned=bank.near_side_turned,
-        settings=dict(bank.settings),
-        knee_px=bank.knee_px,
-    )
+    values = {each.name: getattr(bank, each.name) for each in fields(BankHead)}
+    return BankHead(**values | {"settings": dict(bank.settings)})
 
 
 def cell_path(folder: Path | str, cell: int) -> Path:
@@ -133,17 +124,8 @@ def read_bank(folder: Path | str) -> PsfBank:
             f"--out {folder}` again, it goes on where it stopped"
         )
     kernels = tuple(_read_cell(cell_path(folder, cell), head.channels) for cell in range(cells))
-    return PsfBank(
-        model=head.model,
-        axes=head.axes,
-        counts=head.counts,
-        kernels=kernels,
-        turns=head.turns,
-        near_side_turned=head.near_side_turned,
-        nested=head.nested,
-        settings=head.settings,
-        knee_px=head.knee_px,
-    )
+    described = {name: value for name, value in vars(head).items() if name != "channels"}
+    return PsfBank(kernels=kernels, **described)
 
 
 def _read_cell(path: Path, channels: int) -> np.ndarray:

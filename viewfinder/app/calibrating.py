@@ -3,13 +3,13 @@
 import asyncio
 from collections.abc import Callable, Iterator
 from contextlib import AsyncExitStack, ExitStack, contextmanager
+from functools import partial
 from threading import Event
 
 import typer
 from aiohttp import web
 
-from mrbokeh.optics.camera import Camera
-from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.camera import Camera, camera_of_lens
 from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.system.atomic_files import refuse_existing
 from mrbokeh.system.errors import InputError
@@ -118,11 +118,4 @@ def _intrinsics(options: CalibrationOptions) -> Callable[[int, int], Camera]:
     if options.camera is not None:
         return read_fixed_pose(options.camera).camera.resized
     assert options.lens is not None, "one of them"
-    return _pinhole(read_lens(options.lens))
-
-
-def _pinhole(lens: Lens) -> Callable[[int, int], Camera]:
-    def camera(width_px: int, height_px: int) -> Camera:
-        return Camera(width_px, height_px, (lens.focal_px(width_px),) * 2, (width_px / 2, height_px / 2))
-
-    return camera
+    return partial(camera_of_lens, read_lens(options.lens))

@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 from mrbokeh.compositing.overlay import Overlay, code_tables
-from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.camera import Camera, camera_of_lens
 from mrbokeh.optics.lens import Lens
 from viewfinder.app.opening import Parts
 from viewfinder.focus.sources import FocusSource
@@ -68,8 +68,7 @@ class LiveCompositor:
         height, width = bgr.shape[:2]
         if self._known_intrinsics is not None:
             return self._known_intrinsics.resized(width, height)
-        focal_px = self.lenses.lens.focal_px(width)
-        return Camera(width, height, (focal_px, focal_px), (width / 2, height / 2))
+        return camera_of_lens(self.lenses.lens, width, height)
 
     def _pose(self, frame: CameraFrame, intrinsics: Camera) -> TrackedPose | None:
         last = self.last

@@ -18,7 +18,7 @@ from capture.merging.metres.relative_focus import RelativeFocus, solve_relative_
 from capture.merging.registration.registered_slices import IngestedSlices, RegisteredSlices, source_path
 from mrbokeh.images.camera_rgb import half_of
 from mrbokeh.images.exr_io import ExrPart, write_exr
-from mrbokeh.optics.camera import Camera, camera_from_json, camera_to_json
+from mrbokeh.optics.camera import camera_from_json, camera_of_lens, camera_to_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import lens_from_json, lens_to_json
 from mrbokeh.stacks.focal_stack import GROWTH, GROWTH_WIDTH, METRES, FocalStack, Slice
@@ -141,7 +141,7 @@ def with_guessed_metres(
     }
     facts = {"known": gauge.known, "why": _why(gauge, stated), "gauge": _gauge_json(gauge, direction)}
     metadata = stated.metadata | {METRES: facts, STATED_BEFORE: before}
-    return replace(stated, slices=slices, lens=lens, camera=stated.camera or _camera(lens, size_px), metadata=metadata)
+    return replace(stated, slices=slices, lens=lens, camera=stated.camera or camera_of_lens(lens, *size_px), metadata=metadata)
 
 
 def gauge_of(stated: FocalStack, positions_px: Float[np.ndarray, " slices"], size_px: tuple[int, int]) -> Gauge:
@@ -250,11 +250,6 @@ def _nominal_lens(stated: FocalStack, size_px: tuple[int, int], growth: float, f
     sensor_mm = _SENSOR_MM * min(1.0, size_px[0] / size_px[1])
     guess = Lens(min(_FOCAL_LENGTH_MM, _NEAREST_SHARE * 1000.0 * nearest_m), 1.0, focus_m, sensor_mm)
     return replace(guess, f_number=guess.coc_px_per_dioptre(size_px[0]) / growth)
-
-
-def _camera(lens: Lens, size_px: tuple[int, int]) -> Camera:
-    focal_px = lens.focal_px(size_px[0])
-    return Camera(*size_px, (focal_px, focal_px), (size_px[0] / 2.0, size_px[1] / 2.0))
 
 
 def _why(gauge: Gauge, stated: FocalStack) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from mrbokeh.lens_measuring.matching.lens_match import LensMatch
+from mrbokeh.optics.aperture_shapes import closed
 
 
 @dataclass(frozen=True)
@@ -154,18 +155,14 @@ def _draw_photograph(axes: "Axes", rgb: Rgb, match: LensMatch) -> None:
     axes.imshow(display_rgb8(np.clip(rgb, 0.0, 1e4)), extent=(0.0, width, height, 0.0))
     kept = {id(disc) for disc in match.discs}
     for disc in match.found:
-        axes.plot(*_closed(disc.contour_px).T, color="lime" if id(disc) in kept else "red", lw=0.9)
+        axes.plot(*closed(disc.contour_px).T, color="lime" if id(disc) in kept else "red", lw=0.9)
     for disc, own in zip(match.discs, match.own, strict=True):
         for outline in match.lens.aperture.seen(match.side, disc.field_xy).outlines[:1]:
-            axes.plot(*(own[:2] + match.side * own[2] * _closed(outline)).T, color="magenta", lw=0.7, ls="--")
+            axes.plot(*(own[:2] + match.side * own[2] * closed(outline)).T, color="magenta", lw=0.7, ls="--")
     axes.set_xlim(0.0, width)
     axes.set_ylim(height, 0.0)
     axes.set_title("discs used (green), left out (red), fitted outlines (magenta)", fontsize=9)
     axes.axis("off")
-
-
-def _closed(outline: Float64[np.ndarray, "points 2"]) -> Float64[np.ndarray, "closed 2"]:
-    return np.concatenate([outline, outline[:1]])
 
 
 def _draw_regions(axes: "Axes", rgb: Rgb, match: LensMatch) -> None:
