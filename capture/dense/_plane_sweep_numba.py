@@ -1,10 +1,22 @@
 """Matching scores of a plane sweep, compiled: warp a band of rows of a neighbour's picture, correlate it in windows, keep the best."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from mrbokeh.system.kernels import njit
 
 _UNSEEN = -2.0  # as plane_sweep.UNSEEN
+
+
+class Reference(NamedTuple):
+    """The picture (H, W) that is swept, with its statistics in windows, the ray of each pixel (H, W, 3) and its 1 / depth in the middle."""
+
+    picture: np.ndarray
+    mean: np.ndarray
+    variance: np.ndarray
+    rays: np.ndarray
+    dioptres: np.ndarray
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -73,11 +85,7 @@ def _correlations(sums: np.ndarray, rows: int, radius: int, mean: np.ndarray, va
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def score_neighbour(
-    reference: np.ndarray,
-    mean: np.ndarray,
-    variance: np.ndarray,
-    rays: np.ndarray,
-    dioptres: np.ndarray,
+    seen_from: Reference,
     offset: float,
     picture: np.ndarray,
     view: np.ndarray,
@@ -87,6 +95,7 @@ def score_neighbour(
     out: np.ndarray,
 ) -> None:
     """Compute the scores (rows, W) of the rows first <= y < end against one neighbour."""
+    reference, mean, variance, rays, dioptres = seen_from
     height, width = reference.shape
     first, end = rows
     offset32 = np.float32(offset)

@@ -103,13 +103,13 @@ class PlaneScores:
 
     def of_rows(self, first: int, end: int, offset: float) -> Float32[np.ndarray, "rows width"]:
         """Return the mean correlation with the best neighbours of rows first <= y < end; `UNSEEN` where none sees the point."""
-        from capture.dense._plane_sweep_numba import mean_of_best, score_neighbour
+        from capture.dense._plane_sweep_numba import Reference, mean_of_best, score_neighbour
 
         matching = self._matching
         each = np.empty((len(self._views), end - first, self._structure.shape[1]), np.float32)
-        fixed = (self._structure, self._mean, self._variance, self._rays, self._base, float(offset))
+        reference = Reference(picture=self._structure, mean=self._mean, variance=self._variance, rays=self._rays, dioptres=self._base)
         for scores, picture, view in zip(each, self._pictures, self._views, strict=True):
-            score_neighbour(*fixed, picture, view, (first, end), matching.radius_px, matching.noise**2, scores)
+            score_neighbour(reference, float(offset), picture, view, (first, end), matching.radius_px, matching.noise**2, scores)
         best = np.empty(each.shape[1:], np.float32)
         mean_of_best(each, matching.best_of(len(self._views)), best)
         return best

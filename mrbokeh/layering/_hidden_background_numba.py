@@ -4,12 +4,29 @@ A place is a pixel's number: row times width plus column.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
 from mrbokeh.system.kernels import njit
 
 _BESIDE = ((0, 1), (1, 0), (1, 1), (1, -1))
+
+
+class Front(NamedTuple):
+    """A brush fire over H W places: seeds (zeros before), and the memory that it takes: squares of distances and queued, both zeros.
+
+    queue: H W + 1.
+    """
+
+    seeds: np.ndarray
+    squares: np.ndarray
+    queue: np.ndarray
+    queued: np.ndarray
+
+    @classmethod
+    def over(cls, pixels: int) -> "Front":
+        return cls(np.zeros(pixels, np.int32), np.zeros(pixels, np.int32), np.empty(pixels + 1, np.int32), np.zeros(pixels, np.bool_))
 
 
 @njit(cache=True, nogil=True)
@@ -179,23 +196,13 @@ def pure_neighbours(places: np.ndarray, coc_px: np.ndarray, pure: np.ndarray, st
 
 
 @njit(cache=True, nogil=True)
-def nearest_behind(
-    seeds: np.ndarray,
-    squares: np.ndarray,
-    queue: np.ndarray,
-    queued: np.ndarray,
-    coc_px: np.ndarray,
-    rims: np.ndarray,
-    pure: np.ndarray,
-    step_px: float,
-) -> None:
-    """Set seeds (H W, zeros before) to one plus the place of the nearest pure pixel that lies more than `step_px` behind.
+def nearest_behind(front: Front, coc_px: np.ndarray, rims: np.ndarray, pure: np.ndarray, step_px: float) -> None:
+    """Set the seeds of the front to one plus the place of the nearest pure pixel that lies more than `step_px` behind.
 
     Where the lens sees none they stay 0. rims: places of rim pixels; pure: the pure pixel beside each, or -1.
     The lens sees past an edge by half the difference of the two circles of confusion (and a rim's width more is searched).
     A brush fire from the edges inwards; the condition differs from pixel to pixel, and a seed travels only through pixels
     that it lies behind, so that a nearer one can be missed by a pixel or two where several depths meet.
-    squares (H W) of distances and queued (H W), both zeros, and queue (H W + 1) are memory for it.
     """
     width = coc_px.shape[1]
     first, end = 0, 0
@@ -203,31 +210,20 @@ def nearest_behind(
         if pure[i] >= 0:
             y, x = rims[i] // width, rims[i] % width
             nearer_px = coc_px[y, x] - step_px
-            end = _pass_on(seeds, squares, queue, queued, end, coc_px, y, x, pure[i], nearer_px, step_px)
+            end = _pass_on(front, end, coc_px, y, x, pure[i], nearer_px, step_px)
     while first != end:
-        place = queue[first]
-        first = (first + 1) % queue.size
-        queued[place] = False
-        end = _pass_on(seeds, squares, queue, queued, end, coc_px, place // width, place % width, seeds[place] - 1, np.inf, step_px)
+        place = front.queue[first]
+        first = (first + 1) % front.queue.size
+        front.queued[place] = False
+        end = _pass_on(front, end, coc_px, place // width, place % width, front.seeds[place] - 1, np.inf, step_px)
 
 
 @njit(cache=True, nogil=True)
-def _pass_on(
-    seeds: np.ndarray,
-    squares: np.ndarray,
-    queue: np.ndarray,
-    queued: np.ndarray,
-    end: int,
-    coc_px: np.ndarray,
-    y: int,
-    x: int,
-    seed: int,
-    nearer_px: float,
-    step_px: float,
-) -> int:
+def _pass_on(front: Front, end: int, coc_px: np.ndarray, y: int, x: int, seed: int, nearer_px: float, step_px: float) -> int:
     """Offer a seed to the pixels around (y, x) whose circle of confusion is below `nearer_px`, and return the new end of the queue. A
     pixel takes the seed and is queued if the seed lies behind it, within sight, and nearer than the seed that it has.
     """
+    seeds, squares, queue, queued = front
     height, width = coc_px.shape
     sy, sx, seed_px = seed // width, seed % width, coc_px[seed // width, seed % width]
     for ny in range(max(0, y - 1), min(height, y + 2)):

@@ -70,12 +70,12 @@ def _sources(edges: _Edges) -> tuple[Places, Places, Places]:
     """Return edge pixels beside pure ones, the places at which the lens sees behind an edge (edges included), and for each of these
     the nearest pure pixel of what it sees there.
     """
-    from mrbokeh.layering._hidden_background_numba import nearest_behind, pure_neighbours
+    from mrbokeh.layering._hidden_background_numba import Front, nearest_behind, pure_neighbours
 
     pure = pure_neighbours(edges.rims, edges.coc_px, edges.pure, _STEP_PX, _RIM_PX)
-    pixels = edges.coc_px.size
-    seeds, squares, queued = np.zeros(pixels, np.int32), np.zeros(pixels, np.int32), np.zeros(pixels, np.bool_)
-    nearest_behind(seeds, squares, np.empty(pixels + 1, np.int32), queued, edges.coc_px, edges.rims, pure, _STEP_PX)
+    front = Front.over(edges.coc_px.size)
+    nearest_behind(front, edges.coc_px, edges.rims, pure, _STEP_PX)
+    seeds = front.seeds
     rims = edges.rims[pure >= 0]
     seeds[rims] = pure[pure >= 0] + 1
     places = np.flatnonzero(seeds != 0).astype(np.int32)

@@ -99,8 +99,9 @@ class LensBeam:
         across the axis. shares: of the window (a, |b|) and of the band. field: place in `chiefs`, 0 to nodes - 1.
         """
         landings, weights = np.empty((len(shares), len(bands_um), 2)), np.empty((len(shares), len(bands_um)))
-        optics = (self.table, chiefs, self.front_mm, self.sensor_at_mm)
-        compiled.trace_rays(*optics, window, np.ascontiguousarray(shares), per_mm, field, bands_um, landings, weights)
+        optics = compiled.Optics(self.table, chiefs, self.front_mm, self.sensor_at_mm)
+        rays = compiled.Rays(np.ascontiguousarray(shares), per_mm, field)
+        compiled.trace_rays(optics, window, rays, bands_um, landings, weights)
         return landings, weights
 
     def open_share(self, per_mm: float, eccentricity: float) -> float:

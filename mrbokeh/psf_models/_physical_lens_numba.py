@@ -4,9 +4,28 @@ A table has a row per surface: z, curvature, squared aperture radius, Cauchy A a
 micrometres (wavelengths). The meridional plane, which holds the axis and the source, is y = 0.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from mrbokeh.system.kernels import njit
+
+
+class Optics(NamedTuple):
+    """A lens and where it is focused. chiefs (nodes, 5): where the sensor is met (x) and the chief ray, evenly over eccentricity."""
+
+    table: np.ndarray
+    chiefs: np.ndarray
+    front_mm: float
+    sensor_mm: float
+
+
+class Rays(NamedTuple):
+    """Rays to trace. shares (rays, 3): a, b and the wavelength in its band. field (rays): place among the chief rays, 0 to nodes - 1."""
+
+    shares: np.ndarray
+    per_mm: np.ndarray
+    field: np.ndarray
 
 
 @njit(cache=True, nogil=True)
@@ -152,25 +171,13 @@ def open_window(
 
 
 @njit(cache=True, nogil=True)
-def trace_rays(
-    table: np.ndarray,
-    chiefs: np.ndarray,
-    front_mm: float,
-    sensor_mm: float,
-    window: np.ndarray,
-    shares: np.ndarray,
-    per_mm: np.ndarray,
-    field: np.ndarray,
-    bands_um: np.ndarray,
-    landings: np.ndarray,
-    weights: np.ndarray,
-) -> None:
+def trace_rays(optics: Optics, window: np.ndarray, rays: Rays, bands_um: np.ndarray, landings: np.ndarray, weights: np.ndarray) -> None:
     """Trace rays for all colours: landings (rays, colours, 2) in mm from the chief ray's place, weights (rays, colours).
 
-    chiefs (nodes, 5): where the sensor is met (x) and the chief ray, evenly over the range of eccentricity; field (rays):
-    place in that range, 0 to nodes - 1. shares (rays, 3): a, b and the wavelength in its band (bands_um (colours, 2): middle
-    and half width of a triangle).
+    bands_um (colours, 2): middle and half width of a triangle.
     """
+    table, chiefs, front_mm, sensor_mm = optics
+    shares, per_mm, field = rays
     chief, ray, landing = np.empty(4), np.empty(6), np.empty(2)
     for i in range(shares.shape[0]):
         node = min(int(field[i]), max(chiefs.shape[0] - 2, 0))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import minimum_filter
 
-from mrbokeh.layering._hidden_background_numba import find_rims, nearest_behind, pure_neighbours, snap
+from mrbokeh.layering._hidden_background_numba import Front, find_rims, nearest_behind, pure_neighbours, snap
 from mrbokeh.layering.hidden_background import split_edges
 from mrbokeh.layering.highlights import find_highlights
 from mrbokeh.layering.padded_layers import PaddedLayer
@@ -84,14 +84,14 @@ def test_behind_objects_at_one_depth_the_nearest_pixel_of_the_ground_is_the_seed
     rim = coc_px - minimum_filter(coc_px, 3, mode="nearest") > 1.0
     rims = np.flatnonzero(rim).astype(np.int32)
     pure = pure_neighbours(rims, coc_px, ~rim, 1.0, 3)
-    seeds, squares, queued = np.zeros(coc_px.size, np.int32), np.zeros(coc_px.size, np.int32), np.zeros(coc_px.size, np.bool_)
-    nearest_behind(seeds, squares, np.empty(coc_px.size + 1, np.int32), queued, coc_px, rims, pure, 1.0)
+    front = Front.over(coc_px.size)
+    nearest_behind(front, coc_px, rims, pure, 1.0)
     sources, places = np.unique(pure[pure >= 0]), np.flatnonzero(near)
     least_px = np.hypot(sources // 70 - places[:, None] // 70, sources % 70 - places[:, None] % 70).min(axis=1)
-    found = seeds[places] > 0
+    found = front.seeds[places] > 0
     np.testing.assert_array_equal(found, least_px <= 13.5)
-    assert 0 < (~found).sum() < found.sum() and not seeds[np.flatnonzero(~near)].any()
-    at = seeds[places] - 1
+    assert 0 < (~found).sum() < found.sum() and not front.seeds[np.flatnonzero(~near)].any()
+    at = front.seeds[places] - 1
     distance_px = np.hypot(at // 70 - places // 70, at % 70 - places % 70)[found]
     assert np.isin(at[found], sources).all()
     assert (distance_px <= least_px[found] + 1.0).all() and (distance_px == least_px[found]).mean() > 0.95

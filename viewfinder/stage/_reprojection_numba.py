@@ -3,9 +3,27 @@
 `view` is fx, fy, cx, cy of the camera that drew, then of the new one; rotation and shift take a point from the first to the second.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from mrbokeh.system.kernels import njit
+
+
+class DepthGrid(NamedTuple):
+    """1 / depth of a layer on a grid of cells `cell_px` wide, and where to begin."""
+
+    dioptres: np.ndarray
+    cell_px: int
+    first_dioptres: float
+
+
+class Motion(NamedTuple):
+    """From the camera that drew to the new one."""
+
+    view: np.ndarray
+    rotation: np.ndarray
+    shift: np.ndarray
 
 
 @njit(cache=True, nogil=True, inline="always")
@@ -35,10 +53,10 @@ def _at(grid, x, y):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def source_nodes(  # type: ignore[no-untyped-def]
-    nodes, left, top, step, dioptres, cell, first_dioptres, rounds, view, rotation, shift
-) -> None:
+def source_nodes(nodes, left, top, step, depth, rounds, motion) -> None:  # type: ignore[no-untyped-def]
     """Fill nodes (N, M, 2): the place in the layer of pixel (left + step j, top + step i), by fixed-point iteration over 1 / depth."""
+    dioptres, cell, first_dioptres = depth
+    view, rotation, shift = motion
     for i in range(nodes.shape[0]):
         for j in range(nodes.shape[1]):
             x, y = left + step * j + 0.5, top + step * i + 0.5

@@ -22,7 +22,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import make_renderer
-from viewfinder.stage._reprojection_numba import sample, source_nodes
+from viewfinder.stage._reprojection_numba import DepthGrid, Motion, sample, source_nodes
 
 GRID_PX = 4
 """Pixels of the layer per pixel of the grid of depths."""
@@ -133,7 +133,8 @@ class MovableLayer:
         nodes = np.empty((-(-(bottom - top) // NODE_PX) + 1, -(-(right - left) // NODE_PX) + 1, 2))
         middle = float(np.median(self.dioptres))
         turn, shift = np.ascontiguousarray(from_drawn[:3, :3]), np.ascontiguousarray(from_drawn[:3, 3])
-        source_nodes(nodes, left, top, NODE_PX, self.dioptres, GRID_PX, middle, _ROUNDS, view, turn, shift)
+        depth = DepthGrid(self.dioptres, GRID_PX, middle)
+        source_nodes(nodes, left, top, NODE_PX, depth, _ROUNDS, Motion(view, turn, shift))
         rgb, shines_through = np.empty((bottom - top, right - left, 3), np.float32), np.empty((bottom - top, right - left), np.float32)
         sample(rgb, shines_through, self.rgba, nodes, NODE_PX, np.float32(opacity))
         return Overlay(top, left, rgb, shines_through)

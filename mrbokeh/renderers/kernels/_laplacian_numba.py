@@ -1,5 +1,7 @@
 """Compiled loops of Laplacian spreadlets: the kernel that every pixel takes, and the tridiagonal sweeps of integration."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from mrbokeh.system.kernels import njit
@@ -9,26 +11,28 @@ _STRETCH_PX = 32
 NEAR = 4  # levels that are found by steps
 
 
+class Limits(NamedTuple):
+    """Sizes of blur at which kernels change. borders_px: where each level of those beyond dense_up_to_px begins.
+
+    The last 2 NEAR of the borders are infinitely large.
+    """
+
+    sharp_up_to_px: float
+    dense_up_to_px: float
+    dense_per_px: float
+    levels_per_octave: float
+    borders_px: np.ndarray
+    blocks: int
+
+
 @njit(cache=True, nogil=True)
-def choose_cells(
-    codes: np.ndarray,
-    out: np.ndarray,
-    values: np.ndarray,
-    coc_px: np.ndarray,
-    bright: np.ndarray,
-    sharp_up_to_px: float,
-    dense_up_to_px: float,
-    dense_per_px: float,
-    levels_per_octave: float,
-    borders_px: np.ndarray,
-    blocks: int,
-) -> bool:
+def choose_cells(codes: np.ndarray, out: np.ndarray, values: np.ndarray, coc_px: np.ndarray, bright: np.ndarray, limits: Limits) -> bool:
     """Set the code of every pixel's kernel; sharp pixels are copied to out and have none. Returns False if a circle of confusion is not
     finite.
 
     A code is a level + blocks * kind + 3 * blocks * (in front of the focus); kinds: 0 dense, 1 sparse, 2 whole Laplacian.
-    borders_px: where each level of those beyond dense_up_to_px begins, the last 2 NEAR infinitely large.
     """
+    sharp_up_to_px, dense_up_to_px, dense_per_px, levels_per_octave, borders_px, blocks = limits
     height, width, channels = values.shape
     finite = True
     level = 0  # neighbours often have the same: so much logarithms would take longer than all the rest

@@ -61,16 +61,23 @@ class KernelTables:
         aperture: Aperture,
     ) -> Int32[np.ndarray, "height width"]:
         """Return codes of the kernels, -1 for sharp and dark pixels; sharp ones are copied to out."""
-        from mrbokeh.renderers.kernels._laplacian_numba import choose_cells
+        from mrbokeh.renderers.kernels._laplacian_numba import Limits, choose_cells
 
         codes = np.empty(coc_px.shape, np.int32)
         large = np.abs(coc_px) > self.dense_up_to_px
         bright = stands_out(values) if self.sparsification is not None and large.any() else np.zeros(coc_px.shape, np.bool_)
-        limits = 1.0 / aperture.unit_radius, self.dense_up_to_px, DENSE_PER_PX, LEVELS_PER_OCTAVE, self._borders_px, _BLOCK
+        limits = Limits(
+            sharp_up_to_px=1.0 / aperture.unit_radius,
+            dense_up_to_px=self.dense_up_to_px,
+            dense_per_px=DENSE_PER_PX,
+            levels_per_octave=LEVELS_PER_OCTAVE,
+            borders_px=self._borders_px,
+            blocks=_BLOCK,
+        )
 
         def choose(first: int) -> bool:
             rows = slice(first, first + _ROWS_AT_ONCE)
-            return choose_cells(codes[rows], out[rows], values[rows], coc_px[rows], bright[rows], *limits)
+            return choose_cells(codes[rows], out[rows], values[rows], coc_px[rows], bright[rows], limits)
 
         with workers(codes.size) as pool:
             all_finite = all(list(pool.map(choose, range(0, len(codes), _ROWS_AT_ONCE))))

@@ -6,12 +6,57 @@ across) stays in the processor's cache. Exact splats take single pixels by tabul
 kernel of the source, and down with the kernel of the pixel that was reached.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from mrbokeh.system.kernels import njit
 
 TILE_FLOATS = 128
 _ROWS_AT_ONCE = 4
+
+
+class Source(NamedTuple):
+    """Pixels to be scattered by levels. shares (H, W): how much of a pixel goes this way.
+
+    levels (H, W) int16, uppers (H, W): the share `upper` of a pixel goes to the kernel of level + 1, the rest to that of its level.
+    """
+
+    values: np.ndarray
+    shares: np.ndarray
+    levels: np.ndarray
+    uppers: np.ndarray
+    spans: np.ndarray
+
+
+class Kernels(NamedTuple):
+    """Taps in the order in which a pixel of the result meets its sources: columns (levels, terms, 3 + K + 6), rows (levels, terms, K).
+
+    K differs from level to level: radii_px and ranks say how much of it is used.
+    """
+
+    columns: np.ndarray
+    rows: np.ndarray
+    ranks: np.ndarray
+    radii_px: np.ndarray
+
+
+class SinglePixels(NamedTuple):
+    """Pixels (N,) that are splatted one by one: `upper` of each by the kernel after `lower`, the rest by that one."""
+
+    shares: np.ndarray
+    ys: np.ndarray
+    xs: np.ndarray
+    lowers: np.ndarray
+    uppers: np.ndarray
+
+
+class TapTable(NamedTuple):
+    """Kernels of (2 r + 1)^2 taps, kernel i from starts[i] on."""
+
+    taps: np.ndarray
+    starts: np.ndarray
+    radii_px: np.ndarray
 
 
 @njit(cache=True, nogil=True, fastmath={"contract"})
@@ -107,12 +152,9 @@ def _any_in_reach(spans: np.ndarray, top: int, bottom: int, left: int, right: in
 
 @njit(cache=True, nogil=True)
 def _stage_level(
-    lines: np.ndarray, lit: np.ndarray, source: tuple, top: int, bottom: int, tile: int, tile_px: int, radius_px: int, level: int
+    lines: np.ndarray, lit: np.ndarray, source: Source, top: int, bottom: int, tile: int, tile_px: int, radius_px: int, level: int
 ) -> bool:
-    """Set one level's share of all rows of the picture that reach rows top:bottom of a tile; False if that is nothing.
-
-    source: values, shares, levels, uppers and spans of `scatter_piece`.
-    """
+    """Set one level's share of all rows of the picture that reach rows top:bottom of a tile; False if that is nothing."""
     values, shares, levels, uppers, spans = source
     tiles_away = (radius_px + tile_px - 1) // tile_px
     first, end = tile - tiles_away, tile + tiles_away + 1
@@ -141,29 +183,10 @@ def _add_tile(out: np.ndarray, sums: np.ndarray) -> None:
 
 
 @njit(cache=True, nogil=True)
-def scatter_piece(
-    out: np.ndarray,
-    values: np.ndarray,
-    shares: np.ndarray,
-    levels: np.ndarray,
-    uppers: np.ndarray,
-    spans: np.ndarray,
-    columns: np.ndarray,
-    rows: np.ndarray,
-    ranks: np.ndarray,
-    radii_px: np.ndarray,
-    top: int,
-    bottom: int,
-    first_tile: int,
-    end_tile: int,
-) -> None:
-    """Add to rows top:bottom and tiles first_tile:end_tile of out (H, W, C) what all levels throw there.
-
-    shares (H, W): how much of a pixel goes this way. levels (H, W) int16, uppers (H, W): the share `upper` of a pixel goes to
-    the kernel of level + 1, the rest to that of its level. columns (levels, terms, 3 + K + 6), rows (levels, terms, K): taps
-    in the order in which a pixel of the result meets its sources; K differs, radii_px and ranks say how much of it is used.
-    """
-    channels = values.shape[2]
+def scatter_piece(out: np.ndarray, source: Source, kernels: Kernels, top: int, bottom: int, first_tile: int, end_tile: int) -> None:
+    """Add to rows top:bottom and tiles first_tile:end_tile of out (H, W, C) what all levels throw there."""
+    columns, rows, ranks, radii_px = kernels
+    channels = source.values.shape[2]
     tile_px = TILE_FLOATS // channels
     size = bottom - top + (-(bottom - top)) % _ROWS_AT_ONCE
     longest = 2 * radii_px.max() + 1
@@ -171,7 +194,6 @@ def scatter_piece(
     across = np.empty((size + longest + 6, TILE_FLOATS), np.float32)
     lines = np.empty((across.shape[0], TILE_FLOATS + longest * channels), np.float32)
     lit = np.empty(across.shape[0], np.bool_)
-    source = (values, shares, levels, uppers, spans)
     for tile in range(first_tile, end_tile):
         sums[:] = np.float32(0)
         for level in range(ranks.shape[0]):
@@ -183,8 +205,9 @@ def scatter_piece(
 
 
 @njit(cache=True, nogil=True)
-def _blend(kernel: np.ndarray, taps: np.ndarray, starts: np.ndarray, radii_px: np.ndarray, lower: int, upper: float, channels: int) -> int:
+def _blend(kernel: np.ndarray, table: TapTable, lower: int, upper: float, channels: int) -> int:
     """Write (1 - upper) of kernel `lower` and upper of the next into kernel, every tap once per channel; returns the radius."""
+    taps, starts, radii_px = table
     above = lower + 1 if upper > 0 else lower
     radius_px = radii_px[above]
     size, inset = 2 * radius_px + 1, radius_px - radii_px[lower]
@@ -207,33 +230,20 @@ def _add_row(out: np.ndarray, taps: np.ndarray, light: np.ndarray) -> None:
 
 
 @njit(cache=True, nogil=True)
-def splat_pixels(
-    out: np.ndarray,
-    values: np.ndarray,
-    shares: np.ndarray,
-    ys: np.ndarray,
-    xs: np.ndarray,
-    lowers: np.ndarray,
-    uppers: np.ndarray,
-    taps: np.ndarray,
-    starts: np.ndarray,
-    radii_px: np.ndarray,
-    top: int,
-    left: int,
-) -> None:
+def splat_pixels(out: np.ndarray, values: np.ndarray, pixels: SinglePixels, table: TapTable, top: int, left: int) -> None:
     """Add share * value * kernel of every listed pixel to out (h, w * C), whose first pixel lies at row `top`, column `left`.
 
-    ys, xs, lowers, uppers: (N,). taps: of all kernels, (2 r + 1)^2 from starts[i] on for kernel i.
     out must hold all the kernels. Pixels of equal diameter that follow one another share the blending of their kernel.
     """
+    shares, ys, xs, lowers, uppers = pixels
     channels = values.shape[2]
-    longest = 2 * radii_px.max() + 1
+    longest = 2 * table.radii_px.max() + 1
     kernel = np.empty(longest * longest * channels, np.float32)
     light = np.empty(longest * channels, np.float32)
     radius_px = 0
     for n in range(ys.shape[0]):
         if n == 0 or lowers[n] != lowers[n - 1] or uppers[n] != uppers[n - 1]:
-            radius_px = _blend(kernel, taps, starts, radii_px, lowers[n], uppers[n], channels)
+            radius_px = _blend(kernel, table, lowers[n], uppers[n], channels)
         size = 2 * radius_px + 1
         for i in range(size):
             for c in range(channels):

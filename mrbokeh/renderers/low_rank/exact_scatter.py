@@ -90,14 +90,15 @@ def _band(
     part: slice,
 ) -> tuple[Float32[np.ndarray, "rows columns channels"], int, int]:
     """Return the light of a band of pixels on the smallest rectangle that holds it, and the row and column where that begins."""
-    from mrbokeh.renderers.low_rank._filter_numba import splat_pixels
+    from mrbokeh.renderers.low_rank._filter_numba import SinglePixels, TapTable, splat_pixels
 
     lowers, uppers = tables.lowers[part], tables.uppers[part]
     reach_px = int(tables.radii_px[np.minimum(lowers + 1, len(tables.radii_px) - 1)].max())
     top, left = int(ys.min()) - reach_px, int(xs.min()) - reach_px
     height, width = int(ys.max()) + reach_px + 1 - top, int(xs.max()) + reach_px + 1 - left
     band = np.zeros((height, width * values.shape[2]), np.float32)
-    splat_pixels(band, values, shares[ys, xs], ys, xs, lowers, uppers, tables.taps, tables.starts, tables.radii_px, top, left)
+    pixels = SinglePixels(shares=shares[ys, xs], ys=ys, xs=xs, lowers=lowers, uppers=uppers)
+    splat_pixels(band, values, pixels, TapTable(tables.taps, tables.starts, tables.radii_px), top, left)
     return band.reshape(height, width, values.shape[2]), top, left
 
 
