@@ -23,7 +23,7 @@ from mrbokeh.tracking.charuco.detector import CharucoDetector, Grey, flow
 from mrbokeh.tracking.charuco.pose_from_points import poses_from_plane
 from mrbokeh.video.clip import read_display_frames
 from tests.bench.machine import machine_line, memory_line
-from tests.scenes.immediate_detections import ImmediateDetections
+from tests.scenes.told_parts import ImmediateDetections
 from tests.scenes.traced_board_clip import BOARD, LENS, PoseError, camera_frames, clip_of, pose_error
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.charuco_tracker import CharucoTracker, Detector

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.system.errors import InputError
-from tests.scenes.card_stack import SIZE, make_card_stack
+from tests.scenes.card_stack import SIZE, make_card_scene
+from tests.scenes.command_line import printed_by
 from training.ablation.plan import (
     PAPER_TABLE_3,
     PUBLISHED,
@@ -42,10 +42,7 @@ ALL = rows_of(("1", "3", "improvements"))
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("ablation") / "heart_scene"
-    for seed in range(2):
-        make_card_stack(folder / f"view_{seed}", seed)
-    return folder
+    return make_card_scene(tmp_path_factory.mktemp("ablation") / "heart_scene")
 
 
 @pytest.fixture(scope="module")
@@ -58,9 +55,7 @@ def small_base(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def ablate(*arguments: object) -> str:
-    done = CliRunner().invoke(app, ["ablate", *map(str, arguments), "--threads", "1"], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
-    return done.output
+    return printed_by(app, "ablate", *arguments, "--threads", "1")
 
 
 @pytest.fixture(scope="module")
@@ -187,8 +182,7 @@ def test_a_stopped_table_goes_on(scene: Path, small_base: Path, tmp_path: Path, 
     arguments = [str(scene), "--out", str(tmp_path), "--table", "1", "--rows", "published,no_overlap", "--epochs", "1", *TILES]
     arguments += ["--settings", str(small_base), "--threads", "1"]
     monkeypatch.setattr(train, "fit", counting(stop_at=2))
-    stopped = CliRunner().invoke(app, ["ablate", *arguments])
-    assert stopped.exit_code == 130 and "goes on" in stopped.output
+    assert "goes on" in printed_by(app, "ablate", *arguments, exit_code=130)
     assert (tmp_path / "table_1.csv").read_text().count("\n") == 2
     monkeypatch.setattr(train, "fit", counting(stop_at=0))
     ablate(*arguments[:-2])
@@ -230,7 +224,6 @@ def test_means_are_over_sets_then_seeds() -> None:
     values = {("heart", 0): 30.0, ("round", 0): 34.0, ("heart", 1): 31.0, ("round", 1): 37.0, ("heart", 2): 99.0}
     results = [made("published", name, seed, value) for (name, seed), value in values.items()]
     found = summary(PUBLISHED, results, ["heart", "round"])
-    assert found is not None
     assert (found.seeds, found.slices, found.means["psnr_db"]) == (2, 30, 33.0)
     assert found.spreads["psnr_db"] == pytest.approx(np.sqrt(2.0))
     assert summary(PUBLISHED, results, ["bladed"]) is None

@@ -193,7 +193,6 @@ def _exported(network: nn.Module, path: Path) -> onnxruntime.InferenceSession:
             dynamo=True,
             verbose=False,
         )
-    assert program is not None
     program.save(str(path))
     return onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
 

@@ -9,7 +9,6 @@ import numpy as np
 import onnx
 import pytest
 from onnx import TensorProto, helper
-from typer.testing import CliRunner
 
 from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.images.image_metrics import psnr
@@ -18,7 +17,9 @@ from mrbokeh.optics.psf_bank_file import write_bank
 from mrbokeh.optics.psf_grid import NestedGrid
 from mrbokeh.stacks.focal_stack import write_focal_stack
 from mrbokeh.system.errors import InputError
-from tests.scenes.card_stack import CARD_M, CARD_PX, LENS, SIZE, WALL_M, make_card_stack
+from tests.learning.test_train import DEMO_LIKE
+from tests.scenes.card_stack import CARD_M, CARD_PX, LENS, SIZE, WALL_M, make_card_scene, make_card_stack
+from tests.scenes.command_line import printed_by
 from training.cli import app
 from training.data.dataset import PairSet
 from training.data.pairs import WHERE_TRUTH_IS_KNOWN
@@ -43,25 +44,20 @@ from training.evaluation.report import HEADINGS, table_rows
 from training.evaluation.scores import MEASURES, OnnxPerceptualDistance, Score, SliceScorer, mean_known
 from training.evaluation.unseen_slice import UnseenSlice, edge_band, highlight_discs, sharp_side, unseen_slice
 from training.fitting import train
-from training.fitting.settings import demo_settings
 
-QUICK = dataclasses.replace(demo_settings(), minutes=None, epochs=1, crop_px=0, threads=1, validate_every_s=0.0)
 ON_THE_CARD, ON_THE_WALL = 0, 2
 
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("evaluation") / "card"
-    for seed in range(2):
-        make_card_stack(folder / f"view_{seed}", seed)
-    return folder
+    return make_card_scene(tmp_path_factory.mktemp("evaluation") / "card")
 
 
 @pytest.fixture(scope="module")
 def runs(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     folder = tmp_path_factory.mktemp("runs")
     for seed in range(2):
-        train.fit(training_data([scene]), folder / f"seed_{seed}", dataclasses.replace(QUICK, seed=seed), ["view_1"])
+        train.fit(training_data([scene]), folder / f"seed_{seed}", dataclasses.replace(DEMO_LIKE, epochs=1, seed=seed), ["view_1"])
     return [folder / f"seed_{seed}" for seed in range(2)]
 
 
@@ -242,9 +238,8 @@ def read_numbers(path: Path) -> list[Score]:
 def test_many_networks_on_stacks_that_none_has_seen(scene: Path, runs: list[Path], tmp_path: Path) -> None:
     """The table's numbers are those computed here from the runs, and both come back from the CSV."""
     write_distance(tmp_path / "distance.onnx")
-    arguments = ["evaluate", *map(str, runs), "--data", str(scene), "--out", str(tmp_path / "out"), "--renderer", "polygon", "--pull", "3"]
-    done = CliRunner().invoke(app, [*arguments, "--lpips", str(tmp_path / "distance.onnx")], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
+    arguments = ["evaluate", *runs, "--data", scene, "--out", tmp_path / "out", "--renderer", "polygon", "--pull", "3"]
+    told = printed_by(app, *arguments, "--lpips", tmp_path / "distance.onnx")
     scores = read_numbers(tmp_path / "out" / "evaluation.csv")
     assert {each.stack for each in scores} == {"card/view_1"}
     assert {each.method for each in scores} == {"seed_0", "seed_1", NO_BLUR, SCATTERED, GATHERED, "polygon"}
@@ -253,27 +248,26 @@ def test_many_networks_on_stacks_that_none_has_seen(scene: Path, runs: list[Path
         expected = [psnr(blur_of(run)[0](pairs[index]), pairs[index].target) for index in range(len(pairs))]
         assert [each.psnr_db for each in scores if each.method == run.name] == pytest.approx(expected, abs=1e-4)
         assert f"| {run.name} | {np.mean(expected):.2f} |" in (tmp_path / "out" / "evaluation.md").read_text()
-        assert f"{run.name} over no blur" in done.output
+        assert f"{run.name} over no blur" in told
     assert all(each.lpips >= 0 and each.seconds >= 0 for each in scores)
     assert {each.name for each in (tmp_path / "out").iterdir()} == {f"evaluation{end}" for end in (".md", ".csv", ".png", "_crops.png")}
 
 
 def test_one_network_with_its_data_behind_it(scene: Path, runs: list[Path]) -> None:
     """The short form; the network is called "network" and its results lie in its run. No weights of LPIPS: the table says so."""
-    done = CliRunner().invoke(app, ["evaluate", str(runs[0]), str(scene), "--renderer", "none", "--pull", "0"], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
+    told = printed_by(app, "evaluate", runs[0], scene, "--renderer", "none", "--pull", "0")
     with (runs[0] / "evaluation.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     assert {row["method"] for row in rows} == {NETWORK, NO_BLUR, SCATTERED, GATHERED}
     assert set(rows[0]) == {"stack", "slice_index", "method", *MEASURES}
-    assert "network over no blur" in done.output and "no weights are shipped" in (runs[0] / "evaluation.md").read_text()
+    assert "network over no blur" in told and "no weights are shipped" in (runs[0] / "evaluation.md").read_text()
 
 
 def test_what_evaluate_wants(scene: Path, runs: list[Path]) -> None:
     with pytest.raises(InputError, match="give --data"):
-        CliRunner().invoke(app, ["evaluate", str(runs[0])], catch_exceptions=False)
+        printed_by(app, "evaluate", runs[0])
     with pytest.raises(InputError, match="give --out"):
-        CliRunner().invoke(app, ["evaluate", *map(str, runs), "--data", str(scene)], catch_exceptions=False)
+        printed_by(app, "evaluate", *runs, "--data", scene)
     with pytest.raises(InputError, match="trained on every slice of these"):
         unseen_of(training_data([scene]).stacks, [Seen(("card/view_0", "card/view_1"))])
 

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import onnxruntime
 import pytest
-from typer.testing import CliRunner
 
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.onnx_network import OnnxNetwork
 from mrbokeh.system.errors import InputError
+from tests.scenes.command_line import printed_by
 from tests.scenes.made_networks import GATED, PARITY, PUBLISHED, SIZE, TOP, blurred, pictures, session_of, twin, untrained
 from training.commands.export import export_command
 from training.export.fast_onnx import ASSUMED_PSNR_DB, export_fast_network, loss_db, made_up_sample, model_of, plans
@@ -111,10 +111,6 @@ def test_forms_that_have_no_fast_graph_are_said() -> None:
 
 
 def test_the_command_writes_a_fast_network(tmp_path: Path) -> None:
-    import typer
-
-    app = typer.Typer()
-    app.command()(export_command)
     settings = TrainSettings(network=replace(PUBLISHED, blocks=2))
     run = tmp_path / "run"
     run.mkdir()
@@ -122,10 +118,7 @@ def test_the_command_writes_a_fast_network(tmp_path: Path) -> None:
     write_facts(run, _facts())
     save_network(run, untrained(settings.network, 5.0))
     out = tmp_path / "fast.onnx"
-    result = CliRunner().invoke(app, [str(run), "--out", str(out), "--fast", "--max-psnr-loss", "0.1"], catch_exceptions=False)
-    assert result.exit_code == 0
-    assert "times faster" in result.output
-    assert "of at most 0.1 dB" in result.output
-    assert out.is_file()
+    told = printed_by(export_command, run, "--out", out, "--fast", "--max-psnr-loss", 0.1)
+    assert "times faster" in told and "of at most 0.1 dB" in told and out.is_file()
     with pytest.raises(InputError, match="add --fast"):
-        CliRunner().invoke(app, [str(run), "--out", str(tmp_path / "x.onnx"), "--data", str(run)], catch_exceptions=False)
+        printed_by(export_command, run, "--out", tmp_path / "x.onnx", "--data", run)

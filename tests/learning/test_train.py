@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from mrbokeh.images.image_io import write_image
 from mrbokeh.images.image_metrics import psnr
@@ -15,6 +14,7 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from mrbokeh.system.errors import InputError
+from tests.scenes.command_line import printed_by
 from training.cli import app
 from training.data.batches import draw_batch
 from training.data.dataset import PairSet, read_pair
@@ -43,6 +43,7 @@ SIZE = (48, 72)
 LENS = Lens(35.0, 2.8, 1.0, 3.5, Aperture.blades(6, 0.2))
 FOCUS_M = (0.5, 0.6, 0.8)
 DEMO_LIKE = dataclasses.replace(demo_settings(), minutes=None, epochs=30, crop_px=0, threads=1, validate_every_s=0.0)
+DEMO_WORDS = ["--preset", "demo", "--threads", "1", "--held-out", "view_2"]
 PUBLISHED = TrainSettings(network=NetworkSettings(tile_px=32, overlap_px=8), epochs=4, threads=1, validate_every_s=0.0)
 
 
@@ -161,26 +162,12 @@ def test_interrupting_keeps_the_checkpoint_and_the_command_goes_on(scene: Path, 
             signal.raise_signal(signal.SIGINT)
         step(run, rate_factor)
 
-    arguments = [
-        "fit",
-        str(scene),
-        "--preset",
-        "demo",
-        "--epochs",
-        "4",
-        "--threads",
-        "1",
-        "--held-out",
-        "view_2",
-        "--out",
-        str(tmp_path / "run"),
-    ]
+    arguments = ["fit", scene, *DEMO_WORDS, "--epochs", 4, "--out", tmp_path / "run"]
     monkeypatch.setattr(Run, "_step", interrupted)
-    stopped = CliRunner().invoke(app, arguments)
-    assert stopped.exit_code == 130 and "go on" in stopped.output
+    assert "go on" in printed_by(app, *arguments, exit_code=130)
     assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["progress"]["step"] == 3
     monkeypatch.setattr(Run, "_step", step)
-    assert CliRunner().invoke(app, arguments).exit_code == 0
+    printed_by(app, *arguments)
     assert (tmp_path / "run" / "network.pt").exists()
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.learning.test_train import DEMO_LIKE, make_stack
+from tests.learning.test_train import DEMO_LIKE, make_wall
 from training.data.training_data import training_data
 from training.fitting import train
 from training.fitting.distributed import Ranks
@@ -23,10 +23,7 @@ TWO = dataclasses.replace(DEMO_LIKE, epochs=2, batch=1, device="cpu", crop_px=32
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("distributed") / "wall"
-    for seed in range(3):
-        make_stack(folder / f"view_{seed}", seed)
-    return folder
+    return make_wall(tmp_path_factory.mktemp("distributed") / "wall")
 
 
 def torchrun(*arguments: str, start: tuple[str, ...] = ("-m", "training")) -> subprocess.Popen[str]:

@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from capture.dataset.writer import slices_of_a_single_stack
 from mrbokeh.images.image_io import write_image
@@ -18,6 +17,7 @@ from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, wri
 from mrbokeh.stacks.focal_stack_dataset import slices_to_hold_out
 from mrbokeh.system.errors import InputError
 from tests.learning.test_train import DEMO_LIKE, LENS
+from tests.scenes.command_line import printed_by
 from training.cli import app
 from training.data.dataset import PairSet
 from training.data.stacks import Seen, stack_name
@@ -142,10 +142,9 @@ def test_a_slice_that_any_network_was_trained_on_is_not_unseen(scene: Path) -> N
 def test_evaluate_judges_a_network_of_one_stack_on_the_slices_held_out(scene: Path, run: Path, tmp_path: Path) -> None:
     """The network is nearer to the held-out slice than its neighbour in focus and than the sharp picture; the truth of this stack is the
     reference renderer's, whose score says that the pair is put together rightly."""
-    arguments = ["evaluate", str(run), str(scene), "--renderer", "scatter", "--out", str(tmp_path)]
-    done = CliRunner().invoke(app, arguments, catch_exceptions=False)
-    decibels = {line[:22].strip(): float(line[22:].split()[0]) for line in done.stdout.splitlines() if "SSIM" in line}
-    assert "1 slices held out of one stack, not an unseen view" in done.stdout
+    told = printed_by(app, "evaluate", run, scene, "--renderer", "scatter", "--out", tmp_path)
+    decibels = {line[:22].strip(): float(line[22:].split()[0]) for line in told.splitlines() if "SSIM" in line}
+    assert "1 slices held out of one stack, not an unseen view" in told
     assert "held out of one stack, not an unseen view" in (tmp_path / "evaluation.md").read_text()
     assert decibels["network"] > max(decibels["nearest slice"], decibels["no blur"])
     assert decibels["scatter reference"] > 45.0
@@ -188,7 +187,7 @@ def test_a_budget_without_time_for_200_steps_is_refused_and_nothing_changes(
         clock = itertools.count()
         monkeypatch.setattr(Run, "_now_s", lambda _, clock=clock: 60.0 * next(clock))
         with pytest.raises(InputError, match=r"10 minutes make about 11 steps of 60 s.*give --minutes \d+"):
-            CliRunner().invoke(app, [*arguments, str(tmp_path / name)], catch_exceptions=False)
+            printed_by(app, *arguments, tmp_path / name)
     assert (tmp_path / "old" / "network.pt").read_bytes() == b"kept" and not (tmp_path / "new").exists()
 
 

@@ -4,20 +4,20 @@ import csv
 import dataclasses
 import math
 import os
+import re
 import signal
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from mrbokeh.system.errors import InputError
-from tests.learning.test_train import DEMO_LIKE, make_wall
+from tests.learning.test_train import DEMO_LIKE, DEMO_WORDS, make_wall
+from tests.scenes.command_line import printed_by
+from tests.scenes.waiting import wait_until
 from training.cli import app
 from training.data.training_data import training_data
 from training.fitting import train
@@ -33,7 +33,7 @@ ROOT = Path(__file__).resolve().parents[2]
 LOGGED_RUN = """
 import sys
 from pathlib import Path
-from training import train
+from training.fitting import train
 from training.fitting.run import Run
 from training.fitting.settings import load_settings
 from training.data.training_data import training_data
@@ -67,13 +67,6 @@ def child(*arguments: str) -> subprocess.Popen[str]:
     return subprocess.Popen(arguments, env=environment, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
 
-def wait_for(what: Callable[[], bool], seconds: float = 90.0) -> None:
-    limit = time.monotonic() + seconds
-    while not what():
-        assert time.monotonic() < limit, "waited too long"
-        time.sleep(0.02)
-
-
 def steps_logged(log: Path) -> int:
     return len(log.read_text().splitlines()) if log.exists() else 0
 
@@ -101,7 +94,7 @@ def test_sigkill_costs_at_most_one_interval_and_the_run_goes_on_to_the_same_weig
     log = tmp_path / "log"
     process = child(sys.executable, "-c", LOGGED_RUN, str(scene), str(tmp_path / "killed"), str(log))
     checkpoint = tmp_path / "killed" / "checkpoint.pt"
-    wait_for(lambda: process.poll() is not None or (checkpoint.exists() and steps_logged(log) >= 12))
+    wait_until(lambda: process.poll() is not None or (checkpoint.exists() and steps_logged(log) >= 12), 90.0)
     process.kill()
     process.communicate()
     assert process.returncode == -signal.SIGKILL
@@ -120,22 +113,10 @@ def test_sigkill_costs_at_most_one_interval_and_the_run_goes_on_to_the_same_weig
 @pytest.mark.slow
 def test_sigterm_of_a_batch_system_leaves_a_checkpoint_of_that_very_step(scene: Path, tmp_path: Path) -> None:
     """143 is 128 + SIGTERM. The interval is so long that only the signal can have made the checkpoint."""
-    arguments = [
-        str(scene),
-        "--preset",
-        "demo",
-        "--epochs",
-        "4000",
-        "--threads",
-        "1",
-        "--held-out",
-        "view_2",
-        "--out",
-        str(tmp_path / "run"),
-    ]
+    arguments = [str(scene), *DEMO_WORDS, "--epochs", "4000", "--out", str(tmp_path / "run")]
     arguments += ["--set", "checkpoint_every_s=1e6", "--set", "crop_px=0", "--set", "validate_every_s=1e-3"]
     process = child(sys.executable, "-m", "training", "fit", *arguments)
-    wait_for(lambda: process.poll() is not None or (tmp_path / "run" / "curve.csv").exists())
+    wait_until(lambda: process.poll() is not None or (tmp_path / "run" / "curve.csv").exists(), 90.0)
     process.terminate()
     _, said = process.communicate(timeout=60)
     assert process.returncode == 143 and "go on" in said
@@ -155,9 +136,8 @@ def test_ctrl_c_in_the_first_steps_changes_nothing(name: str, scene: Path, tmp_p
         run._stopped_by = signal.SIGINT
 
     monkeypatch.setattr(Run, "_step", stopped)
-    arguments = ["fit", str(scene), "--preset", "demo", "--minutes", "10", "--threads", "1", "--overwrite", "--out", str(run)]
-    told = CliRunner().invoke(app, arguments)
-    assert told.exit_code == 130 and f"nothing was changed in {run}" in " ".join(told.output.split())
+    arguments = ["fit", scene, "--preset", "demo", "--minutes", 10, "--threads", 1, "--overwrite", "--out", run]
+    assert f"nothing was changed in {run}" in " ".join(printed_by(app, *arguments, exit_code=130).split())
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["network.pt", "old", "settings.json"]
 
 
@@ -278,10 +258,9 @@ def test_half_precision_learns_the_same(scene: Path, tmp_path: Path) -> None:
 
 
 def test_any_setting_can_be_given_by_its_name(scene: Path, tmp_path: Path) -> None:
-    arguments = ["fit", str(scene), "--preset", "demo", "--held-out", "view_2", "--out", str(tmp_path / "run"), "--seed", "3"]
+    arguments = ["fit", scene, "--preset", "demo", "--held-out", "view_2", "--out", tmp_path / "run", "--seed", 3]
     choices = ["epochs=1", "network.width=1", "crop_px=0", "sheets=false", "sensor_white=none", "loss_weighting=relative", "threads=1"]
-    result = CliRunner().invoke(app, arguments + [part for each in choices for part in ("--set", each)])
-    assert result.exit_code == 0, result.output
+    printed_by(app, *arguments, *(part for each in choices for part in ("--set", each)))
     settings = load_run(tmp_path / "run")[1]
     assert (settings.epochs, settings.minutes, settings.network.width, settings.crop_px) == (1, None, 1, 0)
     assert (settings.sheets, settings.sensor_white, settings.loss_weighting, settings.seed) == (False, None, "relative", 3)
@@ -299,5 +278,5 @@ def test_any_setting_can_be_given_by_its_name(scene: Path, tmp_path: Path) -> No
     ],
 )
 def test_settings_that_do_not_exist_or_fit_are_named(choice: str, message: str, tmp_path: Path) -> None:
-    result = CliRunner().invoke(app, ["fit", str(tmp_path), "--out", str(tmp_path / "run"), "--set", choice])
-    assert isinstance(result.exception, InputError) and message in str(result.exception)
+    with pytest.raises(InputError, match=re.escape(message)):
+        printed_by(app, "fit", tmp_path, "--out", tmp_path / "run", "--set", choice)

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner
 
 from capture.dataset.writer import DatasetPlan, write_dataset
 from capture.report.exclusion import REASONS, write_exclusions
@@ -19,14 +18,16 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from mrbokeh.stacks.focal_stack_dataset import read_focal_stack_dataset
 from mrbokeh.system.errors import InputError
+from tests.learning.test_train import DEMO_LIKE
 from tests.scenes import traced_focal_stack
+from tests.scenes.command_line import printed_by
 from training.cli import app
 from training.data.dataset import PairSet
 from training.data.training_data import common_lens, training_data
 from training.export.onnx_export import export_run
 from training.fitting import train
 from training.fitting.run_folder import load_run, read_facts
-from training.fitting.settings import TrainSettings, demo_settings, settings_to_json
+from training.fitting.settings import TrainSettings, settings_to_json
 from training.networks.network_settings import NetworkSettings
 
 SIZE = (24, 32)
@@ -34,9 +35,7 @@ LENS = Lens(50.0, 1.4, 1.0, 36.0)
 FOCUS_M = (0.8, 1.0, 1.5)
 SCALE = 3.0
 PLAN = DatasetPlan("CC0, nobody", test=("view_1",), radiance_scale=f"radiance {SCALE:g}")
-ONE_TILE = NetworkSettings(tile_px=0, overlap_px=0)
-FEW_STEPS = TrainSettings(network=ONE_TILE, epochs=1, threads=1, validate_every_s=0.0)
-DEMO_LIKE = replace(demo_settings(), minutes=None, epochs=1, crop_px=0, threads=1, validate_every_s=0.0)
+FEW_STEPS = TrainSettings(network=NetworkSettings(tile_px=0, overlap_px=0), epochs=1, threads=1, validate_every_s=0.0)
 
 
 def write_noise(folder: Path, seed: int, saturated: np.ndarray | None = None, full: float = 1.0) -> FocalStack:
@@ -193,12 +192,9 @@ def test_the_commands_take_a_data_set(traced: Path, tmp_path: Path) -> None:
     settings = tmp_path / "settings.json"
     settings.write_text(json.dumps(settings_to_json(replace(DEMO_LIKE, epochs=10))))
     run = tmp_path / "run"
-    arguments = ["fit", str(traced), "--settings", str(settings), "--threads", "1", "--out", str(run)]
-    fitted = CliRunner().invoke(app, arguments, catch_exceptions=False)
-    assert fitted.exit_code == 0, fitted.output
+    printed_by(app, "fit", traced, "--settings", settings, "--threads", 1, "--out", run)
     assert (read_facts(run).trained_on, read_facts(run).held_out) == (("desk/view_0",), ("desk/view_1",))
-    evaluated = CliRunner().invoke(app, ["evaluate", str(run), str(traced), "--no-reference"], catch_exceptions=False)
-    assert evaluated.exit_code == 0, evaluated.output
+    told = printed_by(app, "evaluate", run, traced, "--no-reference")
     rows = (run / "evaluation.csv").read_text().splitlines()[1:]
     assert {tuple(row.split(",")[:2]) for row in rows} == {("desk/view_1", str(index)) for index in range(6)}
-    assert float(evaluated.output.split("over no blur ")[1].split(" dB")[0]) > 3.0
+    assert float(told.split("over no blur ")[1].split(" dB")[0]) > 3.0

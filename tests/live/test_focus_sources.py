@@ -8,7 +8,7 @@ import pytest
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 from viewfinder.app.opening import LensBook
-from viewfinder.focus.sources import FirstKnown, FrameFocus, ManualFocus
+from viewfinder.focus.sources import FirstKnown, FrameFocus, ManualFocus, open_focus
 from viewfinder.frames import CameraFrame, LensState
 from viewfinder.tracking.tracker import TrackedPose
 
@@ -75,6 +75,26 @@ def test_first_known_of_each_value() -> None:
     assert both.state(frame(), POSE) == LensState(None, 2.0) and both.focus_from is None
     both.close()
     assert (first.closed, second.closed, third.closed) == (1, 1, 1)
+
+
+def test_who_is_asked_first_for_the_focus() -> None:
+    """By hand 3 m, the frame says 2 m; the board's 0.9 m counts only where it is named."""
+    told, board = frame(1.0, LensState(2.0, 4.0)), Counted("blur of the board", LensState(0.9))
+    manual = ManualFocus(LensState(3.0))
+    expected: dict[tuple[str, ...], tuple[float, str]] = {
+        (): (3.0, manual.name),
+        ("source",): (2.0, FrameFocus.name),
+        ("source", "hand"): (2.0, FrameFocus.name),
+        ("hand", "source"): (3.0, manual.name),
+        ("board",): (0.9, board.name),
+        ("hand", "board"): (3.0, manual.name),
+    }
+    for first, (metres, name) in expected.items():
+        focus = open_focus(manual, None, first, board if "board" in first else None)
+        assert (focus.state(told, None), focus.focus_from) == (LensState(metres, 4.0), name), first
+    manual.focus(None)
+    focus = open_focus(manual, None, ("hand", "board"), board)
+    assert focus.state(told, None).focus_distance_m == 0.9, "what nobody set by hand comes from the next"
 
 
 FIFTY = Lens(50.0, 1.8, 2.0, 36.0)

@@ -13,9 +13,9 @@ import pytest
 
 from mrbokeh.system.errors import InputError
 from tests.scenes.made_viewfinder import made_viewfinder
-from tests.scenes.waiting import in_time
+from viewfinder.options import ListeningOptions
 from viewfinder.server.access import LOOPBACK_NAMES, Access
-from viewfinder.server.endpoint import Interface, choose, interfaces, load_tls, page_url, qr_text
+from viewfinder.server.endpoint import Endpoint, Interface, choose, interfaces, load_tls, open_endpoint, page_url, qr_text
 from viewfinder.server.sessions import Role, Sessions
 
 LOOPBACK = Interface("lo", "127.0.0.1")
@@ -109,46 +109,38 @@ def make_certificate(tmp_path: Path) -> Make:
     return make
 
 
-def test_the_page_the_stream_and_the_cookie_travel_encrypted(make_certificate: Make) -> None:
+async def test_the_page_the_stream_and_the_cookie_travel_encrypted(make_certificate: Make) -> None:
     certificate, key = make_certificate()
     tls = load_tls(certificate, key)
     assert tls.names == ("box.local", "127.0.0.1")
     sessions = Sessions()
-
-    async def work() -> None:
-        trusting = ssl.create_default_context(cafile=str(certificate))
-        access = Access(names=LOOPBACK_NAMES | set(tls.names), sessions=sessions, secure=True)
-        async with (
-            made_viewfinder(access, tls) as made,
-            aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True), connector=aiohttp.TCPConnector(ssl=trusting)) as client,
-        ):
-            assert made.url.startswith("https://127.0.0.1:")
-            async with client.post(made.url + "enter", json={"token": sessions.invitation(Role.CONTROL)}) as answer:
-                assert answer.status == 200
-                assert "Secure" in answer.headers["Set-Cookie"]
-            async with client.ws_connect(made.url + "stream") as stream:
-                assert (await stream.receive(timeout=5)).type is aiohttp.WSMsgType.BINARY
-            async with client.get(made.url) as page:
-                assert "wss://127.0.0.1" in page.headers["Content-Security-Policy"]
-            async with client.get(made.url + "state", headers={"Host": "box.local"}) as answer:
-                assert answer.status == 401  # known name, other cookie
-            with pytest.raises(aiohttp.ClientError):
-                await client.get(made.url.replace("https", "http"))
-
-    in_time(work)
+    trusting = ssl.create_default_context(cafile=str(certificate))
+    access = Access(names=LOOPBACK_NAMES | set(tls.names), sessions=sessions, secure=True)
+    async with (
+        made_viewfinder(access, tls) as made,
+        aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True), connector=aiohttp.TCPConnector(ssl=trusting)) as client,
+    ):
+        assert made.url.startswith("https://127.0.0.1:")
+        async with client.post(made.url + "enter", json={"token": sessions.invitation(Role.CONTROL)}) as answer:
+            assert answer.status == 200
+            assert "Secure" in answer.headers["Set-Cookie"]
+        async with client.ws_connect(made.url + "stream") as stream:
+            assert (await stream.receive(timeout=5)).type is aiohttp.WSMsgType.BINARY
+        async with client.get(made.url) as page:
+            assert "wss://127.0.0.1" in page.headers["Content-Security-Policy"]
+        async with client.get(made.url + "state", headers={"Host": "box.local"}) as answer:
+            assert answer.status == 401  # known name, other cookie
+        with pytest.raises(aiohttp.ClientError):
+            await client.get(made.url.replace("https", "http"))
 
 
-def test_the_address_has_a_name_of_the_certificate(make_certificate: Make) -> None:
+async def test_the_address_has_a_name_of_the_certificate(make_certificate: Make) -> None:
     certificate, key = make_certificate()
     tls = load_tls(certificate, key)
-
-    async def work() -> None:
-        async with made_viewfinder(tls=tls) as made:
-            assert made.url.startswith("https://127.0.0.1:")
-        async with made_viewfinder(tls=tls, host="127.0.0.2") as made:
-            assert made.url.startswith("https://box.local:")
-
-    in_time(work)
+    async with made_viewfinder(tls=tls) as made:
+        assert made.url.startswith("https://127.0.0.1:")
+    async with made_viewfinder(tls=tls, host="127.0.0.2") as made:
+        assert made.url.startswith("https://box.local:")
 
 
 def test_certificate_and_key_may_share_a_file(make_certificate: Make, tmp_path: Path) -> None:
@@ -176,3 +168,24 @@ def test_what_cannot_be_used_is_named(make_certificate: Make, tmp_path: Path) ->
     for files, expected in cases:
         with pytest.raises(InputError, match=expected):
             load_tls(*files)
+
+
+def test_what_is_printed_for_a_network(capsys: pytest.CaptureFixture[str]) -> None:
+    """The QR code is drawn with half blocks, as long as nobody asks for none. A token that was used is followed by the next."""
+    sessions = Sessions()
+    url = "https://10.0.0.1:8080/"
+    for qr in (True, False):
+        endpoint = Endpoint(ListeningOptions(lan=True, qr=qr), "10.0.0.1", None, Access(sessions=sessions))
+        endpoint.announce("viewfinder of x", url)
+        endpoint.announce_camera(url)
+        shown = capsys.readouterr().out
+        assert ("\u2588" in shown or "\u2584" in shown) == qr
+        assert f"to control, for one device: {url}#token={sessions.invitation(Role.CONTROL)}" in shown
+        assert f"to send a camera from a browser: {url}camera#token={sessions.standing_token(Role.CONTROL)}" in shown
+        assert f"{url}whip with the bearer token {sessions.standing_token(Role.CONTROL)}" in shown
+    used = sessions.invitation(Role.CONTROL)
+    assert sessions.enter(used) is not None
+    assert f"#token={sessions.invitation(Role.CONTROL)}" in capsys.readouterr().out != used
+    alone = open_endpoint(ListeningOptions())
+    alone.announce("viewfinder of x", "http://127.0.0.1:8080/")
+    assert capsys.readouterr().out == "viewfinder of x: http://127.0.0.1:8080/ (Ctrl-C stops it)\n"

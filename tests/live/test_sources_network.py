@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from fractions import Fraction
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -19,6 +19,7 @@ import pytest
 from aiortc.codecs.h264 import H264Encoder
 from aiortc.rtp import RtpPacket
 
+from tests.scenes.video_files import encoded
 from tests.scenes.waiting import wait_until
 from viewfinder.frames import CameraFrame
 from viewfinder.sources.frame_source import SizeLimit
@@ -56,16 +57,39 @@ def encode_live(target: Any, going: Callable[[], bool], bgr: tuple[int, int, int
 
 
 @contextmanager
-def udp_sender(port: int, bgr: tuple[int, int, int], **color: int) -> Iterator[None]:
-    stop = Event()
-    url = f"udp://127.0.0.1:{port}?pkt_size=1316"
-    thread = threading.Thread(target=encode_live, args=(url, lambda: not stop.is_set(), bgr), kwargs=color)
+def at_work(work: Callable[[], Any], stop: Callable[[], Any]) -> Iterator[None]:
+    """A thread works meanwhile."""
+    thread = threading.Thread(target=work)
     thread.start()
     try:
         yield
     finally:
-        stop.set()
+        stop()
         thread.join(10)
+    assert not thread.is_alive()
+
+
+@contextmanager
+def udp_sender(port: int, bgr: tuple[int, int, int], **color: int) -> Iterator[None]:
+    stop = Event()
+    url = f"udp://127.0.0.1:{port}?pkt_size=1316"
+    with at_work(lambda: encode_live(url, lambda: not stop.is_set(), bgr, **color), stop.set):
+        yield
+
+
+class Server(socketserver.ThreadingTCPServer):
+    allow_reuse_address, daemon_threads = True, True
+
+
+@contextmanager
+def served(port: int, handler: type[socketserver.BaseRequestHandler]) -> Iterator[str]:
+    """The address of a server; its handlers have `stop`, which is set at the end."""
+    kind = type("Handler", (handler,), {"stop": Event()})
+    with Server(("127.0.0.1", port), kind) as server, at_work(lambda: server.serve_forever(0.05), server.shutdown):
+        try:
+            yield f"127.0.0.1:{server.server_address[1]}"
+        finally:
+            kind.stop.set()
 
 
 class Body:
@@ -80,45 +104,53 @@ class Body:
 
 
 @contextmanager
-def http_server(port: int, respond: Callable[[BaseHTTPRequestHandler, Event], None]) -> Iterator[str]:
-    stop = Event()
-
+def http_server(port: int, respond: Callable[[Any], None]) -> Iterator[str]:
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             try:
-                respond(self, stop)
+                respond(self)
             except OSError:
                 self.close_connection = True
 
         def log_message(self, *what: object) -> None: ...
 
-    server = ThreadingHTTPServer(("127.0.0.1", port), Handler)
-    server.daemon_threads = True
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_address[1]}/live"
-    finally:
-        stop.set()
-        server.shutdown()
-        server.server_close()
-        thread.join(10)
+    with served(port, Handler) as address:
+        yield f"http://{address}/live"
 
 
-def respond_mpegts(handler: BaseHTTPRequestHandler, stop: Event, bgr: tuple[int, int, int]) -> None:
-    handler.send_response(200)
-    handler.send_header("Content-Type", "video/mp2t")
+def begin(handler: Any, status: int = 200, **headers: object) -> None:
+    handler.send_response(status)
+    for name, value in headers.items():
+        handler.send_header(name.replace("_", "-"), str(value))
     handler.end_headers()
-    encode_live(Body(handler.wfile), lambda: not stop.is_set(), bgr)
 
 
-def respond_mjpeg(handler: BaseHTTPRequestHandler, stop: Event, bgr: tuple[int, int, int]) -> None:
+def mpegts(bgr: tuple[int, int, int]) -> Callable[[Any], None]:
+    def respond(handler: Any) -> None:
+        begin(handler, Content_Type="video/mp2t")
+        encode_live(Body(handler.wfile), lambda: not handler.stop.is_set(), bgr)
+
+    return respond
+
+
+def file_of(path: Path) -> Callable[[Any], None]:
+    """From where it is asked for."""
+    data = path.read_bytes()
+
+    def respond(handler: Any) -> None:
+        start = int((handler.headers.get("Range") or "bytes=0-").split("=")[1].split("-")[0])
+        part = f"bytes {start}-{len(data) - 1}/{len(data)}"
+        begin(handler, 206, Content_Length=len(data) - start, Content_Range=part, Accept_Ranges="bytes")
+        handler.wfile.write(data[start:])
+
+    return respond
+
+
+def green_mjpeg(handler: Any) -> None:
     """As phone apps and network cameras do: multipart/x-mixed-replace."""
-    handler.send_response(200)
-    handler.send_header("Content-Type", "multipart/x-mixed-replace; boundary=frame")
-    handler.end_headers()
-    jpeg = cv2.imencode(".jpg", np.full((HEIGHT, WIDTH, 3), bgr, np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
-    while not stop.is_set():
+    begin(handler, Content_Type="multipart/x-mixed-replace; boundary=frame")
+    jpeg = cv2.imencode(".jpg", np.full((HEIGHT, WIDTH, 3), GREEN, np.uint8), [cv2.IMWRITE_JPEG_QUALITY, 95])[1].tobytes()
+    while not handler.stop.is_set():
         handler.wfile.write(b"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: %d\r\n\r\n" % len(jpeg) + jpeg + b"\r\n")
         time.sleep(1 / FPS)
 
@@ -149,14 +181,6 @@ def opened(source: NetworkStreamSource) -> Iterator[tuple[Iterator[CameraFrame],
     assert not [each for each in threading.enumerate() if each.name.startswith("decode ")]
 
 
-def pumped(frames: Iterator[CameraFrame]) -> tuple[threading.Thread, list[CameraFrame]]:
-    """All frames, collected by a thread until the source stops."""
-    got: list[CameraFrame] = []
-    thread = threading.Thread(target=lambda: got.extend(frames))
-    thread.start()
-    return thread, got
-
-
 def test_udp_comes_goes_and_comes_again() -> None:
     """Tagged BT.709: its matrix is used although so small a picture would be BT.601 untagged (up to 12 codes apart)."""
     port = free_port(socket.SOCK_DGRAM)
@@ -167,23 +191,20 @@ def test_udp_comes_goes_and_comes_again() -> None:
             frame = first_like(frames, RED)
             assert frame.bgr.shape == (HEIGHT, WIDTH, 3) and source.status is None and source.transfer == "bt709"
             assert next(frames).sequence > frame.sequence
-        thread, _ = pumped(frames)
-        wait_until(lambda: source.status is not None and "does not answer" in source.status)
-        stopping.set()
-        thread.join(10)
-        assert not thread.is_alive()
+        with at_work(lambda: list(frames), stopping.set):
+            wait_until(lambda: source.status is not None and "does not answer" in source.status)
 
 
 def test_a_stream_that_is_restarted_goes_on() -> None:
     port = free_port(socket.SOCK_STREAM)
     source = NetworkStreamSource(f"http://127.0.0.1:{port}/live", SizeLimit(80))
     with opened(source) as (frames, _):
-        with http_server(port, lambda handler, stop: respond_mpegts(handler, stop, RED)):
+        with http_server(port, mpegts(RED)):
             before = first_like(frames, RED)
             assert before.bgr.shape == (56, 80, 3)
         wait_until(lambda: source.status is not None)
         assert "trying again" in str(source.status) or "waiting" in str(source.status)
-        with http_server(port, lambda handler, stop: respond_mpegts(handler, stop, GREEN)):
+        with http_server(port, mpegts(GREEN)):
             after = first_like(frames, GREEN)
             assert after.sequence > before.sequence and after.captured_s > before.captured_s
             assert source.status is None
@@ -242,45 +263,31 @@ class RtspHandler(socketserver.StreamRequestHandler):
                 number += 1
 
 
-@contextmanager
-def rtsp_camera(port: int, bgr: tuple[int, int, int]) -> Iterator[None]:
-    stop = Event()
-
-    class Server(socketserver.ThreadingTCPServer):
-        allow_reuse_address, daemon_threads = True, True
-
-    with Server(("127.0.0.1", port), type("Handler", (RtspHandler,), {"bgr": bgr, "stop": stop})) as server:
-        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
-        thread.start()
-        try:
-            yield
-        finally:
-            stop.set()
-            server.shutdown()
-            thread.join(10)
+class GreenRtspHandler(RtspHandler):
+    bgr = GREEN
 
 
 def test_a_network_camera_over_rtsp_is_switched_off_and_on() -> None:
     port = free_port(socket.SOCK_STREAM)
     source = NetworkStreamSource(f"rtsp://127.0.0.1:{port}/cam")
     with opened(source) as (frames, _):
-        with rtsp_camera(port, RED):
+        with served(port, RtspHandler):
             before = first_like(frames, RED)
             assert before.bgr.shape == (HEIGHT, WIDTH, 3)
         wait_until(lambda: source.status is not None)
-        with rtsp_camera(port, GREEN):
+        with served(port, GreenRtspHandler):
             assert first_like(frames, GREEN).sequence > before.sequence
             assert source.status is None
 
 
 def test_mjpeg_of_a_network_camera() -> None:
-    with http_server(0, lambda handler, stop: respond_mjpeg(handler, stop, GREEN)) as url, opened(NetworkStreamSource(url)) as (frames, _):
+    with http_server(0, green_mjpeg) as url, opened(NetworkStreamSource(url)) as (frames, _):
         assert first_like(frames, GREEN).bgr.shape == (HEIGHT, WIDTH, 3)
 
 
 def test_a_slow_viewer_gets_the_newest_not_the_oldest() -> None:
     """0.6 s asleep are about 15 frames at 25 per second: they are dropped, none is queued."""
-    with http_server(0, lambda handler, stop: respond_mpegts(handler, stop, RED)) as url, opened(NetworkStreamSource(url)) as (frames, _):
+    with http_server(0, mpegts(RED)) as url, opened(NetworkStreamSource(url)) as (frames, _):
         before = first_like(frames, RED)
         time.sleep(0.6)
         asleep_until_s = time.monotonic()
@@ -292,25 +299,9 @@ def test_a_slow_viewer_gets_the_newest_not_the_oldest() -> None:
 
 def test_a_recording_behind_a_url_plays_in_its_own_time(tmp_path: Path) -> None:
     """25 frames of 25 per second last a second, over and over: never faster, as a live stream would be read."""
-    clip = tmp_path / "clip.mp4"
-    with av.open(str(clip), "w", options={"movflags": "faststart"}) as container:
-        stream: Any = container.add_stream("libx264", rate=25)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
-        for index in range(25):
-            picture = av.VideoFrame.from_ndarray(np.full((HEIGHT, WIDTH, 3), GREEN, np.uint8), "bgr24")
-            picture.pts, picture.time_base = index, Fraction(1, 25)
-            container.mux(stream.encode(picture))
-        container.mux(stream.encode(None))
-    data = clip.read_bytes()
-
-    def respond(handler: BaseHTTPRequestHandler, _stop: Event) -> None:
-        handler.send_response(200)
-        handler.send_header("Content-Type", "video/mp4")
-        handler.send_header("Content-Length", str(len(data)))
-        handler.end_headers()
-        handler.wfile.write(data)
-
-    with http_server(0, respond) as url, opened(NetworkStreamSource(url)) as (frames, _):
+    picture = av.VideoFrame.from_ndarray(np.full((HEIGHT, WIDTH, 3), GREEN, np.uint8), "bgr24")
+    clip = encoded(tmp_path / "clip.mkv", "libx264", "yuv420p", *[picture] * 25)
+    with http_server(0, file_of(clip)) as url, opened(NetworkStreamSource(url)) as (frames, _):
         got = [next(frames) for _ in range(35)]
     assert got[20].captured_s - got[0].captured_s > 0.7
     assert got[-1].sequence - got[0].sequence >= 34
@@ -347,18 +338,8 @@ def test_an_iphone_film_as_a_stream_stands_upright(shared_data: Path) -> None:
     from mrbokeh.video.clip import probe
 
     clip = shared_data / "video" / "iphone_xr_chart.mov"
-    info, data = probe(clip), clip.read_bytes()
-
-    def respond(handler: BaseHTTPRequestHandler, _stop: Event) -> None:
-        start = int((handler.headers.get("Range") or "bytes=0-").split("=")[1].split("-")[0])
-        handler.send_response(206)
-        handler.send_header("Content-Length", str(len(data) - start))
-        handler.send_header("Content-Range", f"bytes {start}-{len(data) - 1}/{len(data)}")
-        handler.send_header("Accept-Ranges", "bytes")
-        handler.end_headers()
-        handler.wfile.write(data[start:])
-
-    with http_server(0, respond) as url, opened(NetworkStreamSource(url, SizeLimit(270, 270))) as (frames, _):
+    info = probe(clip)
+    with http_server(0, file_of(clip)) as url, opened(NetworkStreamSource(url, SizeLimit(270, 270))) as (frames, _):
         height_px, width_px = next(frames).bgr.shape[:2]
     assert max(width_px, height_px) == 270
     assert width_px / height_px == pytest.approx(info.width_px / info.height_px, rel=0.02)
@@ -367,11 +348,9 @@ def test_an_iphone_film_as_a_stream_stands_upright(shared_data: Path) -> None:
 def test_nobody_there_is_a_sentence_without_the_password() -> None:
     port = free_port(socket.SOCK_STREAM)
     source = NetworkStreamSource(f"rtsp://me:secret@127.0.0.1:{port}/cam")
-    stopping = Event()
-    thread, got = pumped(source.frames(stopping))
-    wait_until(lambda: "does not answer" in str(source.status))
-    stopping.set()
-    thread.join(10)
-    assert not thread.is_alive() and got == []
+    stopping, got = Event(), list[CameraFrame]()
+    with at_work(lambda: got.extend(source.frames(stopping)), stopping.set):
+        wait_until(lambda: "does not answer" in str(source.status))
+    assert got == []
     assert "secret" not in source.name + str(source.status)
     assert source.name == f"rtsp://127.0.0.1:{port}/cam"

@@ -11,12 +11,13 @@ from mrbokeh.compositing.overlay import Overlay
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.camera import Camera, camera_to_json
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.scene.staging.picture_box import box_around
 from mrbokeh.scene.staging.scene_description import RealThings
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import upright_camera
-from tests.scenes.stage_scenes import FOCAL_PX, HEIGHT, LENS, ONE_CARD, WIDTH, camera, render_setup, staged
+from tests.scenes.stage_scenes import FOCAL_PX, HEIGHT, LENS, ONE_CARD, SHADOW, WIDTH, camera, centroid, render_setup, staged
 from viewfinder.stage.drawing import Drawing, DrawRequest, draw, is_outdated, moved_px
 from viewfinder.stage.occlusion import Mask, Occlusion, RealDepth, read_occlusion
 from viewfinder.stage.reprojection import LayerDepth
@@ -25,28 +26,14 @@ BLACK = np.zeros((HEIGHT, WIDTH, 3), np.float32)
 
 
 def shown(drawing: Drawing, view: Camera) -> Overlay:
-    assert drawing.layer is not None
     return drawing.layer.moved_to(upright_camera(view, "-z"))
 
 
-def alpha_of(overlay: Overlay, view: Camera) -> np.ndarray:
-    return (
-        1.0
-        - overlay.over(np.ones((view.height_px, view.width_px, 3), np.float32))[..., 0]
-        + overlay.over(np.zeros((view.height_px, view.width_px, 3), np.float32))[..., 0]
-    )
-
-
-def centroid(plane: np.ndarray) -> tuple[float, float]:
-    columns, rows = np.meshgrid(np.arange(plane.shape[1]) + 0.5, np.arange(plane.shape[0]) + 0.5)
-    return float((plane * columns).sum() / plane.sum()), float((plane * rows).sum() / plane.sum())
-
-
-def whole_frame(folder: Path, view: Camera, lens: object = LENS) -> Layer:
+def whole_frame(folder: Path, view: Camera, lens: Lens = LENS) -> Layer:
     """The same scene without any box: raycast and blurred as one picture."""
     tools = render_setup()
     sharp = tools.backend.render(staged(folder).scene_at(0.0), upright_camera(view, "-z"))
-    return tools.renderer.render([sharp], lens)  # type: ignore[arg-type]
+    return tools.renderer.render([sharp], lens)
 
 
 @pytest.mark.parametrize("focus_m", [0.5, 1.0, 3.0])
@@ -80,9 +67,9 @@ def test_a_camera_within_the_object_is_no_mistake(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("lens", [replace(LENS, tilt_rad=(0.0, 0.1)), replace(LENS, aperture=replace(LENS.aperture, cat_eye=0.5))])
-def test_a_blur_that_depends_on_the_place_is_drawn_in_the_whole_frame(tmp_path: Path, lens: object) -> None:
-    lens = replace(lens, focus_distance_m=0.6)  # type: ignore[type-var]
-    drawing = draw(staged(tmp_path), DrawRequest(camera(), lens), render_setup())  # type: ignore[arg-type]
+def test_a_blur_that_depends_on_the_place_is_drawn_in_the_whole_frame(tmp_path: Path, lens: Lens) -> None:
+    lens = lens.focused_at(0.6)
+    drawing = draw(staged(tmp_path), DrawRequest(camera(), lens), render_setup())
     assert np.abs(shown(drawing, camera()).over(BLACK) - whole_frame(tmp_path, camera(), lens).rgb).max() < 2e-4
 
 
@@ -121,43 +108,30 @@ def test_a_moved_drawing_is_near_a_fresh_one(tmp_path: Path) -> None:
 class TestShadow:
     # The sun stands 45 degrees high in front of the card: light goes away from the viewer and down. The card of 0.2 m throws 0.2 m of
     # shadow behind it, 0.2 m wide. Seen from high above, its middle lies clear of the card.
-    TEXT = ONE_CARD + "[[sun]]\ndirection = [0, -1, 1]\nirradiance = 3\n[shadow]\nstrength = 0.75\n"
     VIEW = camera((0.0, 0.3, -1.2), (0.0, -0.1, 0.0))
-    STOPPED_DOWN = replace(LENS, f_number=32.0, focus_distance_m=1.25)
+    GREY = np.full((HEIGHT, WIDTH, 3), 0.8, np.float32)
 
-    def at(self, x_m: float, y_m: float) -> tuple[int, int]:
-        column, row = self.VIEW.project(np.array([x_m, y_m, 0.0]))[0]
-        return int(row), int(column)
+    def drawing(self, folder: Path, text: str = SHADOW) -> Drawing:
+        return draw(staged(folder, text), DrawRequest(self.VIEW, replace(LENS, f_number=32.0, focus_distance_m=1.25)), render_setup())
+
+    def light_at(self, folder: Path, text: str, x_m: float, y_m: float, view: Camera = VIEW) -> np.ndarray:
+        """On a grey table."""
+        column, row = view.project(np.array([x_m, y_m, 0.0]))[0]
+        return shown(self.drawing(folder, text), view).over(self.GREY)[int(row), int(column)]
 
     def test_it_darkens_the_plate_by_its_strength_where_the_light_is_blocked(self, tmp_path: Path) -> None:
-        overlay = shown(draw(staged(tmp_path, self.TEXT), DrawRequest(self.VIEW, self.STOPPED_DOWN), render_setup()), self.VIEW)
-        plate = np.full((HEIGHT, WIDTH, 3), 0.8, np.float32)
-        result = overlay.over(plate)
-        assert np.allclose(result[self.at(0.0, -0.1)], 0.25 * 0.8, atol=1e-3)
-        assert np.allclose(result[self.at(0.07, -0.17)], 0.25 * 0.8, atol=1e-3)
-        for clear in ((0.15, -0.1), (0.0, -0.26), (0.0, 0.1)):
-            assert np.allclose(result[self.at(*clear)], 0.8, atol=1e-3)
+        for x_m, y_m, light in ((0.0, -0.1, 0.2), (0.07, -0.17, 0.2), (0.15, -0.1, 0.8), (0.0, -0.26, 0.8), (0.0, 0.1, 0.8)):
+            assert np.allclose(self.light_at(tmp_path, SHADOW, x_m, y_m), light, atol=1e-3)
 
-    def test_without_a_plane_there_is_none(self, tmp_path: Path) -> None:
-        text = self.TEXT.partition("[shadow]")[0]
-        overlay = shown(draw(staged(tmp_path, text), DrawRequest(self.VIEW, self.STOPPED_DOWN), render_setup()), self.VIEW)
-        result = overlay.over(np.full((HEIGHT, WIDTH, 3), 0.8, np.float32))
-        assert np.allclose(result[self.at(0.0, -0.1)], 0.8)
-
-    def test_it_ends_where_the_plane_ends(self, tmp_path: Path) -> None:
-        text = self.TEXT + "size_m = 0.2\n"
-        overlay = shown(draw(staged(tmp_path, text), DrawRequest(self.VIEW, self.STOPPED_DOWN), render_setup()), self.VIEW)
-        result = overlay.over(np.full((HEIGHT, WIDTH, 3), 0.8, np.float32))
-        assert np.allclose(result[self.at(0.0, -0.17)], 0.8, atol=1e-3)
+    def test_without_a_plane_there_is_none_and_it_ends_where_the_plane_ends(self, tmp_path: Path) -> None:
+        assert np.allclose(self.light_at(tmp_path, SHADOW.partition("[shadow]")[0], 0.0, -0.1), 0.8)
+        assert np.allclose(self.light_at(tmp_path, SHADOW + "size_m = 0.2\n", 0.0, -0.17), 0.8, atol=1e-3)
 
     def test_it_moves_with_the_table(self, tmp_path: Path) -> None:
         # From a camera 5 cm to the right, the shadow's middle is where that camera sees it.
-        drawing = draw(staged(tmp_path, self.TEXT), DrawRequest(self.VIEW, self.STOPPED_DOWN), render_setup())
         view = camera((0.05, 0.3, -1.2), (0.05, -0.1, 0.0))
-        result = shown(drawing, view).over(np.full((HEIGHT, WIDTH, 3), 0.8, np.float32))
         for x_m, light in ((0.08, 0.2), (0.12, 0.8)):
-            column, row = view.project(np.array([x_m, -0.15, 0.0]))[0]
-            assert result[int(row), int(column), 1] == pytest.approx(light, abs=0.02)
+            assert self.light_at(tmp_path, SHADOW, x_m, -0.15, view)[1] == pytest.approx(light, abs=0.02)
 
 
 class TestOcclusion:

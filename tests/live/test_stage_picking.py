@@ -9,7 +9,8 @@ import pytest
 
 from mrbokeh.compositing.overlay import code_tables
 from mrbokeh.images.image_io import read_linear
-from mrbokeh.optics.camera import level_plane_dioptres
+from mrbokeh.optics.camera import Camera, level_plane_dioptres
+from mrbokeh.optics.lens import Lens
 from mrbokeh.scene import split_sun
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.light import Environment
@@ -19,10 +20,9 @@ from mrbokeh.scene.staging.scene_description import Lighting, Sun
 from mrbokeh.scene.staging.staged_scene import Assets
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import UPRIGHT_FROM_WORLD, turned, turned_back, upright_camera
-from tests.scenes.stage_scenes import HEIGHT, LENS, ONE_CARD, WIDTH, camera, render_setup, scene_file, staged
+from tests.scenes.stage_scenes import HEIGHT, LENS, ONE_CARD, SHADOW, WIDTH, camera, render_setup, scene_file, staged
 from viewfinder.stage.drawing import DrawRequest, draw, sharp_layers
 from viewfinder.stage.occlusion import Occlusion, RealDepth
-from viewfinder.stage.reprojection import MovableLayer
 from viewfinder.stage.shown_scene import VIEWS, ShownScene, depth_at_m, object_at, view_picture
 from viewfinder.stage.stage_setup import SetupLoader, live_backend
 
@@ -32,12 +32,11 @@ PLATE = np.full((HEIGHT, WIDTH, 3), 90, np.uint8)
 ABOVE = camera((0.0, 0.5, -1.0), (0.0, 0.0, 0.0))
 
 
-def seen(folder: Path, text: str = TWO_CARDS, view: object = None, occlusion: Occlusion | None = None, lens: object = LENS) -> ShownScene:
-    pose = camera() if view is None else view
-    scene = staged(folder, text)
-    drawing = draw(scene, DrawRequest(pose, lens), render_setup())  # type: ignore[arg-type]
-    upright = upright_camera(pose, "-z")  # type: ignore[arg-type]
-    assert isinstance(drawing.layer, MovableLayer)
+def seen(
+    folder: Path, text: str = TWO_CARDS, pose: Camera | None = None, occlusion: Occlusion | None = None, lens: Lens = LENS
+) -> ShownScene:
+    scene, pose = staged(folder, text), pose or camera()
+    drawing, upright = draw(scene, DrawRequest(pose, lens), render_setup()), upright_camera(pose, "-z")
     return ShownScene(drawing.layer.moved_to(upright), upright, drawing, scene, occlusion)
 
 
@@ -126,13 +125,9 @@ def test_before_anything_is_drawn_and_where_nothing_is_seen(tmp_path: Path) -> N
             assert np.array_equal(view_picture(view, PLATE, nothing, TABLES), expected)
 
 
-SHADOW = ONE_CARD + "[[sun]]\ndirection = [0, -1, 1]\nirradiance = 3\n[shadow]\nstrength = 0.75\n"
-
-
 def test_drawings_are_live_and_captures_are_not(tmp_path: Path) -> None:
     loader = SetupLoader(scene_file(tmp_path, SHADOW), EmbreeRaycaster(threads=1))
     setup, upright = loader.load(), upright_camera(camera((0.05, 0.3, -1.2), (0.0, -0.1, 0.0)), "-z")
-    assert setup.render_setup.live is not None
     live = setup.render_setup.live.render(setup.staged.scene_at(0.0), upright)
     assert set(np.unique(live.alpha)) <= {0.0, 0.25, 0.5, 0.75, 1.0}
     card, shadow = sharp_layers(setup.staged, 0.0, upright, setup.render_setup)
@@ -141,7 +136,6 @@ def test_drawings_are_live_and_captures_are_not(tmp_path: Path) -> None:
     assert (
         len(np.unique(card.alpha)) > 5 >= len(np.unique(live_backend(EmbreeRaycaster()).render(setup.staged.scene_at(0.0), upright).alpha))
     )
-    assert setup.staged.catcher is not None
     mask = EmbreeRaycaster().render_shadow_mask(setup.staged.scene_at(0.0), upright, setup.staged.catcher)
     assert np.allclose(shadow.alpha, 0.75 * (1 - mask))
 
@@ -170,17 +164,10 @@ def test_a_moved_object_shares_what_was_loaded(tmp_path: Path) -> None:
     before = staged(tmp_path)
     after = before.with_object("card", position_m=(0.1, 0.2, 0.0), yaw_rad=0.5)
     motion = rigid_motion(before.scene_at(0.0).meshes, after.scene_at(0.0).meshes)
-    assert motion is not None
     # Upright axes: x as the table's, y down, z away: (0.1, 0.2, 0) of a board whose y comes towards the viewer.
-    foot_m = np.array([0.0, 0.0, 0.0, 1.0])
-    assert (motion @ foot_m)[:3] == pytest.approx(upright_point(0.1, 0.2, 0.0), abs=1e-9)
+    assert (motion @ np.array([0.0, 0.0, 0.0, 1.0]))[:3] == pytest.approx((0.1, 0.0, -0.2), abs=1e-9)
     bigger = before.with_object("card", height_m=0.3)
     assert rigid_motion(before.scene_at(0.0).meshes, bigger.scene_at(0.0).meshes) is None
-
-
-def upright_point(x: float, y: float, z: float) -> tuple[float, float, float]:
-    """ "-z" is up: x stays, what goes into the table goes down, and the board's y points towards the viewer."""
-    return x, z, -y
 
 
 def test_points_are_those_of_the_scene(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from mrbokeh.compositing.overlay import Overlay
 from mrbokeh.optics.camera import Camera
-from tests.scenes.stage_scenes import looking
+from tests.scenes.stage_scenes import centroid, looking
 from viewfinder.stage.reprojection import GRID_PX, NODE_PX, MovableLayer, filled_outwards
 
 FRAME = Camera(160, 112, (150.0, 150.0), (80.0, 56.0))
@@ -53,11 +53,6 @@ def whole(overlay: Overlay, camera: Camera = FRAME) -> np.ndarray:
     box = rgba[overlay.top_px : overlay.top_px + height, overlay.left_px : overlay.left_px + width]
     box[..., :3], box[..., 3] = overlay.rgb, 1.0 - overlay.shines_through
     return rgba
-
-
-def centroid(plane: np.ndarray) -> tuple[float, float]:
-    columns, rows = np.meshgrid(np.arange(plane.shape[1]) + 0.5, np.arange(plane.shape[0]) + 0.5)
-    return float((plane * columns).sum() / plane.sum()), float((plane * rows).sum() / plane.sum())
 
 
 def placed(rgba: np.ndarray, right_px: int = 0, down_px: int = 0) -> np.ndarray:

@@ -100,11 +100,6 @@ def test_a_mistake_is_one_sentence_that_names_it(tmp_path: Path, text: str, told
     assert told in str(caught.value) and "scene.toml" in str(caught.value)
 
 
-def test_no_file_at_all(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="expected a scene file"):
-        read_scene_file(tmp_path / "no.toml")
-
-
 def test_the_example_in_the_documentation_reads_with_all_that_it_comments_out(tmp_path: Path) -> None:
     text = (ROOT / "docs" / "viewfinder_scene.toml").read_text(encoding="utf-8")
     for name in ("studio.hdr", "lens.json", "in_front.png"):

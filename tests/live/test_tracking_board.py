@@ -7,7 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from datasets_scripts.charuco_clip import HandHeld, Sheet, pack_table, trace_sheet
 from mrbokeh.images.color import display_rgb8
@@ -24,8 +23,8 @@ from mrbokeh.tracking.charuco.board import (
     read_board,
     write_board,
 )
-from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners
-from tests.scenes.traced_board_clip import BOARD
+from mrbokeh.tracking.charuco.detector import CharucoDetector
+from tests.scenes.traced_board_clip import BOARD, tilted_views
 from viewfinder.tracking.printed_board import MARGIN_MM, BoardView, page_for, plan_board, write_board_pdf
 
 SIMPLE = CharucoBoard((CharucoGrid((5, 4), 24.0, 18.0),))
@@ -38,12 +37,6 @@ def rasterised(rectangles_mm: np.ndarray, size_mm: tuple[float, float], px_per_m
     for x, y, width, height in (rectangles_mm * px_per_mm).round().astype(int):
         picture[y : y + height, x : x + width] = 0
     return picture
-
-
-def test_the_drawing_is_opencvs() -> None:
-    """Squares of 48 px, cells of 6 px: OpenCV's own drawing has nothing to round."""
-    theirs = SIMPLE.opencv_board(0).generateImage((240, 192), marginSize=0)
-    np.testing.assert_array_equal(rasterised(black_rectangles_mm(SIMPLE), (120.0, 96.0), 2), theirs)
 
 
 def test_corners_lie_where_opencv_has_them() -> None:
@@ -197,27 +190,6 @@ def test_where_no_paper_helps_the_plan_says_so() -> None:
         BoardView(Lens(50.0, 1.8, 0.8, 36.0), 1.5, 1.2, 1280)
 
 
-def seen_from_all_sides(board: CharucoBoard) -> list[Corners]:
-    """24 views by OpenCV's own formula, tilted by up to 40 degrees about x and y in turn, with noise of 0.1 px."""
-    rng, matrix, middle = (
-        np.random.default_rng(0),
-        np.array([[600.0, 0, 319.5], [0, 600.0, 179.5], [0, 0, 1]]),
-        board.corners_m.mean(axis=0),
-    )
-    seen = []
-    for index, tilt_deg in enumerate(np.linspace(-40.0, 40.0, 24)):
-        turn = Rotation.from_euler("yx"[index % 2], tilt_deg, degrees=True)
-        shift = np.array([0.0, 0.0, 0.6]) - turn.apply(middle)
-        xy = cv2.projectPoints(board.corners_m, turn.as_rotvec(), shift, matrix, None)[0].reshape(-1, 2).astype(np.float64)
-        seen.append(Corners(np.arange(len(xy)), xy + 0.5 + rng.normal(0.0, 0.1, xy.shape)))
-    return seen
-
-
-def coarse_only(board: CharucoBoard) -> CharucoBoard:
-    """What is read of it where the blur is strongest."""
-    return CharucoBoard(board.grids[:1])
-
-
 @pytest.mark.parametrize(
     ("view", "corners"),
     [
@@ -229,8 +201,9 @@ def coarse_only(board: CharucoBoard) -> CharucoBoard:
 def test_a_planned_board_keeps_enough_corners_to_calibrate_by(view: BoardView, corners: int) -> None:
     plan = plan_board(view)
     assert plan.board is not None and np.bincount(plan.board.grid_of_corner)[0] == corners and "--calibrate" not in plan.sentence
-    coarse = coarse_only(plan.board)
-    found = calibrated(coarse, seen_from_all_sides(coarse), 640, 360)
+    # What is read of it where the blur is strongest.
+    coarse = CharucoBoard(plan.board.grids[:1])
+    found = calibrated(coarse, tilted_views(coarse, np.linspace(-40.0, 40.0, 24), 0.6), 640, 360)
     assert found.camera.focal_px[0] == pytest.approx(600.0, rel=0.02)
 
 
@@ -239,4 +212,4 @@ def test_a_planned_board_with_too_few_corners_to_calibrate_by_says_so() -> None:
     assert plan.board is not None and len(plan.board.corners_m) == 6
     assert plan.sentence.endswith("its 6 corners are too few for `mrbokeh track clip --calibrate` (8): give it --camera")
     with pytest.raises(InputError, match="only 0 frames show 8 corners"):
-        calibrated(plan.board, seen_from_all_sides(plan.board), 640, 360)
+        calibrated(plan.board, tilted_views(plan.board, np.linspace(-40.0, 40.0, 24), 0.6), 640, 360)

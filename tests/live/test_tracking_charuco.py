@@ -18,8 +18,8 @@ from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners, FrameHis
 from mrbokeh.tracking.charuco.pose_branches import PoseBranches, PoseFit
 from mrbokeh.tracking.charuco.pose_from_points import poses_from_plane
 from mrbokeh.video.clip import read_display_frames
-from tests.scenes.immediate_detections import ImmediateDetections
-from tests.scenes.traced_board_clip import BOARD, LENS, camera_frames, clip_of, pose_error, small_clip
+from tests.scenes.told_parts import ImmediateDetections
+from tests.scenes.traced_board_clip import BOARD, LENS, camera_frames, clip_of, grey_of, pose_error, small_clip
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.charuco_tracker import GRACE_S, CharucoTracker, DetectionThread
 from viewfinder.tracking.tracker import TrackedPose
@@ -34,10 +34,6 @@ class CountingDetector:
     def detect(self, grey: Grey) -> Corners:
         self.searches += 1
         return self._detector.detect(grey)
-
-
-def grey_of(frame: CameraFrame) -> Grey:
-    return cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY)
 
 
 def tracked(every: int) -> tuple[list[TrackedPose | None], CountingDetector]:

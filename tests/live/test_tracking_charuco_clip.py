@@ -25,10 +25,10 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.charuco.board import black_rectangles_mm, write_board
 from mrbokeh.tracking.charuco.board_alignment import AlignedDetector, aligned_corners
-from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners, Grey
+from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners
 from mrbokeh.video.clip import read_frames
-from tests.scenes.immediate_detections import ImmediateDetections
-from tests.scenes.traced_board_clip import BOARD, LENS, camera_frames, clip_of, pose_error, small_clip
+from tests.scenes.told_parts import ImmediateDetections
+from tests.scenes.traced_board_clip import BOARD, LENS, camera_frames, clip_of, grey_of, pose_error, small_clip
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.charuco_tracker import CharucoTracker
 
@@ -133,10 +133,6 @@ def test_a_file_without_rectangles_is_refused(tmp_path: Path) -> None:
 def out_of_focus() -> tuple[CameraFrame, Camera]:
     """f/1.4 focused behind the board: circles of 6 px, in which only the coarse markers are read."""
     return next(camera_frames(clip_of(1024, 576, 1, replace(LENS, f_number=1.4, focus_distance_m=0.75))))
-
-
-def grey_of(frame: CameraFrame) -> Grey:
-    return cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY)
 
 
 def off_px(corners: Corners, true: Camera) -> float:

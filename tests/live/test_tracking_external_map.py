@@ -14,8 +14,8 @@ import pytest
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import inverted, rigid
-from tests.scenes.immediate_detections import ImmediateDetections
 from tests.scenes.textured_room import FOCAL_PX, HEIGHT_PX, WIDTH_PX, picture, room_camera, similarity
+from tests.scenes.told_parts import ImmediateDetections
 from tests.scenes.waiting import wait_until
 from viewfinder.frames import CameraFrame, Pose
 from viewfinder.tracking.map_tracker import MapLocaliser, MapTracker, matches, pose_in_map, pose_refined

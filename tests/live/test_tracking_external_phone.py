@@ -1,7 +1,7 @@
 """A phone on the camera: calibrated from pairs of poses, applied to any tracker's poses."""
 
-import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from threading import Event
 
@@ -11,7 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.world_axes import inverted
+from tests.scenes.phone_on_camera import CAMERA_FROM_PHONE, rig_error
+from tests.scenes.told_parts import ToldCamera, ToldTracker
+from tests.scenes.waiting import wait_until
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.phone_rig import (
     PhoneRig,
@@ -25,8 +27,6 @@ from viewfinder.tracking.phone_rig import (
 from viewfinder.tracking.phone_tracker import PhoneTracker
 from viewfinder.tracking.tracker import TrackedPose
 
-# The phone 8 cm above the lens, 3 cm to its left, a little askew.
-CAMERA_FROM_PHONE = rigid_of(np.array([0.05, -0.02, 0.03, -0.03, -0.08, 0.02]))
 INTRINSICS = Camera(64, 48, (60.0, 60.0), (32.0, 24.0))
 
 
@@ -46,15 +46,9 @@ def pairs(count: int, rng: np.random.Generator, turn_deg: float = 0.0, shift_m: 
     return result
 
 
-def off(rig: PhoneRig) -> tuple[float, float]:
-    """(degrees, mm) by which it misses the truth."""
-    error = rig.camera_from_phone @ inverted(CAMERA_FROM_PHONE)
-    return angle_deg(error), 1000 * float(np.linalg.norm(error[:3, 3]))
-
-
 def test_exact_pairs_give_the_rig_back() -> None:
     rig = calibrate_rig(pairs(8, np.random.default_rng(0)))
-    assert off(rig) == (pytest.approx(0.0, abs=1e-4), pytest.approx(0.0, abs=1e-3))
+    assert rig_error(rig.camera_from_phone) == (pytest.approx(0.0, abs=1e-4), pytest.approx(0.0, abs=1e-3))
     assert rig.residual_deg < 1e-3 and rig.residual_mm < 1e-2 and rig.pairs == 8
 
 
@@ -65,7 +59,7 @@ def test_noise_averages_out_and_is_stated() -> None:
     the residual is near sqrt(3 * 2) (0.2 degrees; and 2 mm with what turns of the pose do to a place that far away).
     """
     rig = calibrate_rig(pairs(40, np.random.default_rng(1), 0.2, 0.002))
-    degrees, millimetres = off(rig)
+    degrees, millimetres = rig_error(rig.camera_from_phone)
     assert degrees < 0.16 and millimetres < 2.5
     assert rig.residual_deg == pytest.approx(0.2 * np.sqrt(6), rel=0.25)
 
@@ -73,7 +67,7 @@ def test_noise_averages_out_and_is_stated() -> None:
 def test_one_wrong_pair_does_little() -> None:
     good = pairs(20, np.random.default_rng(2), 0.05, 0.0005)
     wrong = PosePair(good[0].phone_from_world, rigid_of(np.array([0.1, 0.0, 0.0, 0.02, 0.0, 0.0])) @ good[0].camera_from_world)
-    degrees, millimetres = off(calibrate_rig([*good, wrong]))
+    degrees, millimetres = rig_error(calibrate_rig([*good, wrong]).camera_from_phone)
     # The plain mean would be off by 5.7 / 21 degrees.
     assert degrees < 0.1 and millimetres < 2.0
 
@@ -98,81 +92,51 @@ def test_rig_file(tmp_path: Path) -> None:
             read_phone_rig(tmp_path / "wrong.json")
 
 
-class Phone:
-    """Gives frames at the times told, then waits for its end."""
-
-    name, status = "test phone", None
-
-    def __init__(self, times_s: list[float]) -> None:
-        self.times_s, self.shown = times_s, Event()
-
-    def frames(self, stopping: Event) -> Iterator[CameraFrame]:
-        for number, time_s in enumerate(self.times_s):
-            yield CameraFrame(np.zeros((48, 64, 3), np.uint8), time_s, number)
-        self.shown.set()
-        stopping.wait(10.0)
-
-
-class Slides:
-    """A tracker of a phone that moves 1 m to the right each second, and loses itself after 2 s."""
-
-    name = "slides"
-
-    def __init__(self) -> None:
-        self.closed, self.sizes = False, set[tuple[int, int]]()
-
-    def track(self, frame: CameraFrame, intrinsics: Camera) -> TrackedPose | None:
-        self.sizes.add((intrinsics.width_px, intrinsics.height_px))
-        if frame.captured_s > 2.0:
-            return None
-        return TrackedPose(phone_at(frame.captured_s), 0.8, frame.captured_s, 0.5, 20)
-
-    def close(self) -> None:
-        self.closed = True
-
-
 def phone_at(time_s: float) -> np.ndarray:
     return rigid_of(np.array([0.0, 0.0, 0.0, -time_s, 0.0, 1.0]))
 
 
+def slides(frame: CameraFrame) -> TrackedPose | None:
+    """A phone that moves 1 m to the right each second, and loses itself after 2 s."""
+    return TrackedPose(phone_at(frame.captured_s), 0.8, frame.captured_s, 0.5, 20) if frame.captured_s <= 2.0 else None
+
+
 def test_tracker_of_the_phone() -> None:
-    phone, slides = Phone([0.1 * step for step in range(40)]), Slides()
-    tracker = PhoneTracker(phone, slides, INTRINSICS.resized(640, 480), PhoneRig(CAMERA_FROM_PHONE, 0.1, 1.0, 9), hold_s=0.2)
-    try:
-        assert phone.shown.wait(10.0)
+    shown, by_board = Event(), ToldTracker(slides)
 
-        def at(time_s: float) -> TrackedPose | None:
-            return tracker.track(CameraFrame(np.zeros((4, 4, 3), np.uint8), time_s, 0), INTRINSICS)
+    def frames(stopping: Event) -> Iterator[CameraFrame]:
+        for number in range(40):
+            yield CameraFrame(np.zeros((48, 64, 3), np.uint8), 0.1 * number, number)
+        shown.set()
+        stopping.wait(10.0)
 
+    def at(time_s: float) -> TrackedPose | None:
+        return tracker.track(CameraFrame(np.zeros((4, 4, 3), np.uint8), time_s, 0), INTRINSICS)
+
+    rig = PhoneRig(CAMERA_FROM_PHONE, 0.1, 1.0, 9)
+    with closing(PhoneTracker(ToldCamera(frames), by_board, INTRINSICS.resized(640, 480), rig, hold_s=0.2)) as tracker:
+        assert shown.wait(10.0)
         found = at(1.234)
-        assert found is not None and found.quality == 0.8 and found.captured_s == 1.234
+        assert found.quality == 0.8 and found.captured_s == 1.234
         assert found.camera_from_world == pytest.approx(CAMERA_FROM_PHONE @ phone_at(1.234))
         tracker.video_delay_s = 0.1
-        delayed = at(1.234)
-        assert delayed is not None and delayed.camera_from_world == pytest.approx(CAMERA_FROM_PHONE @ phone_at(1.134))
+        assert at(1.234).camera_from_world == pytest.approx(CAMERA_FROM_PHONE @ phone_at(1.134))
         assert tracker.phone_pose(1.234) == pytest.approx(phone_at(1.134))
         tracker.video_delay_s = 0.0
-        held = at(2.1)
-        assert held is not None and held.quality == pytest.approx(0.4, abs=0.01)  # 0.1 of 0.2 s after the last pose
+        assert at(2.1).quality == pytest.approx(0.4, abs=0.01)  # 0.1 of 0.2 s after the last pose
         assert at(2.21) is None and tracker.phone_pose(2.1) is None
         tracker.rig = None
         assert at(1.0) is None
-    finally:
-        tracker.close()
-    assert slides.closed and slides.sizes == {(64, 48)} and not tracker._thread.is_alive()
+    assert by_board.closed and by_board.sizes == {(64, 48)} and not tracker._thread.is_alive()
 
 
 def test_a_phone_that_fails_says_so() -> None:
-    class Unplugged(Phone):
-        def frames(self, stopping: Event) -> Iterator[CameraFrame]:  # noqa: ARG002
-            yield from ()
-            raise InputError("the phone went away")
+    def unplugged(_: Event) -> Iterator[CameraFrame]:
+        yield from ()
+        raise InputError("the phone went away")
 
-    tracker = PhoneTracker(Unplugged([]), Slides(), INTRINSICS, None)
-    deadline = time.monotonic() + 5.0
-    while tracker.failure is None and time.monotonic() < deadline:
-        time.sleep(0.01)
-    tracker.close()
+    with closing(PhoneTracker(ToldCamera(unplugged), ToldTracker(slides), INTRINSICS, None)) as tracker:
+        wait_until(lambda: tracker.failure is not None)
     assert tracker.failure == "the phone went away"
 
 

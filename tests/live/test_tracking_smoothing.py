@@ -1,5 +1,6 @@
 """The 1-Euro filter on poses, against what was simulated for it: steady at rest, hardly late in a pan; and a camera on a tripod."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.errors import InputError
+from tests.scenes.told_parts import ToldTracker
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.smoothing import OneEuroPose, SmoothedTracker
 from viewfinder.tracking.tracker import TrackedPose, read_fixed_pose
@@ -90,46 +92,31 @@ def test_turning_about_the_board_keeps_the_pivot_still() -> None:
         np.testing.assert_allclose(given[:3, :3] @ pivot + given[:3, 3], (0.0, 0.0, 0.8), atol=1e-12)
 
 
-class Scripted:
-    """A tracker that gives what it was told to."""
-
-    name = "scripted"
-
-    def __init__(self, poses: list[TrackedPose | None]) -> None:
-        self._poses, self.closed = iter(poses), False
-
-    def track(self, frame: CameraFrame, intrinsics: Camera) -> TrackedPose | None:  # noqa: ARG002
-        return next(self._poses)
-
-    def close(self) -> None:
-        self.closed = True
-
-
 FRAME = CameraFrame(np.zeros((4, 4, 3), np.uint8), 0.0, 0)
 CAMERA = Camera(4, 4, (4.0, 4.0), (2.0, 2.0))
 
 
+def given(poses: list[TrackedPose | None]) -> ToldTracker:
+    left = iter(poses)
+    return ToldTracker(lambda _: next(left))
+
+
 def test_off_is_the_default_and_changes_nothing() -> None:
     poses = [TrackedPose(pose, 0.8, number / FPS) for number, pose in enumerate(noisy(1, 0.0, 4))]
-    tracker = SmoothedTracker(Scripted(list(poses)))
-    assert tracker.name == "scripted" and [tracker.track(FRAME, CAMERA) for _ in poses] == poses
+    tracker = SmoothedTracker(given(poses))
+    assert tracker.name == "told" and [tracker.track(FRAME, CAMERA) for _ in poses] == poses
 
 
 def test_after_a_loss_it_begins_anew() -> None:
     first, later = TrackedPose(panned(0.0), 0.8, 0.0), TrackedPose(panned(10.0), 0.8, 0.1)
-    inner = Scripted([first, None, later, replaced_time(first, 0.2)])
+    inner = given([first, None, later, replace(first, captured_s=0.2)])
     tracker = SmoothedTracker(inner, smoothing=True)
-    assert tracker.track(FRAME, CAMERA) is not None and tracker.track(FRAME, CAMERA) is None
-    again, back = tracker.track(FRAME, CAMERA), tracker.track(FRAME, CAMERA)
-    assert again is not None and back is not None
+    once, lost, again, back = (tracker.track(FRAME, CAMERA) for _ in range(4))
+    assert once is not None and lost is None
     np.testing.assert_allclose(again.camera_from_world, later.camera_from_world, atol=1e-12)
     assert abs(x_px(back.camera_from_world)) > 1.0 and back.quality == 0.8
     tracker.close()
     assert inner.closed
-
-
-def replaced_time(pose: TrackedPose, captured_s: float) -> TrackedPose:
-    return TrackedPose(pose.camera_from_world, pose.quality, captured_s)
 
 
 def test_a_pose_that_is_given_again_is_not_filtered_in() -> None:

@@ -19,7 +19,7 @@ from mrbokeh.tracking.charuco.detector import Corners
 from mrbokeh.tracking.charuco.pose_branches import CERTAIN_DEG, PoseBranches, PoseFit, fits_of_shot
 from mrbokeh.tracking.charuco.pose_from_points import PlanePoses, poses_from_plane, turn_between_rad
 from tests.live.test_tracking_charuco import pose_from_plane
-from tests.scenes.immediate_detections import ImmediateDetections
+from tests.scenes.told_parts import ImmediateDetections
 from tests.scenes.traced_board_clip import BOARD, camera_frames
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.charuco_tracker import CharucoTracker
@@ -164,9 +164,7 @@ def test_a_single_frame_that_leaves_it_open_says_so() -> None:
 
 def poses_of_frame(camera_from_world: np.ndarray, noise_px: float = 0.1, seed: int = 0) -> PlanePoses:
     exact = replace(CAMERA, camera_from_world=camera_from_world).project(SMALL.corners_m)[0]
-    found = poses_from_plane(SMALL.corners_m, exact + np.random.default_rng(seed).normal(0.0, noise_px, exact.shape), CAMERA)
-    assert found is not None
-    return found
+    return poses_from_plane(SMALL.corners_m, exact + np.random.default_rng(seed).normal(0.0, noise_px, exact.shape), CAMERA)
 
 
 def tilted(tilt_deg: float, distance_m: float) -> np.ndarray:

@@ -1,6 +1,5 @@
 """`mrbokeh viewfinder` and `mrbokeh viewfinder board` as their user meets them: refusals, starting, ending, and what they leave behind."""
 
-import asyncio
 import json
 import os
 import re
@@ -22,9 +21,7 @@ from typing import Any
 import aiohttp
 import numpy as np
 import pytest
-import typer
 from typer.main import get_command
-from typer.testing import CliRunner
 
 from mrbokeh.cli import SUB_COMMANDS
 from mrbokeh.images.image_io import write_layer
@@ -35,17 +32,15 @@ from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, read_board, write_board
+from tests.scenes.command_line import printed_by
+from tests.scenes.layer_viewfinder import watching
 from tests.scenes.phone_on_camera import PHONE
 from tests.scenes.thin_lens_board import Shot, camera_over, display_bgr, photograph
 from viewfinder.app.running import opened
 from viewfinder.cli import board_command
-from viewfinder.focus.sources import FrameFocus, ManualFocus, open_focus
-from viewfinder.frames import CameraFrame, LensState
-from viewfinder.options import ListeningOptions, TrackingOptions, ViewfinderOptions
+from viewfinder.frames import CameraFrame
+from viewfinder.options import TrackingOptions, ViewfinderOptions
 from viewfinder.server.access import Access
-from viewfinder.server.endpoint import Endpoint, open_endpoint
-from viewfinder.server.sessions import Role, Sessions
-from viewfinder.tracking.tracker import TrackedPose
 
 ROOT = Path(__file__).resolve().parents[2]
 DOC = ROOT / "docs" / "viewfinder.md"
@@ -141,10 +136,17 @@ def test_what_cannot_be_is_refused_before_a_camera_is_opened(folder: Path) -> No
 
 
 def test_a_refusal_is_one_sentence_and_code_2(folder: Path) -> None:
-    with command(folder, "--renderer", "magic") as process:
-        output, errors = process.communicate(timeout=60)
-    assert (process.returncode, output) == (2, "")
-    assert errors.startswith("error: --renderer: expected one of polygon") and "Traceback" not in errors
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        for words, sentence in (
+            (("--renderer", "magic"), "--renderer: expected one of polygon"),
+            (("--port", str(taken.getsockname()[1])), "choose another one with --port"),
+        ):
+            with command(folder, *words) as process:
+                output, errors = process.communicate(timeout=60)
+            assert (process.returncode, output) == (2, "")
+            assert errors.startswith("error: ") and sentence in errors and "Traceback" not in errors
 
 
 @contextmanager
@@ -179,28 +181,23 @@ opening.open_source = slowly
 def test_ctrl_c_while_it_starts_ends_it_cleanly(folder: Path) -> None:
     """While the camera is being opened; the tracker's and the layer's threads run by then."""
     with command(folder, "--board", "board.json", before=_SLOW_CAMERA) as process:
-        assert process.stdout is not None and process.stdout.readline() == "opening\n"
+        assert process.stdout.readline() == "opening\n"
         process.send_signal(signal.SIGINT)
         output, errors = process.communicate(timeout=30)
     assert (process.returncode, output, errors) == (0, "viewfinder stopped\n", "")
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM for another process")
-def test_all_that_is_written_goes_to_the_captures(folder: Path) -> None:
+async def test_all_that_is_written_goes_to_the_captures(folder: Path) -> None:
     """A capture and a recording, and nothing else is new in the folder where it ran."""
     before = {path.name for path in folder.iterdir()}
-
-    async def work(url: str) -> None:
+    with command(folder, "--captures", "shots/today") as process:
+        url = url_of(process)
         async with aiohttp.ClientSession() as session, session.ws_connect(url + "stream") as stream:
             await stream.receive(timeout=20)
             for message in ({"record": True}, {"capture": {}}, {"record": False}):
                 async with session.post(url + "control", json=message) as answer:
                     assert answer.status == 200, await answer.text()
-
-    with command(folder, "--captures", "shots/today") as process:
-        assert process.stdout is not None
-        url = next(word for word in process.stdout.readline().split() if word.startswith("http://"))
-        asyncio.run(asyncio.wait_for(work(url), 60.0))
         process.send_signal(signal.SIGTERM)
         output, errors = process.communicate(timeout=30)
     assert (process.returncode, output, errors) == (0, "viewfinder stopped\n", "")
@@ -208,6 +205,28 @@ def test_all_that_is_written_goes_to_the_captures(folder: Path) -> None:
     assert [path.name for path in (folder / "shots").iterdir()] == ["today"]
     kept = sorted(path.suffix for path in (folder / "shots" / "today").iterdir())
     assert "" in kept, "the bundle is a folder"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for another process")
+async def test_the_command_serves_until_ctrl_c(folder: Path) -> None:
+    with command(folder) as process:
+        url = url_of(process)
+        assert url.startswith("http://127.0.0.1:")
+        async with watching(url) as viewer, aiohttp.ClientSession() as session:
+            assert (await viewer.frame()).bgr.shape == (HEIGHT_PX, WIDTH_PX, 3)
+            async with session.get(url) as page:
+                assert "viewport" in await page.text()
+            process.send_signal(signal.SIGINT)
+            while (await viewer.stream.receive(timeout=5)).type is aiohttp.WSMsgType.BINARY:
+                pass
+            assert viewer.stream.close_code == aiohttp.WSCloseCode.GOING_AWAY
+        output, errors = process.communicate(timeout=10)
+    assert (process.returncode, output, errors) == (0, "viewfinder stopped\n", "")
+
+
+def url_of(process: "subprocess.Popen[str]") -> str:
+    """The address that the command prints."""
+    return next(word for word in process.stdout.readline().split() if word.startswith("http://"))
 
 
 def test_a_part_that_fails_closes_those_before_it(folder: Path) -> None:
@@ -234,45 +253,19 @@ def test_a_browser_camera_behind_a_layer_can_be_sent(folder: Path) -> None:
         assert "whip" in running.site.parts
 
 
-def test_what_is_printed_for_a_network(capsys: pytest.CaptureFixture[str]) -> None:
-    """The QR code is drawn with half blocks, as long as nobody asks for none. A token that was used is followed by the next."""
-    sessions = Sessions()
-    url = "https://10.0.0.1:8080/"
-    for qr in (True, False):
-        endpoint = Endpoint(ListeningOptions(lan=True, qr=qr), "10.0.0.1", None, Access(sessions=sessions))
-        endpoint.announce("viewfinder of x", url)
-        endpoint.announce_camera(url)
-        shown = capsys.readouterr().out
-        assert ("\u2588" in shown or "\u2584" in shown) == qr
-        assert f"to control, for one device: {url}#token={sessions.invitation(Role.CONTROL)}" in shown
-        assert f"to send a camera from a browser: {url}camera#token={sessions.standing_token(Role.CONTROL)}" in shown
-        assert f"{url}whip with the bearer token {sessions.standing_token(Role.CONTROL)}" in shown
-    used = sessions.invitation(Role.CONTROL)
-    assert sessions.enter(used) is not None
-    assert f"#token={sessions.invitation(Role.CONTROL)}" in capsys.readouterr().out != used
-    alone = open_endpoint(ListeningOptions())
-    alone.announce("viewfinder of x", "http://127.0.0.1:8080/")
-    assert capsys.readouterr().out == "viewfinder of x: http://127.0.0.1:8080/ (Ctrl-C stops it)\n"
-
-
-boards = typer.Typer()
-boards.command()(board_command)
-
-
 def test_a_board_to_print(tmp_path: Path) -> None:
     """The markers span six blurs: at f/2.8 and half a dioptre from the focus the blur of this lens is 17 px of 1280."""
     write_lens(tmp_path / "lens.json", LENS)
     out = tmp_path / "board.pdf"
-    words = ["--lens", str(tmp_path / "lens.json"), "--distance-m", "0.8,1.2", "--out", str(out)]
-    done = CliRunner().invoke(boards, words)
-    assert done.exit_code == 0, done.exception
-    assert "print it at 100 %" in done.output and "blurs" in done.output
+    words = ["--lens", tmp_path / "lens.json", "--distance-m", "0.8,1.2", "--out", out]
+    told = printed_by(board_command, *words)
+    assert "print it at 100 %" in told and "blurs" in told
     assert out.read_bytes().startswith(b"%PDF")
     marker_px = LENS.focused_at(1.2).focal_px(1280) * read_board(tmp_path / "board.json").grids[0].marker_mm / 1000 / 0.8
     assert marker_px >= 6.0 * abs(float(LENS.coc_px(0.8, 1280)))
-    again = CliRunner().invoke(boards, words)
-    assert isinstance(again.exception, InputError) and "--overwrite" in str(again.exception)
-    assert CliRunner().invoke(boards, [*words, "--overwrite"]).exit_code == 0
+    with pytest.raises(InputError, match="--overwrite"):
+        printed_by(board_command, *words)
+    printed_by(board_command, *words, "--overwrite")
 
 
 @pytest.mark.parametrize(
@@ -288,41 +281,9 @@ def test_a_board_to_print(tmp_path: Path) -> None:
 def test_boards_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], sentence: str) -> None:
     monkeypatch.chdir(tmp_path)
     write_lens(tmp_path / "lens.json", replace(LENS, f_number=1.0))
-    done = CliRunner().invoke(boards, words)
-    assert isinstance(done.exception, InputError) and sentence in str(done.exception)
+    with pytest.raises(InputError, match=re.escape(sentence)):
+        printed_by(board_command, *words)
     assert [path.name for path in tmp_path.iterdir()] == ["lens.json"]
-
-
-class Told:
-    """Knows one focus."""
-
-    name = "blur of the board"
-
-    def state(self, frame: CameraFrame, pose: TrackedPose | None) -> LensState:  # noqa: ARG002
-        return LensState(0.9)
-
-    def close(self) -> None:
-        """Nothing runs."""
-
-
-def test_who_is_asked_first_for_the_focus() -> None:
-    """By hand 3 m, the frame says 2 m; the board's 0.9 m counts only where it is named."""
-    frame = CameraFrame(np.zeros((4, 6, 3), np.uint8), 1.0, 0, LensState(2.0, 4.0))
-    manual = ManualFocus(LensState(3.0))
-    expected: dict[tuple[str, ...], tuple[float, str]] = {
-        (): (3.0, manual.name),
-        ("source",): (2.0, FrameFocus.name),
-        ("source", "hand"): (2.0, FrameFocus.name),
-        ("hand", "source"): (3.0, manual.name),
-        ("board",): (0.9, Told.name),
-        ("hand", "board"): (3.0, manual.name),
-    }
-    for first, (metres, name) in expected.items():
-        focus = open_focus(manual, None, first, Told() if "board" in first else None)
-        assert (focus.state(frame, None), focus.focus_from) == (LensState(metres, 4.0), name), first
-    manual.focus(None)
-    focus = open_focus(manual, None, ("hand", "board"), Told())
-    assert focus.state(frame, None).focus_distance_m == 0.9, "what nobody set by hand comes from the next"
 
 
 @cache
@@ -420,9 +381,5 @@ def test_the_guide_names_every_option_and_only_files_that_exist() -> None:
     options = {option for parameter in group.params for option in parameter.opts if option.startswith("--")}
     missing = {option for option in options - {"--help", "--method"} if option not in text}
     assert not missing, missing
-    for target in _links(text):
-        assert (DOC.parent / target).exists(), target
-
-
-def _links(text: str) -> list[str]:
-    return [target for target in re.findall(r"\]\(([^)#]+)\)", text) if "://" not in target]
+    for target in re.findall(r"\]\(([^)#]+)\)", text):
+        assert "://" in target or (DOC.parent / target).exists(), target

@@ -2,19 +2,18 @@
 
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mrbokeh.compositing.overlay import Overlay
-from mrbokeh.optics.camera import Camera
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 from tests.scenes.layer_viewfinder import HEIGHT, LENS, WIDTH, bright_square
 from tests.scenes.stage_scenes import LENS as SCENE_LENS
 from tests.scenes.stage_scenes import ONE_CARD, backend, camera, scene_file
+from tests.scenes.told_parts import ToldTracker
 from viewfinder.app.live_compositor import LiveCompositor
 from viewfinder.app.live_controls import Captures
 from viewfinder.app.opening import LensBook, Parts
@@ -26,22 +25,6 @@ from viewfinder.stage.stage import FADE_S, Stage
 from viewfinder.stage.static_layer import StaticLayer
 from viewfinder.tracking.smoothing import SmoothedTracker
 from viewfinder.tracking.tracker import TrackedPose
-
-
-class Saying:
-    """A Tracker that says what it is told to."""
-
-    name = "told"
-
-    def __init__(self) -> None:
-        self.is_certain = True
-        self.pose = np.eye(4)
-
-    def track(self, frame: CameraFrame, intrinsics: Camera) -> TrackedPose | None:  # noqa: ARG002
-        return TrackedPose(self.pose, 0.2, frame.captured_s, is_certain=self.is_certain)
-
-    def close(self) -> None:
-        """Nothing runs."""
 
 
 @pytest.fixture
@@ -71,7 +54,7 @@ def test_an_unsure_pose_shows_nothing_at_first_and_fades_what_was_there(stage: S
 
 
 def test_the_page_is_told_and_nothing_is_captured(tmp_path: Path) -> None:
-    tracker = Saying()
+    tracker = ToldTracker(lambda frame: TrackedPose(np.eye(4), 0.2, frame.captured_s, is_certain=frame.sequence == 0))
     lenses = LensBook({"test": LENS})
     still = StaticLayer(bright_square(), LENS, ScatterReference(), "scatter")
     parts = Parts(ViewfinderOptions("test"), PatternSource(WIDTH, HEIGHT), still, lenses, {"scatter": ScatterReference})
@@ -80,7 +63,6 @@ def test_the_page_is_told_and_nothing_is_captured(tmp_path: Path) -> None:
     plate = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     try:
         certain = compositor(CameraFrame(plate, 1.0, 0), 0)
-        tracker.is_certain = False
         unsure = compositor(CameraFrame(plate, 2.0, 1), 0)
         with pytest.raises(InputError, match="pose is not known now"):
             captures.capture()
@@ -93,13 +75,11 @@ def test_the_page_is_told_and_nothing_is_captured(tmp_path: Path) -> None:
 
 def test_smoothing_does_not_glide_from_a_wrong_pose_to_the_right_one() -> None:
     """An unsure pose is given as it comes, and the next certain one, too."""
-    tracker = Saying()
-    smoothed = SmoothedTracker(tracker, smoothing=True)
-    frame = CameraFrame(np.zeros((4, 4, 3), np.uint8), 0.0, 0)
     wrong, right = np.eye(4), np.eye(4)
     wrong[:3, 3], right[:3, 3] = (0.0, 0.0, 1.0), (0.1, 0.0, 1.0)
-    for number, (pose, is_certain) in enumerate([(wrong, False), (wrong, False), (right, True)]):
-        tracker.pose, tracker.is_certain = pose, is_certain
-        given = smoothed.track(replace(frame, captured_s=number / 30.0, sequence=number), camera())
-        assert given is not None
+    poses = [wrong, wrong, right]
+    inner = ToldTracker(lambda frame: TrackedPose(poses[frame.sequence], 0.2, frame.captured_s, is_certain=frame.sequence == 2))
+    smoothed = SmoothedTracker(inner, smoothing=True)
+    for number, pose in enumerate(poses):
+        given = smoothed.track(CameraFrame(np.zeros((4, 4, 3), np.uint8), number / 30.0, number), camera())
         np.testing.assert_allclose(given.camera_from_world, pose, atol=1e-12)

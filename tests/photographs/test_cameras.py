@@ -4,19 +4,16 @@ import sys
 from pathlib import Path
 
 import pytest
-import typer
-from typer.testing import CliRunner
 
 import capture.tether.gphoto2_camera as cameras_module
 from capture.commands.cameras import cameras_command
 from capture.tether.gphoto2_config import explained
 from mrbokeh.system.errors import InputError, MissingExtraError
 from mrbokeh.system.gphoto2_library import library
+from tests.scenes.command_line import printed_by
 from tests.tether.test_gphoto2 import card, in_own_interpreter
 
 __all__ = ["card"]
-APP = typer.Typer()
-APP.command()(cameras_command)
 
 
 def test_the_table(card: Path) -> None:
@@ -29,9 +26,8 @@ def test_the_table(card: Path) -> None:
 
 def test_none_connected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cameras_module, "detected", list)
-    result = CliRunner().invoke(APP, [])
-    assert result.exit_code == 1
-    assert "no camera found" in result.output and "udev" in result.output and "PTP" in result.output
+    told = printed_by(cameras_command, exit_code=1)
+    assert "no camera found" in told and "udev" in told and "PTP" in told
 
 
 def test_several_connected(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -52,13 +48,13 @@ def test_a_camera_that_another_program_holds(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(cameras_module, "open_camera", held)
     found = cameras_module.list_cameras()
     assert found[0].description is None and "gvfs" in found[0].problem and "-53" in found[0].problem
-    assert "another program holds the camera" in " ".join(CliRunner().invoke(APP, [], env={"COLUMNS": "400"}).output.split())
+    assert "another program holds the camera" in " ".join(printed_by(cameras_command).split())
 
 
 def test_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "gphoto2", None)
     with pytest.raises(MissingExtraError, match=r"pip install 'mrbokeh\[tether\]'"):
-        CliRunner().invoke(APP, [], catch_exceptions=False)
+        printed_by(cameras_command)
     monkeypatch.setattr(sys, "platform", "win32")
     with pytest.raises(InputError, match=r"does not run on Windows.*folder:DIR"):
         library()

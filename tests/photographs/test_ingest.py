@@ -1,15 +1,22 @@
-"""Photographs into focal stacks: order, lens, camera, sizes, the command."""
+"""Photographs into focal stacks: what belongs to one, order, lens, camera, sizes, the command; odd ones are named or left out."""
 
+import math
+from collections.abc import Sequence
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 import pytest
 from jaxtyping import Float64
 from scipy.ndimage import gaussian_filter, uniform_filter
-from typer.testing import CliRunner
 
 from capture.cli import app
 from capture.commands.ingest import parse_white_balance
+from capture.photos.focus_metadata import FocusReading
+from capture.photos.photo_files import find_photos
+from capture.photos.photo_metadata import PhotoMetadata
+from capture.photos.sidecar import Sidecar
+from capture.stacks.grouping import Grouping, Photo, PhotoGroup, by_camera, group_photos, why_aside
 from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.stack_ingest import Development
 from datasets_scripts.made_sets.simulated_camera import SensorModel
@@ -17,7 +24,8 @@ from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import write_image
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.system.errors import InputError
-from tests.scenes.made_photographs import DISTANCES_M, LENS, defocused, make_raw_photo, make_shoot, only_stack, scene_rgb, sources
+from tests.scenes.command_line import printed_by
+from tests.scenes.made_photographs import DISTANCES_M, LENS, defocused, make_raw_photo, make_shoot, only_stack, scene_rgb, set_exif, sources
 
 
 @pytest.fixture
@@ -154,14 +162,9 @@ def test_folders_of_a_scene_become_stacks(tmp_path: Path) -> None:
 
 
 def test_the_command_prints_a_table(shoot: Path, tmp_path: Path) -> None:
-    result = CliRunner().invoke(
-        app, ["ingest", str(shoot), "--out", str(tmp_path / "scene"), "--white-balance", "4,2,3.2"], env={"COLUMNS": "160"}
-    )
-    assert result.exit_code == 0, result.output
-    assert "96x72" in result.output
-    assert "0.6 .. inf m" in result.output
-    assert "35 mm f/2.8" in result.output
-    assert "--white-balance 2,1,1.6" in result.output
+    told = printed_by(app, "ingest", shoot, "--out", tmp_path / "scene", "--white-balance", "4,2,3.2")
+    for part in ("96x72", "0.6 .. inf m", "35 mm f/2.8", "--white-balance 2,1,1.6"):
+        assert part in told
 
 
 def test_what_is_no_photograph_is_told_in_one_line(shoot: Path, tmp_path: Path) -> None:
@@ -170,9 +173,9 @@ def test_what_is_no_photograph_is_told_in_one_line(shoot: Path, tmp_path: Path) 
         (shoot / name).write_text("")
     named = sorted(shoot.glob("*.dng"))
     for given, told in (([shoot], "clip.mov, IMG_8.xmp, IMG_9.xmp, IMG_10.xmp, IMG_11.xmp ... (7 files)"), (named, None)):
-        result = CliRunner().invoke(app, ["ingest", *map(str, given), "--out", str(tmp_path / "scene")])
-        lines = [each for each in result.output.splitlines() if each.startswith("not photographs")]
-        assert result.exit_code == 0 and lines == ([] if told is None else [f"not photographs, left out: {told}"])
+        printed = printed_by(app, "ingest", *given, "--out", tmp_path / "scene")
+        lines = [each for each in printed.splitlines() if each.startswith("not photographs")]
+        assert lines == ([] if told is None else [f"not photographs, left out: {told}"])
     (shoot / "my.toml").write_text("")
     (tmp_path / "shoot" / "aside").mkdir()
     report = ingest([shoot], tmp_path / "scene", IngestSettings(sidecar=shoot / "my.toml"))
@@ -185,3 +188,163 @@ def test_white_balance_mistakes(text: str) -> None:
     assert parse_white_balance("4,2,3") == (2.0, 1.0, 1.5)
     with pytest.raises(InputError, match="--white-balance"):
         parse_white_balance(text)
+
+
+def photo(name: str, seconds: float | None = None, focus_m: float | None = None, camera: str | None = "A") -> Photo:
+    taken_at = None if seconds is None else datetime(2025, 1, 1) + timedelta(seconds=seconds)
+    focus = None if focus_m is None else FocusReading(focus_m, focus_m, focus_m, "lens", "test")
+    return Photo(Path(name), PhotoMetadata(taken_at=taken_at, focus=focus, camera_model=camera), Sidecar())
+
+
+def names(photos: Sequence[Photo]) -> list[str]:
+    return [each.path.name for each in photos]
+
+
+def test_group_by_time_splits_at_long_pauses() -> None:
+    """Shots 3 s apart with pauses of two minutes; names not in the order of time."""
+    seconds = {"b": 0, "a": 3, "c": 6, "d": 126, "e": 129, "f": 250}
+    groups = group_photos([("shoot", [photo(name, seconds=seconds[name]) for name in "abcdef"])], Grouping.time)
+    assert [(group.name, names(group.photos)) for group in groups] == [
+        ("shoot_00", ["b", "a", "c"]),
+        ("shoot_01", ["d", "e"]),
+        ("shoot_02", ["f"]),
+    ]
+
+
+def test_group_by_focus_splits_where_the_focus_turns() -> None:
+    """Two sweeps near to far (the second from the start again), one back; equal distances are no turn."""
+    distances_m = [0.5, 0.7, 0.7, 2.0, math.inf, 0.5, 0.7, 2.0, 1.0, 0.5]
+    photos = [photo(f"{index}", focus_m=distance) for index, distance in enumerate(distances_m)]
+    assert [names(group.photos) for group in group_photos([("s", photos)], Grouping.focus)] == [list("01234"), list("567"), list("89")]
+
+
+def test_group_by_folder_and_none() -> None:
+    folders = [("x", [photo("0")]), ("y", [photo("1")]), ("x", [photo("2")])]
+    assert [group.name for group in group_photos(folders, Grouping.folder)] == ["x", "y", "x_2"]
+    assert [names(group.photos) for group in group_photos(folders, Grouping.none)] == [["0", "1", "2"]]
+
+
+def test_grouping_needs_what_it_goes_by() -> None:
+    with pytest.raises(InputError, match="needs the time of each photograph, but b do not state it"):
+        group_photos([("s", [photo("a", seconds=0), photo("b")])], Grouping.time)
+    with pytest.raises(InputError, match="needs the focus distance of each photograph"):
+        group_photos([("s", [photo("a"), photo("b", focus_m=1.0)])], Grouping.focus)
+
+
+def test_a_camera_with_one_picture_lies_aside() -> None:
+    photos = (
+        photo("a.jpg"),
+        photo("b.jpg"),
+        photo("other.jpg", camera="B"),
+        photo("fused.jpg", camera=None),
+        photo("bad.dng", camera=None),
+    )
+    (group,) = by_camera(PhotoGroup("shoot", photos))
+    assert names(group.photos) == ["a.jpg", "b.jpg", "bad.dng"]
+    assert [(each.path.name, each.reason.split(",")[0]) for each in why_aside(group)] == [
+        ("other.jpg", "it was taken with B"),
+        ("fused.jpg", "it names no camera"),
+    ]
+
+
+def test_cameras_with_two_pictures_or_more_make_a_stack_each() -> None:
+    cameras = {"a": "A", "b": "Model B/2", "c": "A", "d": "Model B/2", "e": "A"}
+    groups = group_photos([("shoot", [photo(name, camera=camera) for name, camera in cameras.items()])], Grouping.folder)
+    assert [(group.name, names(group.photos)) for group in groups] == [("shoot", ["a", "c", "e"]), ("shoot_Model_B_2", ["b", "d"])]
+    assert all(
+        group.remarks == ("photographs of 2 cameras, a stack for each: shoot (A, 3), shoot_Model_B_2 (Model B/2, 2)",) for group in groups
+    )
+
+
+def test_cameras_with_one_picture_each_make_one_stack() -> None:
+    """Nothing is the usual one there, so nothing is thrown away."""
+    (group,) = by_camera(PhotoGroup("shoot", tuple(photo(name, camera=name.upper()) for name in "abc")))
+    assert (names(group.photos), group.aside) == (["a", "b", "c"], ())
+    assert group.remarks == ("its 3 photographs name 3 cameras, none of them twice: one stack",)
+
+
+def test_which_files_are_photographs(tmp_path: Path) -> None:
+    for name in ("b10.jpg", "b9.jpg", "a.CR2", "a.jpg", ".hidden.jpg", "notes.txt", "depth.exr"):
+        (tmp_path / name).write_text("")
+    (folder,), skipped = find_photos([tmp_path], tmp_path / "scene")
+    assert [path.name for path in folder.paths] == ["a.CR2", "b9.jpg", "b10.jpg"]
+    assert {each.path.name for each in skipped} == {"a.jpg", "depth.exr"}
+    (folder,), skipped = find_photos([tmp_path / "depth.exr", tmp_path / "notes.txt"], tmp_path / "scene")
+    assert [path.name for path in folder.paths] == ["depth.exr"]
+    assert [each.path.name for each in skipped] == ["notes.txt"]
+    with pytest.raises(InputError, match="there is nothing at"):
+        find_photos([tmp_path / "absent"], tmp_path / "scene")
+
+
+def test_damaged_files_are_named_and_the_rest_goes_on(shoot: Path, tmp_path: Path) -> None:
+    (shoot / "IMG_13.dng").write_text("just a text\n" * 99)
+    truncated = (shoot / "IMG_12.dng").read_bytes()
+    (shoot / "IMG_12.dng").write_bytes(truncated[: len(truncated) // 2])
+    (shoot / "IMG_14.jpg").write_bytes(b"\xff\xd8\xff\xe0 not a JPEG")
+    report = ingest([shoot], tmp_path / "scene")
+    stack = only_stack(report)
+    assert sources(stack) == ["IMG_9.dng", "IMG_10.dng", "IMG_8.dng", "IMG_11.dng"], "and they are in order of focus all the same"
+    assert [each.path for each in stack.slices] == [f"slices/{index:02d}.exr" for index in range(4)], "without a gap"
+    reasons = {each.path.name: each.reason for each in report.stacks[0].skipped}
+    assert set(reasons) == {"IMG_12.dng", "IMG_13.dng", "IMG_14.jpg"}
+    assert "cannot be decoded as RAW" in reasons["IMG_13.dng"]
+    assert {each["source"].split("/")[-1] for each in stack.metadata["skipped"]} == set(reasons)
+
+
+def test_a_jpeg_beside_a_broken_raw_is_not_dropped_without_a_word(shoot: Path, tmp_path: Path) -> None:
+    """Beside a good one it is what everybody expects; also when the stack was made before."""
+
+    for name in ("IMG_9.jpg", "IMG_10.jpg"):
+        write_image(shoot / name, scene_rgb(72, 96))
+    (shoot / "IMG_10.dng").write_bytes((shoot / "IMG_10.dng").read_bytes()[:3000])
+    for _ in range(2):
+        report = ingest([shoot], tmp_path / "scene")
+        reasons = {each.path.name: each.reason for each in report.skipped}
+        assert reasons["IMG_9.jpg"] == "the same shot as IMG_9.dng, which is RAW"
+        assert "IMG_10.dng, which is RAW but cannot be used: copy IMG_10.dng again, or move it elsewhere" in reasons["IMG_10.jpg"]
+    (shoot / "IMG_10.dng").rename(tmp_path / "IMG_10.dng")
+    set_exif(shoot / "IMG_10.jpg", Model="Simulated Bayer Camera")
+    assert "IMG_10.jpg" in sources(only_stack(ingest([shoot], tmp_path / "scene")))
+
+
+def test_nothing_usable_is_an_error(tmp_path: Path) -> None:
+    (tmp_path / "shoot").mkdir()
+    with pytest.raises(InputError, match="found none"):
+        ingest([tmp_path / "shoot"], tmp_path / "scene")
+    (tmp_path / "shoot" / "text.dng").write_text("just a text")
+    with pytest.raises(InputError, match=r"none of the 1 files .* text\.dng: it cannot be decoded"):
+        ingest([tmp_path / "shoot"], tmp_path / "scene")
+
+
+def test_a_picture_of_another_size_is_left_out(tmp_path: Path) -> None:
+    """Also when it is the first, from which exposure was taken: then the others are evened out among themselves."""
+    write_image(tmp_path / "shoot" / "0.png", np.minimum(scene_rgb(60, 64), 0.6))
+    for index, factor in ((1, 1.0), (2, 0.8)):
+        write_image(tmp_path / "shoot" / f"{index}.png", np.minimum(scene_rgb(48, 64), 0.6) * np.float32(factor))
+    report = ingest([tmp_path / "shoot"], tmp_path / "scene")
+    stack = only_stack(report)
+    assert sources(stack) == ["1.png", "2.png"]
+    assert [each.reason for each in report.stacks[0].skipped] == ["64x60 px, but most of its stack have 64x48 px"]
+    assert stack.metadata["exposure_reference"] == "1.png"
+    assert [each.metadata["exposure_gain"] for each in stack.slices] == pytest.approx([1.0, 1.25], rel=0.005)
+    assert len(list((stack.folder / "slices").iterdir())) == 2
+
+
+def test_one_photograph_is_a_stack_that_says_what_it_lacks(tmp_path: Path) -> None:
+    make_raw_photo(tmp_path / "shoot" / "0.dng", scene_rgb(24, 32), 0.6)
+    report = ingest([tmp_path / "shoot"], tmp_path / "scene")
+    assert len(only_stack(report)) == 1
+    assert any("a stack of 1 slice: merging needs at least 2" in remark for remark in report.stacks[0].remarks)
+
+
+def test_names_that_do_not_follow_the_time_are_remarked_where_focus_is_unknown(tmp_path: Path) -> None:
+    """IMG_8 .. IMG_12 are in order of time, natural sorting given; renamed they are not."""
+    shoot = make_shoot(tmp_path / "shoot", blur_px=1.0)
+    for path in shoot.iterdir():
+        set_exif(path, SubjectDistance="0/1")
+    report = ingest([shoot], tmp_path / "scene")
+    assert sources(only_stack(report)) == [f"IMG_{index}.dng" for index in range(8, 13)]
+    assert not any("not that in which they were taken" in remark for remark in report.stacks[0].remarks)
+    (shoot / "IMG_8.dng").rename(shoot / "IMG_99.dng")
+    report = ingest([shoot], tmp_path / "scene")
+    assert any("not that in which they were taken" in remark for remark in report.stacks[0].remarks)

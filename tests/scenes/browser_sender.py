@@ -2,6 +2,8 @@
 
 import asyncio
 import json
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from fractions import Fraction
 from typing import Any
 
@@ -57,3 +59,15 @@ class Sender:
             assert answer.content_type == "application/sdp"
             self.location = answer.headers["Location"]
         await self.peer.setRemoteDescription(aiortc.RTCSessionDescription(text, "answer"))
+
+
+@asynccontextmanager
+async def sending(url: str, track: Canvas, codec: str = "video/VP8") -> AsyncIterator[Sender]:
+    """A camera that sends, and hangs up at the end."""
+    sender = Sender(url, track, codec)
+    try:
+        async with aiohttp.ClientSession() as session:
+            await sender.start(session)
+        yield sender
+    finally:
+        await sender.peer.close()

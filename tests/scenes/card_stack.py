@@ -35,3 +35,10 @@ def make_card_stack(folder: Path, seed: int, focus_m: tuple[float, ...] = FOCUS_
         write_image(folder / slices[index].path, blurred.rgb, half=False)
     write_focal_stack(stack)
     return stack
+
+
+def make_card_scene(folder: Path) -> Path:
+    """Two viewpoints."""
+    for seed in range(2):
+        make_card_stack(folder / f"view_{seed}", seed)
+    return folder

@@ -1,12 +1,15 @@
-"""The command line called in this process, as a process of its own would answer: its code, what it prints and what it says of mistakes."""
+"""Commands called in this process: the whole command line, as a process of its own would answer, and single commands."""
 
 import contextlib
 import io
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 
 import pytest
+import typer
+from typer.testing import CliRunner
 
 from mrbokeh.cli import main
 
@@ -26,3 +29,14 @@ def mrbokeh(*arguments: object, **environment: str) -> subprocess.CompletedProce
         finally:
             signal.signal(signal.SIGINT, interrupt)
     return subprocess.CompletedProcess(words, code, out.getvalue(), err.getvalue())
+
+
+def printed_by(command: typer.Typer | Callable[..., None], *words: object, exit_code: int = 0, answer: str = "") -> str:
+    """What a command prints on a wide terminal, which must end with this exit code; what it raises is raised here."""
+    app = command
+    if not isinstance(app, typer.Typer):
+        app = typer.Typer()
+        app.command()(command)
+    result = CliRunner().invoke(app, [str(each) for each in words], input=answer, env={"COLUMNS": "400"}, catch_exceptions=False)
+    assert result.exit_code == exit_code, result.output
+    return result.output

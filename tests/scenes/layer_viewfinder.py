@@ -5,7 +5,6 @@ import time
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -18,7 +17,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.video.color import linear_from_code
-from mrbokeh.video.writer import VideoWriter
+from tests.scenes.video_files import filmed
 from viewfinder.app.opening import LensBook, Parts
 from viewfinder.app.running import Viewfinder
 from viewfinder.app.running import running as parts_running
@@ -43,11 +42,7 @@ def write_plate(folder: Path) -> tuple[Path, np.ndarray]:
     """(a lossless clip of one smooth picture at 50 frames per second, its 8-bit codes, blue first)."""
     x, y = np.meshgrid(np.linspace(0, 1, WIDTH), np.linspace(0, 1, HEIGHT))
     bgr = np.rint(np.stack([60 + 120 * x, 200 - 100 * y, 80 + 60 * x * y], -1)).astype(np.uint8)
-    path = folder / "plate.mkv"
-    with VideoWriter(path, WIDTH, HEIGHT, Fraction(50)) as writer:
-        for i in range(25):
-            writer.write(linear_from_code(bgr[..., ::-1] / 255.0, "bt709"), i / 50)
-    return path, bgr
+    return filmed(folder / "plate.mkv", [linear_from_code(bgr[..., ::-1] / 255.0, "bt709")] * 25, 50), bgr
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from fractions import Fraction
 from pathlib import Path
 from threading import Event
 
@@ -13,9 +12,9 @@ import numpy as np
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import read_display_frames
-from mrbokeh.video.writer import VideoWriter
 from tests.scenes.stage_scenes import card
 from tests.scenes.traced_board_clip import BOARD, clip_of
+from tests.scenes.video_files import filmed
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.charuco_tracker import CharucoTracker
 
@@ -49,10 +48,7 @@ def write_live_clip(folder: Path, width_px: int, height_px: int, frames: int, su
     traced = clip_of(width_px, height_px, frames)
     pictures = list(traced.pictures())
     order = [*range(frames), *range(frames - 2, 0, -1)]
-    path = folder / f"board{suffix}"
-    with VideoWriter(path, width_px, height_px, Fraction(FPS)) as video:
-        for number, frame in enumerate(order):
-            video.write(pictures[frame], number / FPS)
+    path = filmed(folder / f"board{suffix}", (pictures[frame] for frame in order), FPS)
     plates = [frame.bgr for frame in read_display_frames(path, width_px, height_px)]
     card(folder, material=GREEN)
     scene = folder / "scene.toml"

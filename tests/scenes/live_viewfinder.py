@@ -57,9 +57,7 @@ class Live:
     @property
     def moment(self) -> CompositedFrame:
         """What the newest picture was made of; there must have been one."""
-        moment = self.viewfinder.compositor.last
-        assert moment is not None
-        return moment
+        return self.viewfinder.compositor.last
 
     @property
     def is_watched(self) -> bool:

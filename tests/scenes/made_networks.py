@@ -33,6 +33,15 @@ def untrained(settings: NetworkSettings, largest_px: float = LARGEST_PX, grid: T
     return network.eval()
 
 
+@torch.no_grad()
+def jittered(network: BlurNetwork, std: float, seed: int = 0) -> BlurNetwork:
+    """Away from its start, as training might leave it."""
+    generator = torch.Generator().manual_seed(seed)
+    for parameter in network.parameters():
+        parameter.add_(std * torch.randn(parameter.shape, generator=generator))
+    return network
+
+
 def pictures(size: tuple[int, int] = SIZE, largest_px: float = LARGEST_PX) -> dict[str, torch.Tensor]:
     rng = np.random.default_rng(3)
     rgb = rng.random((1, 3, *size), dtype=np.float32)

@@ -17,7 +17,7 @@ from mrbokeh.tracking.charuco.board import write_board
 from mrbokeh.tracking.world_axes import inverted, rigid
 from tests.scenes.traced_board_clip import BOARD, clip_of
 from viewfinder.frames import Pose
-from viewfinder.tracking.phone_rig import rigid_of
+from viewfinder.tracking.phone_rig import angle_deg, rigid_of
 
 CAMERA_FROM_PHONE = rigid_of(np.array([0.05, -0.02, 0.03, -0.03, -0.06, 0.02]))
 """The phone 6 cm above the lens, 3 cm to its left, a little askew."""
@@ -56,3 +56,9 @@ def write_files(folder: Path) -> None:
     write_board(folder / "board.json", BOARD)
     write_lens(folder / "lens.json", LENS)
     write_json(folder / "phone.json", camera_to_json(PHONE))
+
+
+def rig_error(camera_from_phone: Pose) -> tuple[float, float]:
+    """(degrees, mm) by which it misses the truth."""
+    error = camera_from_phone @ inverted(CAMERA_FROM_PHONE)
+    return angle_deg(error), 1000 * float(np.linalg.norm(error[:3, 3]))

@@ -14,6 +14,7 @@ from aiohttp import web
 from aiortc import RTCConfiguration, RTCPeerConnection, RTCRtpSender, RTCSessionDescription
 from aiortc.mediastreams import MediaStreamTrack
 
+from tests.scenes.streaming_viewers import serving_routes
 from viewfinder.frames import CameraFrame
 from viewfinder.sources.frame_source import SizeLimit
 from viewfinder.sources.playback import VideoFileSource
@@ -77,14 +78,9 @@ async def plain_stream(path: Path, width_px: int, height_px: int) -> AsyncIterat
         await peer.setLocalDescription()
         return web.Response(status=201, text=peer.localDescription.sdp, content_type="application/sdp", headers={"Location": "/whep/1"})
 
-    app = web.Application()
-    app.add_routes([web.post("/whep", offered)])
-    runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
-    await runner.setup()
-    try:
-        await web.TCPSite(runner, "127.0.0.1", 0).start()
-        yield f"http://127.0.0.1:{runner.addresses[0][1]}"
-    finally:
-        await asyncio.gather(*(peer.close() for peer in peers))
-        await frames.close()
-        await runner.cleanup()
+    async with serving_routes([web.post("/whep", offered)]) as url:
+        try:
+            yield url
+        finally:
+            await asyncio.gather(*(peer.close() for peer in peers))
+            await frames.close()

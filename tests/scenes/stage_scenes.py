@@ -56,6 +56,12 @@ def scene_file(folder: Path, text: str) -> Path:
 
 
 ONE_CARD = '[[object]]\nname = "card"\nglb = "card.glb"\nheight_m = 0.2\n'
+SHADOW = ONE_CARD + "[[sun]]\ndirection = [0, -1, 1]\nirradiance = 3\n[shadow]\nstrength = 0.75\n"
+
+
+def centroid(plane: np.ndarray) -> tuple[float, float]:
+    columns, rows = np.meshgrid(np.arange(plane.shape[1]) + 0.5, np.arange(plane.shape[0]) + 0.5)
+    return float((plane * columns).sum() / plane.sum()), float((plane * rows).sum() / plane.sum())
 
 
 def staged(folder: Path, text: str = ONE_CARD) -> StagedScene:

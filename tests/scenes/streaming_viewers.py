@@ -1,9 +1,9 @@
-"""What the tests of streaming share: pictures, a stream that a thread feeds, and viewers in this process over real DTLS and SRTP."""
+"""What the tests of streaming share: pictures, a stream that a thread feeds, a server, viewers over real DTLS and SRTP, a lossy line."""
 
 import asyncio
 import json
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from threading import Event, Thread
 from typing import Any
@@ -87,18 +87,26 @@ def streaming(quality: StreamQuality | None = None, **settings: Any) -> Iterator
 
 
 @asynccontextmanager
-async def serving(whep: Whep) -> AsyncIterator[str]:
+async def serving_routes(routes: Iterable[web.RouteDef], **settings: Any) -> AsyncIterator[str]:
     """The address of a server that has nothing but the routes."""
-    app = web.Application(client_max_size=1024)
-    app.add_routes(whep.routes())
+    app = web.Application(**settings)
+    app.add_routes(routes)
     runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0)
     await runner.setup()
     try:
         await web.TCPSite(runner, "127.0.0.1", 0).start()
         yield f"http://127.0.0.1:{runner.addresses[0][1]}"
     finally:
-        await whep.close()
         await runner.cleanup()
+
+
+@asynccontextmanager
+async def serving(whep: Whep) -> AsyncIterator[str]:
+    async with serving_routes(whep.routes(), client_max_size=1024) as url:
+        try:
+            yield url
+        finally:
+            await whep.close()
 
 
 class Viewer:
@@ -137,8 +145,8 @@ class Viewer:
 
 
 @asynccontextmanager
-async def watching(url: str, codecs: tuple[str, ...] = ("VP8", "H264")) -> AsyncIterator[Viewer]:
-    viewer = Viewer(codecs)
+async def watching(url: str, codecs: tuple[str, ...] = ("VP8", "H264"), viewer: Viewer | None = None) -> AsyncIterator[Viewer]:
+    viewer = viewer or Viewer(codecs)
     try:
         async with aiohttp.ClientSession() as session:
             await viewer.connect(url, session)
@@ -157,3 +165,45 @@ def taken(viewer: ViewerQueue) -> list[EncodedFrame]:
     while (frame := viewer.take()) is not None:
         frames.append(frame)
     return frames
+
+
+# Packets that may wait where a test is not about viewers who fall behind: this process may be kept waiting for a second.
+PATIENT = 1000
+SDP = {"Content-Type": "application/sdp"}
+
+
+@asynccontextmanager
+async def whep_of(stream: EncodedStream, **settings: Any) -> AsyncIterator[tuple[Whep, str]]:
+    whep = Whep(stream, **settings)
+    async with serving(whep) as url:
+        yield whep, url
+
+
+@contextmanager
+def standing_still(connection: Any) -> Iterator[None]:
+    """The sender of a viewer waits in the middle of a packet, as it would for a full socket."""
+    transport, gate = connection.track.sender.transport, asyncio.Event()
+    send = transport._send_rtp
+
+    async def stuck(data: bytes) -> None:
+        await gate.wait()
+        await send(data)
+
+    transport._send_rtp = stuck
+    yield
+    gate.set()
+
+
+class Line:
+    """What the network does to RTP packets before the viewer sees them: `pass_on(number, packet)` gives those to deliver."""
+
+    def __init__(self, viewer: Viewer, pass_on: Any) -> None:
+        receiver = viewer.transceiver.receiver
+        deliver, self.viewer, self.number = receiver._handle_rtp_packet, viewer, 0
+
+        async def handle(packet: Any, arrival_time_ms: int) -> None:
+            self.number += 1
+            for each in pass_on(self.number, packet):
+                await deliver(each, arrival_time_ms)
+
+        receiver._handle_rtp_packet = handle

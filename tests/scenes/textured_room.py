@@ -50,3 +50,11 @@ def picture(camera: Camera) -> np.ndarray:
         grey = np.where(hit < best, seen, grey)
         best = np.minimum(best, hit)
     return cv2.resize(grey, (camera.width_px, camera.height_px), interpolation=cv2.INTER_AREA)
+
+
+def similarity(to: np.ndarray, start: np.ndarray) -> tuple[float, np.ndarray]:
+    """(scale, rotation) that take places (n, 3) to others best, about their means (Umeyama 1991)."""
+    to, start = to - to.mean(axis=0), start - start.mean(axis=0)
+    u, sizes, vt = np.linalg.svd(to.T @ start)
+    flip = np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))])
+    return float((sizes * np.diag(flip)).sum() / (start**2).sum()), u @ flip @ vt

@@ -1,16 +1,19 @@
 """A traced, hand-held clip of a board of two scales with exact poses: what tracking is measured against."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 
+import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from datasets_scripts.charuco_clip import BoardClip, HandHeld, Sheet
 from mrbokeh.images.color import display_rgb8
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import MM_PER_M, Lens
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, black_rectangles_mm
+from mrbokeh.tracking.charuco.detector import Corners, Grey
 from viewfinder.frames import CameraFrame, Pose
 
 BOARD = CharucoBoard((CharucoGrid((4, 3), 46.0, 34.0), CharucoGrid((9, 5), 20.0, 15.0, (0.0, 143.0), 6)))
@@ -42,6 +45,25 @@ def pose_error(pose: Pose, true: Camera) -> PoseError:
 
 def clip_of(width_px: int, height_px: int, frames: int, lens: Lens = LENS, motion: HandHeld = MOTION) -> BoardClip:
     return BoardClip(Sheet(black_rectangles_mm(BOARD)), motion, lens, width_px, height_px, frames, noise=0.01, samples=8)
+
+
+def tilted_views(
+    board: CharucoBoard, tilts_deg: Sequence[float] | np.ndarray, distance_m: float, k1: float = 0.0, sigma_px: float = 0.1
+) -> list[Corners]:
+    """Boards seen by OpenCV's own formula with 600 px and the middle at (310, 185), tilted about x and, every second one, about y."""
+    rng, matrix = np.random.default_rng(2), np.array([[600.0, 0, 309.5], [0, 600.0, 184.5], [0, 0, 1]])
+    middle = board.corners_m.mean(axis=0)
+    seen = []
+    for index, tilt in enumerate(tilts_deg):
+        turn = Rotation.from_euler("yx"[index % 2], tilt, degrees=True)
+        shift = np.array([0.02 * (index % 3 - 1), 0.01, distance_m]) - turn.apply(middle)
+        xy = cv2.projectPoints(board.corners_m, turn.as_rotvec(), shift, matrix, np.array([k1, 0.0, 0.0, 0.0]))[0].reshape(-1, 2)
+        seen.append(Corners(np.arange(len(xy)), xy.astype(np.float64) + 0.5 + rng.normal(0.0, sigma_px, xy.shape)))
+    return seen
+
+
+def grey_of(frame: CameraFrame) -> Grey:
+    return cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY)
 
 
 def camera_frames(clip: BoardClip) -> Iterator[tuple[CameraFrame, Camera]]:

@@ -1,14 +1,9 @@
-"""Waiting in tests: for work in an event loop, and for what another thread or task does."""
+"""Waiting in tests for what another thread or task does."""
 
 import asyncio
 import time
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from typing import Any
-
-
-def in_time(work: Callable[[], Coroutine[Any, Any, None]], limit_s: float = 30.0) -> None:
-    """Run work in an event loop of its own; it fails if that takes longer."""
-    asyncio.run(asyncio.wait_for(work(), limit_s))
 
 
 async def comes_true(true: Callable[[], Any], limit_s: float = 20.0) -> None:

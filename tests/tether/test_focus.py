@@ -62,9 +62,6 @@ def axis_of(motor: SimulatedMotor, stop: Stop = Stop.near, backlash_steps: int =
     return FocusAxis(camera, stop, backlash_steps=backlash_steps, settle_s=0.4, sleep=waits.append), camera, waits
 
 
-# --- the simulated motor -------------------------------------------------------------------------------------------
-
-
 def test_the_motor_has_play_and_ends() -> None:
     """40 steps of play: after turning round, 40 steps move nothing, the 41st moves the lens by one."""
     motor = SimulatedMotor(2.0, travel_steps=1000, backlash_steps=40)
@@ -85,9 +82,6 @@ def test_the_motor_has_play_and_ends() -> None:
     assert motor.gear == 1040, "pressed against the far stop, all play is behind"
     motor.drive(-41)
     assert motor.lens == 999
-
-
-# --- the axis: always from one side --------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("stop", list(Stop))
@@ -138,9 +132,6 @@ def test_the_ends_of_the_travel(stop: Stop) -> None:
     assert camera.motor.lens == (1000 if stop is Stop.near else 0)
     with pytest.raises(InputError, match="cannot be reached"):
         axis.move_to(-1)
-
-
-# --- what the steps mean -------------------------------------------------------------------------------------------
 
 
 def test_steps_and_dioptres() -> None:
@@ -208,9 +199,6 @@ def test_targets_that_tell_nothing() -> None:
     for targets in ([Target(Spot(), 1.0)], [Target(Spot(), 1.0), Target(Spot(0.1), 1.0)], [Target(Spot(), 1.0), Target(Spot(), -1.0)]):
         with pytest.raises(InputError):
             measure_focus_steps(axis, camera, targets, step=100)
-
-
-# --- the live view -------------------------------------------------------------------------------------------------
 
 
 def checkerboard(dark: int, light: int) -> Preview:

@@ -112,9 +112,6 @@ def test_what_the_virtual_camera_has_not_is_said(answers: dict[str, Any]) -> Non
     assert answers["port"] == "CameraError: no camera at usb:009,009, only at Nikon DSC D750 at usb:001,001"
 
 
-# --- stand-ins for cameras with motors -----------------------------------------------------------------------------
-
-
 @dataclass
 class Widget:
     """A setting as libgphoto2 gives it: a copy, written back by set_single_config."""
@@ -310,9 +307,6 @@ def test_what_a_stand_in_can() -> None:
     assert driver_of(StandIn({})).describe().abilities == {Ability.shutter}
 
 
-# --- settings ------------------------------------------------------------------------------------------------------
-
-
 def test_a_full_configuration() -> None:
     stand_in = nikon(
         expprogram=Widget("A", ("P", "A", "S", "M")), imagequality=Widget("NEF+Fine", ("JPEG Fine", "NEF+Fine", "NEF (Raw)")),
@@ -358,15 +352,8 @@ def test_the_nearest_choice() -> None:
 
 
 def test_words_of_cameras() -> None:
-    assert [number_in(each) for each in ("f/4", "0.0166s", "1/125", "ISO 200", "30", "Bulb", "1/0")] == [
-        4,
-        0.0166,
-        0.008,
-        200,
-        30,
-        None,
-        None,
-    ]
+    numbers = {"f/4": 4, "0.0166s": 0.0166, "1/125": 0.008, "ISO 200": 200, "30": 30, "Bulb": None, "1/0": None}
+    assert {words: number_in(words) for words in numbers} == numbers
     raw, others = ("NEF (Raw)", "RAW", "cRAW"), ("RAW+JPEG", "NEF+Basic", "RAW + Large Fine JPEG", "Large Fine JPEG")
     assert all(is_raw_only(each) for each in raw) and not any(is_raw_only(each) for each in others)
     assert is_manual("M") and is_manual("Manual") and not is_manual("AV")

@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from capture.commands.plan import plan_command
 from capture.tether.focus_plan import (
@@ -27,10 +25,9 @@ from capture.tether.focus_plan import (
 from mrbokeh.optics.lens import Lens, film_plane_m, lens_distance_m
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.errors import InputError
+from tests.scenes.command_line import printed_by
 
 LENS = Lens(35.0, 2.8, 1.0, 36.0)
-APP = typer.Typer()
-APP.command()(plan_command)
 COMMAND = ["--focal-length", "35", "--f-number", "2", "--sensor-width", "23.5", "--near", "0.5", "--far", "2", "--image-width", "480"]
 
 
@@ -149,31 +146,25 @@ def test_other_mistakes() -> None:
         on_scale(plan_focus(LENS, FocusRange(0.5, 1.0), 960), [0.0])
 
 
-# --- the command ---------------------------------------------------------------------------------------------------
-
-
 def test_the_command_prints_and_writes(tmp_path: Path) -> None:
     """d_s = 37.634 mm, a = 17.5 mm: 13.45 px per dioptre; 1.5 D are 10.09 gaps of 2 px, so 12 slices."""
-    files = ["--out", str(tmp_path / "plan.json"), "--csv", str(tmp_path / "plan.csv")]
-    result = CliRunner().invoke(APP, [*COMMAND, *files], env={"COLUMNS": "120"})
-    assert result.exit_code == 0, result.output
-    assert "12 slices of 480 px" in result.output and "0.5376" in result.output
+    words = [*COMMAND, "--out", tmp_path / "plan.json", "--csv", tmp_path / "plan.csv"]
+    told = printed_by(plan_command, *words)
+    assert "12 slices of 480 px" in told and "0.5376" in told
     rows = list(csv.DictReader((tmp_path / "plan.csv").read_text().splitlines()))
     assert len(rows) == 12
     assert rows[0] == {"slice": "0", "from_lens_m": "0.5000", "from_film_plane_m": "0.5376", "dioptre": "2.0000", "breathing": "1.00000"}
     assert read_plan(tmp_path / "plan.json").range == FocusRange(0.5, 2.0)
     with pytest.raises(InputError, match="exists already"):
-        CliRunner().invoke(APP, [*COMMAND, *files], catch_exceptions=False)
+        printed_by(plan_command, *words)
 
 
 def test_a_lens_file_and_a_scale(tmp_path: Path) -> None:
     """Marks are engraved from the film plane: 0.5376 m is 0.5 m from the lens."""
     write_lens(tmp_path / "lens.json", replace(LENS, f_number=2.0, sensor_width_mm=23.5))
-    arguments = [str(tmp_path / "lens.json"), *COMMAND[6:], "--scale", "0.537634,1,inf", "--origin", "film_plane", "--near", "0.537634"]
-    result = CliRunner().invoke(APP, arguments, env={"COLUMNS": "120"})
-    assert result.exit_code == 0, result.output
-    assert "3 slices" in result.output
-    assert "0.5376" in result.output and "above the 1 px" in result.output
+    marks = ["--scale", "0.537634,1,inf", "--origin", "film_plane", "--near", "0.537634"]
+    told = printed_by(plan_command, tmp_path / "lens.json", *COMMAND[6:], *marks)
+    assert "3 slices" in told and "0.5376" in told and "above the 1 px" in told
 
 
 @pytest.mark.parametrize(
@@ -185,6 +176,6 @@ def test_a_lens_file_and_a_scale(tmp_path: Path) -> None:
 )  # fmt: skip
 def test_mistakes_of_the_command(more: list[str], said: str) -> None:
     with pytest.raises(InputError, match=said):
-        CliRunner().invoke(APP, [*COMMAND, *more], catch_exceptions=False)
+        printed_by(plan_command, *COMMAND, *more)
     with pytest.raises(InputError, match="give a lens file"):
-        CliRunner().invoke(APP, COMMAND[2:], catch_exceptions=False)
+        printed_by(plan_command, *COMMAND[2:])

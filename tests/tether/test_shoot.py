@@ -23,7 +23,7 @@ from datasets_scripts.made_sets.simulated_camera import SensorModel, ShotMetadat
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.system.errors import InputError
-from tests.scenes.commands import printed_by
+from tests.scenes.command_line import printed_by
 
 LENS = Lens(35.0, 2.0, 1.0, 23.5)
 NEAR_M, FAR_M = 0.5, 2.5
@@ -31,6 +31,9 @@ NEAR_M, FAR_M = 0.5, 2.5
 
 def small_plan(width_px: int = 160, residual_px: float = 1.2) -> FocusPlan:
     return plan_focus(LENS, FocusRange(NEAR_M, FAR_M), width_px, residual_px)
+
+
+FEW = small_plan(96, 2.0)
 
 
 @dataclass
@@ -49,24 +52,16 @@ class WatchedCamera(SimulatedCamera):
         super().home(stop)
 
 
-def camera_for(plan: FocusPlan, before_shot: Callable[[int], None]) -> WatchedCamera:
+def camera_for(plan: FocusPlan, before_shot: Callable[[int], None] = lambda _: None) -> WatchedCamera:
     simulated = SimulatedCamera.for_plan(plan)
     return WatchedCamera(simulated.lens, simulated.scene, simulated.motor, simulated.width_px, before_shot=before_shot)
 
 
-@dataclass
-class Listener:
-    said: list[str] = field(default_factory=list)
-
-    def world(self) -> Surroundings:
-        return Surroundings(self.said.append, self.said.append, lambda _: None, lambda: datetime(2026, 1, 2, 3, 4, 5))
-
-
 def taken(plan: FocusPlan, camera: SimulatedCamera, out: Path, **options: object) -> tuple[dict, list[str]]:
-    listener = Listener()
-    defaults: dict = {"backlash_steps": 100}
-    shoot(plan, camera, out, ShootOptions(**defaults | options), listener.world())
-    return json.loads((out / "shoot.json").read_text()), listener.said
+    said = list[str]()
+    around = Surroundings(said.append, said.append, lambda _: None, lambda: datetime(2026, 1, 2, 3, 4, 5))
+    shoot(plan, camera, out, ShootOptions(**{"backlash_steps": 100} | options), around)
+    return json.loads((out / "shoot.json").read_text()), said
 
 
 def real_dioptres(document: dict, camera: SimulatedCamera) -> list[float]:
@@ -143,7 +138,7 @@ def test_a_pulled_cable(tmp_path: Path) -> None:
     assert sorted(read_log(tmp_path).slices) == [0, 1, 2]
     assert sorted(each.name for each in tmp_path.iterdir()) == ["shoot.json", "slice_00.tif", "slice_01.tif", "slice_02.tif"]
     before = (tmp_path / "slice_01.tif").stat().st_mtime_ns
-    camera = camera_for(plan, lambda _: None)
+    camera = camera_for(plan)
     document, said = taken(plan, camera, tmp_path)
     assert said == [] and camera.homings == [Stop.near] and camera.shots == len(plan) - 3 + 1
     assert (tmp_path / "slice_01.tif").stat().st_mtime_ns == before
@@ -152,41 +147,39 @@ def test_a_pulled_cable(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_keeps_everything_and_a_lost_file_is_taken_again(tmp_path: Path) -> None:
-    plan = small_plan(96, 2.0)
 
     def interrupt(shot: int) -> None:
         if shot == 3:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        taken(plan, camera_for(plan, interrupt), tmp_path)
+        taken(FEW, camera_for(FEW, interrupt), tmp_path)
     (tmp_path / "slice_00.tif").unlink()
-    camera = camera_for(plan, lambda _: None)
-    document, _ = taken(plan, camera, tmp_path)
+    camera = camera_for(FEW)
+    document, _ = taken(FEW, camera, tmp_path)
     assert [each["camera_name"] for each in document["slices"]][:2] == ["SIM_0001.TIF", "SIM_0002.TIF"]
-    assert camera.shots == len(plan) - 1 + 1, "slice 0 and those after 1, and the check"
-    _, said = taken(plan, camera, tmp_path)
-    assert said == [f"all {len(plan)} slices are in {tmp_path} already"] and camera.shots == len(plan)
+    assert camera.shots == len(FEW) - 1 + 1, "slice 0 and those after 1, and the check"
+    _, said = taken(FEW, camera, tmp_path)
+    assert said == [f"all {len(FEW)} slices are in {tmp_path} already"] and camera.shots == len(FEW)
 
 
 def test_a_shoot_goes_on_only_as_it_was(tmp_path: Path) -> None:
-    plan = small_plan(96, 2.0)
-    camera = camera_for(plan, lambda _: None)
-    taken(plan, camera, tmp_path)
+    camera = camera_for(FEW)
+    taken(FEW, camera, tmp_path)
     with pytest.raises(InputError, match="another plan"):
         taken(small_plan(96, 3.0), camera, tmp_path)
     (tmp_path / "slice_01.tif").unlink()
     with pytest.raises(InputError, match=r"other settings \(exposure time"):
-        taken(plan, camera, tmp_path, settings=CameraSettings(exposure_time_s=0.5))
+        taken(FEW, camera, tmp_path, settings=CameraSettings(exposure_time_s=0.5))
     document, _ = taken(small_plan(96, 3.0), camera, tmp_path, overwrite=True)
     assert sorted(each.name for each in tmp_path.glob("slice_*")) == [each["file"] for each in document["slices"]]
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "a.jpg").write_bytes(b"x")
     with pytest.raises(InputError, match=r"not of this shoot \(a\.jpg"):
-        taken(plan, camera, tmp_path / "other")
+        taken(FEW, camera, tmp_path / "other")
     (tmp_path / "shoot.json").write_text('{"format": "mrbokeh-shoot", "version": 1}')
     with pytest.raises(InputError, match="damaged"):
-        taken(plan, camera, tmp_path)
+        taken(FEW, camera, tmp_path)
 
 
 @pytest.mark.parametrize(("bump_gaps", "warned"), [(0.0, False), (0.1, False), (0.5, True), (1.0, True), (-0.6, True)])
@@ -197,7 +190,7 @@ def test_slice_0_shot_again_tells_a_bumped_ring(tmp_path: Path, bump_gaps: float
     """
     plan = small_plan()
     gap_steps = (plan.dioptres[0] - plan.dioptres[1]) / 2.4 * 2400
-    camera = camera_for(plan, lambda _: None)
+    camera = camera_for(plan)
     camera.before_shot = lambda shot: slip(camera, gap_steps * bump_gaps) if shot == len(plan) + 1 else None
     document, said = taken(plan, camera, tmp_path)
     assert document["check"]["focus_error"] == pytest.approx(bump_gaps, abs=max(0.02, 0.5 * abs(bump_gaps)))
@@ -213,7 +206,7 @@ def slip(camera: SimulatedCamera, steps: float) -> None:
 def test_too_little_room_for_the_play_is_noticed(tmp_path: Path) -> None:
     """Slice 0 lies beyond the near stop, so going back to it turns the motor round: with --backlash 0, the play of 200 steps stays."""
     plan = small_plan()
-    careless, careful = (camera_for(plan, lambda _: None) for _ in range(2))
+    careless, careful = (camera_for(plan) for _ in range(2))
     for camera in (careless, careful):
         camera.motor.backlash_steps = 200
     document, said = taken(plan, careless, tmp_path / "a", backlash_steps=0)
@@ -224,7 +217,7 @@ def test_too_little_room_for_the_play_is_noticed(tmp_path: Path) -> None:
 
 def test_a_moved_camera_and_changed_light_are_noticed(tmp_path: Path) -> None:
     plan = small_plan()
-    camera = camera_for(plan, lambda _: None)
+    camera = camera_for(plan)
 
     def disturb(shot: int) -> None:
         if shot == len(plan) + 1:
@@ -241,11 +234,10 @@ def test_a_moved_camera_and_changed_light_are_noticed(tmp_path: Path) -> None:
 
 
 def test_automatic_exposure_is_refused(tmp_path: Path) -> None:
-    plan = small_plan(96, 2.0)
-    camera = camera_for(plan, lambda _: None)
+    camera = camera_for(FEW)
     camera.before_shot = lambda shot: setattr(camera, "exposure_time_s", 1 / 50) if shot == 3 else None
     with pytest.raises(InputError, match=r"SIM_0003\.TIF was exposed otherwise .* set the camera to manual exposure"):
-        taken(plan, camera, tmp_path)
+        taken(FEW, camera, tmp_path)
     assert sorted(each.name for each in tmp_path.glob("slice*")) == ["slice_00.tif", "slice_01.tif"]
 
 
@@ -259,74 +251,68 @@ def test_half_a_file_is_not_kept(tmp_path: Path) -> None:
 
 
 def test_another_lens_than_planned_is_told(tmp_path: Path) -> None:
-    plan = small_plan(96, 2.0)
-    _, said = taken(plan, camera_for(plan, lambda _: None), tmp_path, settings=CameraSettings(f_number=4.0), check=False)
+    _, said = taken(FEW, camera_for(FEW), tmp_path, settings=CameraSettings(f_number=4.0), check=False)
     assert said == ["the plan is for f_number 2, the photographs state 4: plan again, or set the lens"]
 
 
 def test_planned_distances_where_the_camera_is_silent(tmp_path: Path) -> None:
     """lens.toml counts from the lens and names the files; ingest reads it."""
-    plan = small_plan(96, 2.0)
-    camera = camera_for(plan, lambda _: None)
+    camera = camera_for(FEW)
     camera.quantum = lambda _: None
-    taken(plan, camera, tmp_path / "view", check=False)
+    taken(FEW, camera, tmp_path / "view", check=False)
     written = tomllib.loads((tmp_path / "view" / "lens.toml").read_text())
     assert set(written) == {"focus_origin", "focus_distances_m"} and written["focus_origin"] == "lens"
     stack = ingest([tmp_path / "view"], tmp_path / "scene").stacks[0].stack
-    assert [1.0 / each for each in stack.focus_distances_m if each] == pytest.approx(plan.dioptres, abs=6e-4)
+    assert [1.0 / each for each in stack.focus_distances_m if each] == pytest.approx(FEW.dioptres, abs=6e-4)
 
 
 def test_planned_distances_where_rounding_merges_slices(tmp_path: Path) -> None:
     """Gaps of 2 % against Nikon's steps of 5.9 %: neighbours state the same, so the plan's word is taken; and to infinity."""
     plan = FocusPlan(LENS, 96, FocusRange(1.0, math.inf), (1.0, 0.98, 0.0))
-    document, _ = taken(plan, camera_for(plan, lambda _: None), tmp_path, check=False)
+    document, _ = taken(plan, camera_for(plan), tmp_path, check=False)
     assert document["slices"][0]["stated"]["focus_dioptre"] == document["slices"][1]["stated"]["focus_dioptre"]
     distances_m = tomllib.loads((tmp_path / "lens.toml").read_text())["focus_distances_m"]
     assert [1.0 / each for each in distances_m.values()] == pytest.approx([1.0, 0.98, 0.0], abs=6e-4)
 
 
 def test_planned_distances_on_request_and_a_foreign_sidecar(tmp_path: Path) -> None:
-    plan = small_plan(96, 2.0)
-    taken(plan, camera_for(plan, lambda _: None), tmp_path / "b", check=False, planned_distances=True)
-    assert len(tomllib.loads((tmp_path / "b" / "lens.toml").read_text())["focus_distances_m"]) == len(plan)
+    taken(FEW, camera_for(FEW), tmp_path / "b", check=False, planned_distances=True)
+    assert len(tomllib.loads((tmp_path / "b" / "lens.toml").read_text())["focus_distances_m"]) == len(FEW)
     (tmp_path / "c").mkdir()
     (tmp_path / "c" / "lens.toml").write_text("blades = 7\n")
-    taken(plan, camera_for(plan, lambda _: None), tmp_path / "c", check=False, planned_distances=True)
+    taken(FEW, camera_for(FEW), tmp_path / "c", check=False, planned_distances=True)
     assert (tmp_path / "c" / "lens.toml").read_text() == "blades = 7\n"
 
 
 def test_by_hand(tmp_path: Path) -> None:
     """The photographer is told each distance as the ring counts it (0.5 m from the lens is 0.538 m from the film plane)."""
-    plan = small_plan(96, 2.0)
-    camera = camera_for(plan, lambda _: None)
-    document, said = taken(plan, camera, tmp_path, by_hand=True, check=False)
-    assert len(said) == len(plan) and "focus at 0.538 m on the lens's scale (0.500 m from the lens)" in said[0]
-    assert [each["dioptre"] for each in document["slices"]] == list(plan.dioptres) and camera.homings == []
+    camera = camera_for(FEW)
+    document, said = taken(FEW, camera, tmp_path, by_hand=True, check=False)
+    assert len(said) == len(FEW) and "focus at 0.538 m on the lens's scale (0.500 m from the lens)" in said[0]
+    assert [each["dioptre"] for each in document["slices"]] == list(FEW.dioptres) and camera.homings == []
 
 
 def test_unknown_steps_and_a_range_beyond_the_lens(tmp_path: Path) -> None:
-    plan = small_plan(96, 2.0)
-    camera = camera_for(plan, lambda _: None)
+    camera = camera_for(FEW)
     camera.knows_steps = False
     with pytest.raises(InputError, match="--target"):
-        taken(plan, camera, tmp_path / "a")
+        taken(FEW, camera, tmp_path / "a")
     beyond = FocusSteps(Stop.near, ((200.0, 2.0), (5000.0, 0.4)))
     with pytest.raises(InputError, match="the focus motor met its end"):
-        taken(plan, camera, tmp_path / "b", focus_steps=beyond)
+        taken(FEW, camera, tmp_path / "b", focus_steps=beyond)
     before = FocusSteps(Stop.near, ((-200.0, 2.0), (2000.0, 0.4)))
     with pytest.raises(InputError, match="cannot be reached"):
-        taken(plan, camera, tmp_path / "c", focus_steps=before)
+        taken(FEW, camera, tmp_path / "c", focus_steps=before)
 
 
 def test_from_the_infinity_stop(tmp_path: Path) -> None:
     """Counted from infinity, slices are still taken nearest first, each approached from the far side; the focus is the same."""
-    plan = small_plan(96, 2.0)
-    camera = camera_for(plan, lambda _: None)
+    camera = camera_for(FEW)
     scale = FocusSteps(Stop.infinity, ((40.0, 0.0), (2440.0, 2.4)))
     dioptres: list[float] = []
     camera.before_shot = lambda _: dioptres.append(camera.motor.dioptre)
-    taken(plan, camera, tmp_path, focus_steps=scale)
-    assert dioptres[:-1] == pytest.approx(plan.dioptres, abs=6e-4) and dioptres[-1] == dioptres[0]
+    taken(FEW, camera, tmp_path, focus_steps=scale)
+    assert dioptres[:-1] == pytest.approx(FEW.dioptres, abs=6e-4) and dioptres[-1] == dioptres[0]
 
 
 def shoot_by(folder: Path, *more: str) -> str:
@@ -336,7 +322,7 @@ def shoot_by(folder: Path, *more: str) -> str:
 
 
 def test_the_command(tmp_path: Path) -> None:
-    write_plan(tmp_path / "plan.json", small_plan(96, 2.0))
+    write_plan(tmp_path / "plan.json", FEW)
     told = shoot_by(tmp_path, "--exposure-time", "1/60", "--live", "--spot", "0.5,0.5")
     assert "3 slices" in told and "mrbokeh capture ingest" in told
     assert read_metadata(tmp_path / "view" / "slice_00.tif").exposure_time_s == pytest.approx(1 / 60, rel=1e-3)
@@ -364,6 +350,6 @@ def test_the_command_measures_steps_once(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_mistakes_of_the_command(tmp_path: Path, more: list[str], said: str) -> None:
-    write_plan(tmp_path / "plan.json", small_plan(96, 2.0))
+    write_plan(tmp_path / "plan.json", FEW)
     with pytest.raises(InputError, match=said):
         shoot_by(tmp_path, *more)

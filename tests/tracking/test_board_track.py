@@ -3,7 +3,6 @@
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from fractions import Fraction
 from functools import cache
 from pathlib import Path
 
@@ -11,7 +10,6 @@ import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 from datasets_scripts.charuco_clip import HandHeld
 from mrbokeh.commands.track import app
@@ -24,9 +22,9 @@ from mrbokeh.tracking.camera_track.board_track import RollingCorners, TrackSetti
 from mrbokeh.tracking.camera_track.formats import read_track
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, write_board
 from mrbokeh.tracking.charuco.detector import Corners
-from mrbokeh.video.writer import VideoWriter
-from tests.scenes.traced_board_clip import BOARD, MOTION, clip_of, pose_error
-from tests.scenes.video_files import turned_clip
+from tests.scenes.command_line import printed_by
+from tests.scenes.traced_board_clip import BOARD, MOTION, clip_of, pose_error, tilted_views
+from tests.scenes.video_files import filmed, turned_clip
 
 FRAMES, HIDDEN = 16, (6, 7, 8)
 CAMERA = Camera(640, 360, (609.0, 609.0), (320.0, 180.0))
@@ -42,10 +40,7 @@ def traced() -> tuple[np.ndarray, ...]:
 def clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """16 traced frames of 320x180; in three of them somebody stands before the board."""
     path = tmp_path_factory.mktemp("board") / "clip.mkv"
-    with VideoWriter(path, 320, 180, Fraction(30)) as video:
-        for number, rgb in enumerate(traced()):
-            video.write(np.full_like(rgb, 0.2) if number in HIDDEN else rgb, number / 30.0)
-    return path
+    return filmed(path, (np.full_like(rgb, 0.2) if number in HIDDEN else rgb for number, rgb in enumerate(traced())), 30)
 
 
 def true_camera(number: int, width_px: int = 320) -> Camera:
@@ -112,9 +107,6 @@ def test_distortion_is_taken_out_before_the_board_is_looked_for() -> None:
         seen_px = camera.project(BOARD.corners_m[corners.ids])[0]
         off_px.append(float(np.sqrt(np.mean(np.sum((corners.xy_px - seen_px) ** 2, axis=1)))))
     assert off_px[0] < 0.15 < 0.3 < off_px[1]
-
-
-# Smoothing
 
 
 def dense_whittaker(values: np.ndarray, weights: np.ndarray, strength: float) -> np.ndarray:
@@ -204,25 +196,9 @@ def test_asked_for_more_smoothing_gives_calmer_poses() -> None:
     assert rest[1] < 0.5 * rest[0]
 
 
-# Calibration
-
-
-def views(tilts_deg: Sequence[float] | np.ndarray, k1: float, sigma_px: float = 0.1) -> list[Corners]:
-    """Boards seen by OpenCV's own formula, tilted about x and, every second one, about y."""
-    rng, matrix = np.random.default_rng(2), np.array([[600.0, 0, 309.5], [0, 600.0, 184.5], [0, 0, 1]])
-    middle = BOARD.corners_m.mean(axis=0)
-    seen = []
-    for index, tilt in enumerate(tilts_deg):
-        turn = Rotation.from_euler("yx"[index % 2], tilt, degrees=True)
-        shift = np.array([0.02 * (index % 3 - 1), 0.01, 0.42]) - turn.apply(middle)
-        xy = cv2.projectPoints(BOARD.corners_m, turn.as_rotvec(), shift, matrix, np.array([k1, 0.0, 0.0, 0.0]))[0].reshape(-1, 2)
-        seen.append(Corners(np.arange(len(xy)), xy.astype(np.float64) + 0.5 + rng.normal(0.0, sigma_px, xy.shape)))
-    return seen
-
-
 def test_calibration_finds_focal_length_principal_point_and_distortion() -> None:
     """600 px, (310, 185) with the first pixel's centre at a half, k1 = -0.15; noise of 0.1 px on 44 corners of 24 views."""
-    found = calibrated(BOARD, views(np.linspace(-40, 40, 24), -0.15), 640, 360)
+    found = calibrated(BOARD, tilted_views(BOARD, np.linspace(-40, 40, 24), 0.42, -0.15), 640, 360)
     assert found.camera.focal_px[0] == pytest.approx(600.0, rel=0.004) and found.camera.focal_px[0] == found.camera.focal_px[1]
     assert found.camera.principal_px == pytest.approx((310.0, 185.0), abs=2.0)
     assert found.distortion["k1"] == pytest.approx(-0.15, abs=0.03)
@@ -231,23 +207,15 @@ def test_calibration_finds_focal_length_principal_point_and_distortion() -> None
 
 
 def test_a_lens_without_distortion_gets_none_to_speak_of() -> None:
-    found = calibrated(BOARD, views(np.linspace(-40, 40, 24), 0.0), 640, 360)
+    found = calibrated(BOARD, tilted_views(BOARD, np.linspace(-40, 40, 24), 0.42), 640, 360)
     assert abs(found.distortion.get("k1", 0.0)) < 0.02
 
 
 def test_a_board_seen_head_on_only_leaves_the_focal_length_open() -> None:
     with pytest.raises(InputError, match="too few angles"):
-        calibrated(BOARD, views(np.zeros(12), 0.0, 0.3), 640, 360)
+        calibrated(BOARD, tilted_views(BOARD, np.zeros(12), 0.42, sigma_px=0.3), 640, 360)
     with pytest.raises(InputError, match="only 2 frames"):
-        calibrated(BOARD, views(np.array([10.0, 20.0]), 0.0), 640, 360)
-
-
-# The command
-
-
-def run(*arguments: object) -> tuple[int, str]:
-    result = CliRunner().invoke(app, [str(each) for each in arguments])
-    return result.exit_code, str(result.exception or result.output)
+        calibrated(BOARD, tilted_views(BOARD, np.array([10.0, 20.0]), 0.42), 640, 360)
 
 
 def test_the_command_writes_a_track_that_converts(clip: Path, tmp_path: Path) -> None:
@@ -255,14 +223,13 @@ def test_the_command_writes_a_track_that_converts(clip: Path, tmp_path: Path) ->
     write_board(tmp_path / "board.json", BOARD)
     (tmp_path / "camera.json").write_text(json.dumps(camera_to_json(true_camera(0))))
     known = ("--board", tmp_path / "board.json", "--camera", tmp_path / "camera.json", "--out", tmp_path / "track.json")
-    code, told = run("clip", clip, *known)
-    assert code == 0 and "seen in 13 of 16 frames (81.2 %), 3 bridged (6-8); reprojection 0.0" in told
-    code, told = run("clip", clip, *known)
-    assert code == 1 and "--overwrite" in told
-    code, told = run("convert", tmp_path / "track.json", tmp_path / "track.chan", "--frame-offset", 1001)
-    assert code == 0 and "lacks: times" in told and "16 frames, 1001 to 1016" in told
-    code, told = run("convert", tmp_path / "track.chan", tmp_path / "back.json", "--size", "320x180", "--rate", 24, "--out-up", "-z")
-    assert code == 0
+    assert "seen in 13 of 16 frames (81.2 %), 3 bridged (6-8); reprojection 0.0" in printed_by(app, "clip", clip, *known)
+    with pytest.raises(InputError, match="--overwrite"):
+        printed_by(app, "clip", clip, *known)
+    told = printed_by(app, "convert", tmp_path / "track.json", tmp_path / "track.chan", "--frame-offset", 1001)
+    assert "lacks: times" in told and "16 frames, 1001 to 1016" in told
+    back = (tmp_path / "track.chan", tmp_path / "back.json")
+    printed_by(app, "convert", *back, "--size", "320x180", "--rate", 24, "--out-up", "-z")
     one, other = read_track(tmp_path / "track.json"), read_track(tmp_path / "back.json")
     assert (one.up, other.up) == ("-z", "-z") and other.at(1016).time_s == pytest.approx(1016 / 24)
     np.testing.assert_allclose(other.at(1004).camera.camera_from_world, one.at(3).camera.camera_from_world, atol=1e-9)
@@ -278,20 +245,20 @@ def test_the_command_writes_a_track_that_converts(clip: Path, tmp_path: Path) ->
 )
 def test_mistakes_end_in_a_sentence(clip: Path, tmp_path: Path, arguments: tuple[str, ...], says: str) -> None:
     write_board(tmp_path / "board.json", BOARD)
-    code, told = run("clip", clip, "--board", tmp_path / "board.json", "--out", tmp_path / "track.json", *arguments)
-    assert code == 1 and says in told and not (tmp_path / "track.json").exists()
+    with pytest.raises(InputError, match=says):
+        printed_by(app, "clip", clip, "--board", tmp_path / "board.json", "--out", tmp_path / "track.json", *arguments)
+    assert not (tmp_path / "track.json").exists()
 
 
 @pytest.mark.slow
 def test_a_traced_clip_calibrates_itself(tmp_path: Path) -> None:
     """640x360, 40 frames of one hand-held view from 50 degrees: the focal length to half a per cent (0.04 measured on 90 frames)."""
-    with VideoWriter(tmp_path / "clip.mkv", 640, 360, Fraction(30)) as video:
-        for number, rgb in enumerate(clip_of(640, 360, 40).pictures()):
-            video.write(rgb, number / 30.0)
+    filmed(tmp_path / "clip.mkv", clip_of(640, 360, 40).pictures(), 30)
     write_board(tmp_path / "board.json", BOARD)
-    code, told = run("clip", tmp_path / "clip.mkv", "--board", tmp_path / "board.json", "--calibrate", "--out", tmp_path / "track.json")
+    files = ("--board", tmp_path / "board.json", "--out", tmp_path / "track.json")
+    told = printed_by(app, "clip", tmp_path / "clip.mkv", *files, "--calibrate")
     track = read_track(tmp_path / "track.json")
-    assert code == 0 and "calibrated from" in told and "40 of 40 frames" in told
+    assert "calibrated from" in told and "40 of 40 frames" in told
     assert track.at(0).camera.focal_px[0] == pytest.approx(clip_of(640, 360, 1).camera(0).focal_px[0], rel=0.005)
 
 
@@ -303,9 +270,9 @@ def test_a_real_dark_clip_is_tracked_in_most_frames(shared_data: Path, tmp_path:
         pytest.skip("video/charuco_handheld.mp4 is not in the shared test data")
     board = CharucoBoard((CharucoGrid((5, 5), 28.8, 21.6),))
     write_board(tmp_path / "board.json", board)
-    code, _ = run("clip", path, "--board", tmp_path / "board.json", "--calibrate", "--out", tmp_path / "track.json")
+    printed_by(app, "clip", path, "--board", tmp_path / "board.json", "--calibrate", "--out", tmp_path / "track.json")
     track = read_track(tmp_path / "track.json")
-    assert code == 0 and 280.0 < track.at(track.numbers[0]).camera.focal_px[0] < 310.0
+    assert 280.0 < track.at(track.numbers[0]).camera.focal_px[0] < 310.0
     tracked = track_board(path, board, track.at(track.numbers[0]).camera)
     assert tracked.seen > 0.84 * 443 and len(track.frames) > 0.94 * 443
     assert tracked.residual_px < 0.4

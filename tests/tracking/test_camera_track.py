@@ -1,15 +1,22 @@
-"""CameraTrack: frames by number and by time, interpolation, axes. Numbers come from closed forms."""
+"""CameraTrack: frames by number and by time, interpolation, axes and their picture; intrinsics of a camera that was held upright."""
 
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from datasets_scripts.track_picture import axes_of, main, with_axes
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame, fixed_track
+from mrbokeh.tracking.camera_track.board_track import Intrinsics, intrinsics_of_clip
+from mrbokeh.tracking.camera_track.formats import write_track
+from mrbokeh.tracking.camera_track.track import DISTORTION_NAMES, CameraTrack, TrackedFrame, fixed_track
 from mrbokeh.tracking.world_axes import UPRIGHT_FROM_WORLD, upright_camera
+from tests.scenes.command_line import printed_by
+from tests.scenes.video_files import filmed
 
 
 def camera_at(place_m: tuple[float, float, float], turn: Rotation) -> Camera:
@@ -107,3 +114,96 @@ def test_tracks_that_cannot_be_are_refused() -> None:
             CameraTrack(frames, up)
     with pytest.raises(InputError, match="lens distortion is given by k1"):
         TrackedFrame(one.camera, distortion={"kappa": 0.1})
+
+
+LEVEL = Intrinsics(Camera(640, 360, (600.0, 620.0), (330.0, 170.0)), {"k1": -0.1, "p1": 0.01, "p2": -0.02, "k3": 0.03})
+POINTS_M = np.array([[0.1, -0.05, 1.0], [-0.2, 0.1, 1.0], [0.0, 0.15, 1.0], [0.25, 0.12, 1.0]])
+CLIP = Path("clip.mov")
+
+
+def seen_px(intrinsics: Intrinsics, points_m: np.ndarray) -> np.ndarray:
+    """By OpenCV's model of a lens."""
+    (fx, fy), (cx, cy) = intrinsics.camera.focal_px, intrinsics.camera.principal_px
+    coefficients = np.array([(intrinsics.distortion or {}).get(name, 0.0) for name in DISTORTION_NAMES])
+    matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+    return cv2.projectPoints(points_m, np.zeros(3), np.zeros(3), matrix, coefficients)[0].reshape(-1, 2)
+
+
+def turned_px(xy_px: np.ndarray, size_px: tuple[int, int], quarter_turns: int) -> np.ndarray:
+    """Where numpy's rot90 brings places of a picture."""
+    for _ in range(quarter_turns):
+        xy_px, size_px = np.stack([xy_px[:, 1], size_px[0] - xy_px[:, 0]], axis=1), size_px[::-1]
+    return xy_px
+
+
+@pytest.mark.parametrize("quarter_turns", [0, 1, 2, 3])
+def test_what_a_turned_camera_sees_is_what_the_level_one_saw_turned(quarter_turns: int) -> None:
+    """y points down: pictures turned counter-clockwise are those of a camera that was turned clockwise."""
+    size_px = (640, 360) if quarter_turns % 2 == 0 else (360, 640)
+    found = intrinsics_of_clip(LEVEL, size_px, quarter_turns, CLIP)
+    assert (found.camera.width_px, found.camera.height_px) == size_px
+    turn = Rotation.from_euler("z", -90.0 * quarter_turns, degrees=True)
+    if quarter_turns == 2:
+        # Of the same shape: nobody can tell, and no lens is known that well.
+        assert found.camera.principal_px == LEVEL.camera.principal_px
+        found = LEVEL.turned(2)
+    np.testing.assert_allclose(
+        seen_px(found, turn.apply(POINTS_M)), turned_px(seen_px(LEVEL, POINTS_M), (640, 360), quarter_turns), atol=1e-6
+    )
+
+
+def test_the_place_of_a_pixel_is_that_of_rot90() -> None:
+    picture = np.zeros((360, 640))
+    picture[20, 600] = 1.0
+    for turns in range(4):
+        (row,), (column,) = np.nonzero(np.rot90(picture, turns))
+        np.testing.assert_array_equal(turned_px(np.array([[600.5, 20.5]]), (640, 360), turns), [[column + 0.5, row + 0.5]])
+
+
+def test_another_size_of_the_same_shape_is_taken() -> None:
+    found = intrinsics_of_clip(LEVEL, (180, 320), 3, CLIP).camera
+    assert found.focal_px == (310.0, 300.0)
+
+
+@pytest.mark.parametrize(("size_px", "turns"), [((640, 480), 0), ((360, 640), 0), ((480, 640), 1)])
+def test_pictures_of_another_shape_are_refused(size_px: tuple[int, int], turns: int) -> None:
+    with pytest.raises(InputError, match=f"clip.mov .{size_px[0]}x{size_px[1]}., got those of 640x360"):
+        intrinsics_of_clip(LEVEL, size_px, turns, CLIP)
+
+
+CAMERA = Camera(160, 112, (100.0, 100.0), (80.5, 56.5))
+
+
+def drawn_axes(at_z_m: float, up: str) -> np.ndarray:
+    return with_axes(np.zeros((112, 160, 3), np.uint8), CAMERA, axes_of(up, 0.4), np.array([0.0, 0.0, at_z_m]))
+
+
+def test_axes_are_where_the_camera_sees_them() -> None:
+    """0.4 m to the right at 1 m is 40 px at a focal length of 100 px, and so is 0.4 m down; z runs towards the middle of the picture."""
+    drawn = drawn_axes(1.0, "-z")
+    assert drawn[56, 105].tolist() == [255, 40, 40] and drawn[85, 80].tolist() == [40, 220, 40]
+    assert drawn[56, 80].tolist() == [60, 110, 255]
+    assert drawn[56, 119:122].max() == 255 and not drawn[56, 123:].any(), "the side of the square, at 120.5"
+    assert not drawn[:14].any() and drawn[16, 60:100, 0].min() > 100, "its upper side, at 16.5"
+
+
+def test_up_is_blue() -> None:
+    """-y is up in the picture of a level camera."""
+    assert drawn_axes(2.0, "-y")[45, 80].tolist() == [60, 110, 255]
+    assert not (drawn_axes(2.0, "+y")[:50, 80] == [60, 110, 255]).all(1).any()
+
+
+def test_lines_behind_the_camera_are_left_out() -> None:
+    assert not drawn_axes(-1.0, "-z").any()
+
+
+def test_the_command_shows_three_frames(tmp_path: Path) -> None:
+    filmed(tmp_path / "clip.mkv", [np.full((112, 160, 3), 0.2, np.float32)] * 5)
+    write_track(tmp_path / "track.json", fixed_track(CAMERA))
+    words = [tmp_path / name for name in ("clip.mkv", "track.json", "track.png")]
+    printed_by(main, *words, "--at", "0,0,1", "--size-m", "0.4")
+    sheet = cv2.imread(str(words[2]))[..., ::-1]
+    assert sheet.shape == (112, 480, 3)
+    assert all(sheet[56, 105 + 160 * number].tolist() == [255, 40, 40] for number in range(3))
+    assert np.abs(sheet[5, 5].astype(int) - 124).max() <= 2, "linear 0.2 is 124 of 255 in sRGB"
+    assert "expected --at X,Y,Z" in printed_by(main, *words, "--at", "0,0", "--overwrite", exit_code=2)

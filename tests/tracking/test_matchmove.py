@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +25,9 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.formats import read_track
 from mrbokeh.tracking.camera_track.track import CameraTrack
 from mrbokeh.video.clip import probe
-from mrbokeh.video.writer import VideoWriter
-from tests.scenes.commands import printed_by
+from tests.scenes.command_line import printed_by
 from tests.scenes.textured_room import picture, room_camera, similarity
+from tests.scenes.video_files import filmed
 
 
 def walking(count: int) -> list[Camera]:
@@ -43,11 +42,8 @@ def turning(count: int) -> list[Camera]:
 
 
 def write_clip(path: Path, cameras: Sequence[Camera]) -> Path:
-    with VideoWriter(path, 400, 300, Fraction(24)) as video:
-        for number, camera in enumerate(cameras):
-            light = (picture(camera).astype(np.float32) / 255.0) ** 2.2
-            video.write(np.repeat(light[..., None], 3, axis=2).astype(np.float32), number / 24.0)
-    return path
+    light = ((picture(camera).astype(np.float32) / 255.0) ** 2.2 for camera in cameras)
+    return filmed(path, (np.repeat(each[..., None], 3, axis=2).astype(np.float32) for each in light), 24)
 
 
 def wall_points(count: int = 400) -> np.ndarray:
@@ -243,7 +239,7 @@ def test_a_camera_on_a_tripod_is_refused(tmp_path: Path) -> None:
     """COLMAP fails, or finds a model of one point, or one of thousands at 500 px for 380 with a parallax of 6 degrees."""
     pytest.importorskip("pycolmap")
     clip = write_clip(tmp_path / "clip.mkv", turning(25))
-    with pytest.raises(InputError, match="only to rotate|no match-move|too few to trust"):
+    with pytest.raises(InputError, match=r"only to rotate|no match-move|too few to trust"):
         printed_by(app, "matchmove", clip, "--out", tmp_path / "track.json", "--keyframes", 8)
     assert not (tmp_path / "track.json").exists()
 

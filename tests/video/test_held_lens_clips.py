@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import tifffile
 from PIL import Image
-from typer.testing import CliRunner
 
 from mrbokeh.commands.video import app
 from mrbokeh.images.image_io import read_image, read_layer, write_layer
@@ -17,8 +16,8 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.picture_source import open_source
-from mrbokeh.video.writer import VideoWriter
-from tests.scenes.video_files import turned_clip
+from tests.scenes.command_line import printed_by
+from tests.scenes.video_files import filmed, turned_clip
 
 WIDTH, HEIGHT = 96, 64
 # A heart has no symmetry but left and right, a tilt none. 25 mm of aperture, 51.3 mm to the sensor and 16 px per mm: 10 px at 1 m.
@@ -41,15 +40,12 @@ def blurred(folder: Path, clip: Path, quarters: int, lens: Lens, *more: str) -> 
     write_lens(folder / "lens.json", lens)
     words = [clip, *more, "--layer", folder / "layer.exr", "--lens", folder / "lens.json", "--out", folder / "out.%d.exr"]
     options = ["--virtual-only", "--frames", "0:1", "--workers", "1", "--renderer", "scatter", "--overwrite"]
-    done = CliRunner().invoke(app, [*map(str, words), *options], catch_exceptions=False)
-    assert done.exit_code == 0, done.output
+    printed_by(app, *words, *options)
     return read_layer(folder / "out.0.exr")
 
 
 def grey_video(folder: Path) -> Path:
-    with VideoWriter(folder / "level.mov", WIDTH, HEIGHT) as writer:
-        writer.write(np.full((HEIGHT, WIDTH, 3), 0.2, np.float32), 0.0)
-    return folder / "level.mov"
+    return filmed(folder / "level.mov", [np.full((HEIGHT, WIDTH, 3), 0.2, np.float32)])
 
 
 def photographs(folder: Path, suffix: str, quarters: int) -> Path:
@@ -100,13 +96,8 @@ def test_a_lens_described_upright_is_left_as_it_is(tmp_path: Path) -> None:
     clip = turned_clip(grey_video(tmp_path), tmp_path / "turned.mov", 90)
     tall = replace(LENS, sensor_width_mm=4.0, sensor_height_mm=6.0)
     still = blurred(tmp_path, clip, 1, tall)
-    np.testing.assert_allclose(still.alpha, blurred(tmp_path, _upright_video(tmp_path), 1, tall).alpha, atol=2**-11)
-
-
-def _upright_video(folder: Path) -> Path:
-    with VideoWriter(folder / "upright.mov", HEIGHT, WIDTH) as writer:
-        writer.write(np.full((WIDTH, HEIGHT, 3), 0.2, np.float32), 0.0)
-    return folder / "upright.mov"
+    upright = filmed(tmp_path / "upright.mov", [np.full((WIDTH, HEIGHT, 3), 0.2, np.float32)])
+    np.testing.assert_allclose(still.alpha, blurred(tmp_path, upright, 1, tall).alpha, atol=2**-11)
 
 
 def test_photographs_that_turn_amid_the_sequence_are_refused(tmp_path: Path) -> None:

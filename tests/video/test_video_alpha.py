@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from fractions import Fraction
 from pathlib import Path
 
 import av
@@ -25,9 +24,8 @@ from mrbokeh.video.clip import read_frames
 from mrbokeh.video.color import color_of
 from mrbokeh.video.frames import has_alpha, linear_rgb, stored_alpha
 from mrbokeh.video.picture_source import PictureSource, open_source
-from mrbokeh.video.writer import VideoWriter
 from tests.scenes.shot_makers import Brighter
-from tests.scenes.video_files import encoded, turned_clip
+from tests.scenes.video_files import encoded, filmed, turned_clip
 from tests.scenes.video_files import video as run
 
 WIDTH, HEIGHT, COUNT = 96, 64, 5
@@ -53,10 +51,8 @@ def clip_of(folder: Path, kind: str) -> tuple[Path, list[str]]:
     """The clip's name, and what the command line needs beside it."""
     path = folder / CLIPS[kind]
     if kind in ("prores", "ffv1"):
-        with VideoWriter(path, WIDTH, HEIGHT, encoding={"prores": "prores4444-alpha", "ffv1": "ffv1-alpha"}[kind]) as writer:
-            for i in range(COUNT):
-                writer.write(np.dstack(picture(i)).astype(np.float32), i / 25)
-        return path, []
+        encoding = {"prores": "prores4444-alpha", "ffv1": "ffv1-alpha"}[kind]
+        return filmed(path, (np.dstack(picture(i)).astype(np.float32) for i in range(COUNT)), encoding=encoding), []
     for i in range(COUNT):
         write_finished(Path(str(path) % i), *picture(i))
     return path, ["--rate", "25"]
@@ -239,16 +235,14 @@ def test_blurred_coverage_is_put_before_the_clips(settings: list[str], tmp_path:
 def test_where_alpha_does_not_matter_nothing_is_told(settings: list[str], tmp_path: Path) -> None:
     clip, more = clip_of(tmp_path, "png")
     assert "warning" not in run(clip, *more, *settings, "--virtual-only", "--out", tmp_path / "virtual.mkv")
-    with VideoWriter(tmp_path / "opaque.mkv", WIDTH, HEIGHT) as writer:
-        writer.write(np.full((HEIGHT, WIDTH, 3), 0.2, np.float32), 0.0)
-    assert "warning" not in run(tmp_path / "opaque.mkv", *settings, "--out", tmp_path / "opaque.mp4")
+    opaque = filmed(tmp_path / "opaque.mkv", [np.full((HEIGHT, WIDTH, 3), 0.2, np.float32)])
+    assert "warning" not in run(opaque, *settings, "--out", tmp_path / "opaque.mp4")
 
 
 @pytest.mark.parametrize("suffix", ["png", "exr", "mkv"])
 def test_alpha_of_opaque_clips_is_never_read(tmp_path: Path, suffix: str, monkeypatch: pytest.MonkeyPatch) -> None:
     grey = np.full((HEIGHT, WIDTH, 3), 0.2, np.float32)
-    with VideoWriter(tmp_path / "in.mkv", WIDTH, HEIGHT, Fraction(25)) as writer:
-        writer.write(grey, 0.0)
+    filmed(tmp_path / "in.mkv", [grey])
     for each in ("png", "exr"):
         write_finished(tmp_path / f"in.0.{each}", grey)
     source = open_source(tmp_path / "in.mkv") if suffix == "mkv" else open_source(tmp_path / f"in.%d.{suffix}", "25")

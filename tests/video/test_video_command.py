@@ -9,9 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from mrbokeh.commands.video import app, parse_frames
+from mrbokeh.commands.video import parse_frames
 from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.compositing.plate import plate_of
 from mrbokeh.images.exr_io import ExrPart, write_exr
@@ -29,6 +28,8 @@ from mrbokeh.video.writer import VideoWriter
 from tests.compositing.test_plate_look_options import photo_with_exif
 from tests.scenes.shot_makers import wait_for
 from tests.scenes.stage_scenes import HEIGHT, ONE_CARD, WIDTH, camera, scene_file
+from tests.scenes.video_files import filmed
+from tests.scenes.video_files import video as run
 from tests.stacks.test_exr_layers_cryptomatte import beauty, crypto_channels, header
 
 LENS = Lens(focal_length_mm=50.0, f_number=2.0, focus_distance_m=2.0, sensor_width_mm=6.0)
@@ -60,14 +61,6 @@ def settings(tmp_path: Path) -> list[str]:
     write_layer(tmp_path / "layer.exr", square(96, 64), half=False)
     write_lens(tmp_path / "lens.json", LENS)
     return ["--layer", str(tmp_path / "layer.exr"), "--lens", str(tmp_path / "lens.json")]
-
-
-def run(*arguments: object) -> str:
-    """What the command prints; its errors are raised here. One process, unless told otherwise."""
-    alone = () if "--workers" in arguments or "--help" in arguments else ("--workers", "1")
-    result = CliRunner().invoke(app, [*map(str, arguments), *alone], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
 
 
 def test_every_frame_is_the_composite_of_the_library(clip: Path, settings: list[str], tmp_path: Path) -> None:
@@ -119,10 +112,6 @@ def test_mistakes_end_in_a_sentence(clip: Path, settings: list[str], tmp_path: P
     with pytest.raises(InputError, match="nothing to put into the clip"):
         run(clip, "--lens", tmp_path / "lens.json", "--out", tmp_path / "out.mov")
     assert not list(tmp_path.glob("out.mov*"))
-
-
-def test_help_shows_an_example() -> None:
-    assert "Example: mrbokeh video" in run("--help")
 
 
 HELD_COMMAND = """
@@ -214,10 +203,7 @@ def test_layers_and_depth_of_each_frame(clip: Path, tmp_path: Path) -> None:
 
 def test_a_scene_is_rendered_per_frame(tmp_path: Path) -> None:
     """A card of light 0.2 m high stands 1 m before a fixed camera: it covers 0.2 * 150 = 30 px; of a shut lens, exactly."""
-    clip = tmp_path / "grey.mkv"
-    with VideoWriter(clip, WIDTH, HEIGHT, Fraction(25)) as writer:
-        for i in range(3):
-            writer.write(np.full((HEIGHT, WIDTH, 3), 0.25, np.float32), i / 25)
+    clip = filmed(tmp_path / "grey.mkv", [np.full((HEIGHT, WIDTH, 3), 0.25, np.float32)] * 3)
     scene = scene_file(tmp_path, ONE_CARD)
     write_json(tmp_path / "camera.json", camera_to_json(camera()))
     write_lens(tmp_path / "pinhole.json", Lens(50.0, 5000.0, 1.0, 36.0))

@@ -13,6 +13,7 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import probe, read_display_frames, read_frames
 from mrbokeh.video.color import code_from_linear, decode_table, encode_table, linear_from_code, rec709_from_primaries
 from mrbokeh.video.writer import VideoWriter
+from tests.scenes.video_files import encoded, filmed
 
 LUMA = {"709": (0.2126, 0.0722), "601": (0.299, 0.114)}
 H273 = {"709": 1, "601": 6, "untagged": 2}
@@ -30,20 +31,10 @@ def bars(width_px: int = 320, height_px: int = 256) -> tuple[np.ndarray, np.ndar
     return codes, inner
 
 
-def write_yuv444(
-    path: Path, planes: Sequence[np.ndarray], *, matrix: int = 2, code_range: int = 0, trc: int = 2, primaries: int = 2
-) -> None:
-    """One lossless frame of 8-bit luma and chroma with the tags given, written past the code under test."""
-    height, width = planes[0].shape
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("ffv1", rate=25)
-        stream.width, stream.height, stream.pix_fmt = width, height, "yuv444p"
-        context = stream.codec_context
-        context.colorspace, context.color_range, context.color_trc, context.color_primaries = matrix, code_range, trc, primaries
-        frame = av.VideoFrame.from_ndarray(np.stack(planes), "yuv444p")
-        frame.colorspace, frame.color_range, frame.color_trc, frame.color_primaries = matrix, code_range, trc, primaries
-        container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
+def write_yuv444(path: Path, planes: Sequence[np.ndarray], matrix: int = 2, code_range: int = 0, trc: int = 2, primaries: int = 2) -> None:
+    """One lossless frame of 8-bit luma and chroma with the tags given."""
+    frame = av.VideoFrame.from_ndarray(np.stack(planes), "yuv444p")
+    encoded(path, "ffv1", "yuv444p", frame, colorspace=matrix, color_range=code_range, color_trc=trc, color_primaries=primaries)
 
 
 def rgb_by_h273(planes: Sequence[np.ndarray], matrix: str, *, full: bool) -> np.ndarray:
@@ -75,10 +66,7 @@ def rgb_by_h273(planes: Sequence[np.ndarray], matrix: str, *, full: bool) -> np.
 )
 def test_colour_bars_survive(tmp_path: Path, encoding: str, suffix: str, mean_error: float, largest_error: float) -> None:
     codes, inner = bars()
-    path = tmp_path / f"bars{suffix}"
-    with VideoWriter(path, 320, 256, Fraction(25), encoding=encoding) as writer:
-        for i in range(5):
-            writer.write(linear_from_code(codes, "bt709"), i / 25)
+    path = filmed(tmp_path / f"bars{suffix}", [linear_from_code(codes, "bt709")] * 5, encoding=encoding)
     frames = list(read_frames(path))
     assert [frame.time_s for frame in frames] == pytest.approx([i / 25 for i in range(5)], abs=1e-9)
     error = (code_from_linear(frames[3].rgb, "bt709") - codes)[inner]
@@ -94,9 +82,7 @@ def test_players_find_the_tags_that_they_know(tmp_path: Path) -> None:
     """QuickTime plays H.265 in MP4 and MOV as hvc1 only; ffprobe's names of the others."""
     tags = {"h265-10bit": "hvc1", "h264": "avc1", "prores4444-alpha": "ap4h", "prores422": "apch", "dnxhr-hqx": "AVdh"}
     for encoding, tag in tags.items():
-        path = tmp_path / f"{encoding}.mov"
-        with VideoWriter(path, 320, 256, encoding=encoding) as writer:
-            writer.write(np.full((256, 320, 3), 0.18, np.float32), 0.0)
+        path = filmed(tmp_path / f"{encoding}.mov", [np.full((256, 320, 3), 0.18, np.float32)], encoding=encoding)
         with av.open(str(path)) as container:
             assert container.streams.video[0].codec_context.codec_tag == tag
 
@@ -105,8 +91,7 @@ def test_alpha_is_stored_beside_straight_colour(tmp_path: Path) -> None:
     """A ramp of coverage over one colour: 10 bit of alpha, and the colour is the same wherever it is seen."""
     alpha = np.linspace(0, 1, 320, dtype=np.float32)[None].repeat(256, 0)
     picture = np.dstack([alpha * light for light in (0.5, 0.3, 0.2)] + [alpha]).astype(np.float32)
-    with VideoWriter(tmp_path / "ramp.mov", 320, 256, encoding="prores4444-alpha") as writer:
-        writer.write(picture, 0.0)
+    filmed(tmp_path / "ramp.mov", [picture], encoding="prores4444-alpha")
     with av.open(str(tmp_path / "ramp.mov")) as container:
         stored = next(container.decode(video=0))
     assert stored.format.name == "yuva444p12le"
@@ -149,20 +134,13 @@ def test_tags_decide_and_missing_tags_follow_the_size(
 )
 def test_every_kind_of_storage_means_the_same_grey(tmp_path: Path, pixel_format: str) -> None:
     """Luma 126 of 8-bit limited range is (126 - 16) / 219; RGB and grey (full range) store the nearest code to it."""
-    grey, path = (126 - 16) / 219, tmp_path / "grey.nut"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("rawvideo", rate=25)
-        stream.width, stream.height, stream.pix_fmt = 64, 32, pixel_format
-        frame = av.VideoFrame(64, 32, pixel_format)
-        bits, full = frame.format.components[0].bits, frame.format.is_rgb or pixel_format.startswith("gray")
-        luma = round(grey * (2**bits - 1)) if full else 126 << (bits - 8)
-        for i, plane in enumerate(frame.planes):
-            code = luma if i == 0 or frame.format.is_rgb else 128 << (bits - 8)
-            plane.update(code.to_bytes(1 if bits == 8 else 2, "little") * (plane.buffer_size // (1 if bits == 8 else 2)))
-        frame.color_range = 2 if full else 1
-        stream.codec_context.color_range = frame.color_range
-        container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
+    grey, frame = (126 - 16) / 219, av.VideoFrame(64, 32, pixel_format)
+    bits, full = frame.format.components[0].bits, frame.format.is_rgb or pixel_format.startswith("gray")
+    luma = round(grey * (2**bits - 1)) if full else 126 << (bits - 8)
+    for i, plane in enumerate(frame.planes):
+        code = luma if i == 0 or frame.format.is_rgb else 128 << (bits - 8)
+        plane.update(code.to_bytes(1 if bits == 8 else 2, "little") * (plane.buffer_size // (1 if bits == 8 else 2)))
+    path = encoded(tmp_path / "grey.nut", "rawvideo", pixel_format, frame, color_range=2 if full else 1)
     error = code_from_linear(next(read_frames(path)).rgb, "bt709") - grey
     assert np.abs(error).max() < 0.5 / (2**bits - 1) + 1e-5
     for width_px in (64, 32):
@@ -196,9 +174,7 @@ def test_chroma_does_not_wander(tmp_path: Path, encoding: str, suffix: str, larg
         codes = np.stack([0.5 + 0.2 * sign * (2 * ramp - 1), np.full_like(ramp, 0.4), 0.5 - 0.2 * sign * (2 * ramp - 1)], -1)
         codes = codes[None].repeat(64, axis=0).astype(np.float32)
         codes = codes.transpose(1, 0, 2) if vertical else codes
-        path = tmp_path / f"ramp{suffix}"
-        with VideoWriter(path, 64, 64, encoding=encoding) as writer:
-            writer.write(linear_from_code(codes, "bt709"), 0.0)
+        path = filmed(tmp_path / f"ramp{suffix}", [linear_from_code(codes, "bt709")], encoding=encoding)
         error = (code_from_linear(next(read_frames(path)).rgb, "bt709") - codes)[8:-8, 8:-8]
         shifts_px.append(sign * (error[..., 0] - error[..., 2]).mean() / 2 * 64 / 0.4)
     assert abs(np.mean(shifts_px)) < largest_px
@@ -299,14 +275,9 @@ def test_a_crooked_clip_is_refused(tmp_path: Path) -> None:
 
 
 def _write_turned(path: Path, codes: np.ndarray, turn_deg: int) -> None:
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=25, options={"crf": "1"})
-        stream.width, stream.height, stream.pix_fmt = codes.shape[1], codes.shape[0], "yuv420p"
-        stream.codec_context.colorspace, stream.codec_context.color_range = 1, 1
-        stream.set_display_rotation(turn_deg)
-        frame = av.VideoFrame.from_ndarray(np.rint(codes * 255).astype(np.uint8), "rgb24")
-        container.mux(stream.encode(frame.reformat(format="yuv420p", dst_colorspace=1, src_color_range=2, dst_color_range=1)))
-        container.mux(stream.encode(None))
+    frame = av.VideoFrame.from_ndarray(np.rint(codes * 255).astype(np.uint8), "rgb24")
+    frame = frame.reformat(format="yuv420p", dst_colorspace=1, src_color_range=2, dst_color_range=1)
+    encoded(path, "libx264", "yuv420p", frame, turn_deg=turn_deg, options={"crf": "1"}, colorspace=1, color_range=1)
 
 
 def test_what_cannot_be_shown_rightly_is_refused(tmp_path: Path) -> None:
@@ -327,29 +298,15 @@ def test_what_cannot_be_shown_rightly_is_refused(tmp_path: Path) -> None:
         probe(tmp_path / "absent.mp4")
 
 
-def test_stretched_pixels_are_refused(tmp_path: Path) -> None:
-    path = tmp_path / "wide.mp4"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=25, options={"x264-params": "sar=4/3"})
-        stream.width, stream.height, stream.pix_fmt = 64, 48, "yuv420p"
-        container.mux(stream.encode(av.VideoFrame(64, 48, "yuv420p")))
-        container.mux(stream.encode(None))
+def test_stretched_and_interlaced_video_is_refused(tmp_path: Path) -> None:
+    blank = av.VideoFrame(64, 48, "yuv420p")
+    encoded(tmp_path / "wide.mp4", "libx264", "yuv420p", blank, options={"x264-params": "sar=4/3"})
     with pytest.raises(InputError, match="not square"):
-        probe(path)
-
-
-def test_interlaced_video_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "fields.mpg"
-    with av.open(str(path), "w") as container:
-        stream = container.add_stream("mpeg2video", rate=25, options={"flags": "+ildct+ilme"})
-        stream.width, stream.height, stream.pix_fmt = 64, 64, "yuv420p"
-        for i in range(3):
-            frame = av.VideoFrame.from_ndarray(np.full((96, 64), 40 * i + 16, np.uint8), "yuv420p")
-            frame.pts = i
-            container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
+        probe(tmp_path / "wide.mp4")
+    greys = [av.VideoFrame.from_ndarray(np.full((96, 64), 40 * i + 16, np.uint8), "yuv420p") for i in range(3)]
+    encoded(tmp_path / "fields.mpg", "mpeg2video", "yuv420p", *greys, options={"flags": "+ildct+ilme"})
     with pytest.raises(InputError, match="interlaced"):
-        probe(path)
+        probe(tmp_path / "fields.mpg")
 
 
 def test_a_broken_off_video_leaves_nothing(tmp_path: Path) -> None:

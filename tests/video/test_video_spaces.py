@@ -1,14 +1,11 @@
 """`mrbokeh video` in colour spaces of OpenColorIO: numbers of the cameras' own documents in, the same numbers out."""
 
-from fractions import Fraction
 from pathlib import Path
 
 import av
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from mrbokeh.commands.video import app
 from mrbokeh.images.exr_io import AP1, ExrPart, read_exr, write_exr
 from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer
 from mrbokeh.images.layer import Layer
@@ -16,7 +13,8 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import read_frames
-from mrbokeh.video.writer import VideoWriter
+from tests.scenes.video_files import encoded, filmed
+from tests.scenes.video_files import video as run
 
 pytest.importorskip("PyOpenColorIO")
 
@@ -28,10 +26,7 @@ RED_IN_AP1 = (0.6131, 0.0702, 0.0206)
 
 
 def clip_of_codes(path: Path, code: float, encoding: str | None = None) -> Path:
-    with VideoWriter(path, WIDTH, HEIGHT, Fraction(25), encoding=encoding, as_codes=True) as writer:
-        for i in range(3):
-            writer.write(np.full((HEIGHT, WIDTH, 3), code, np.float32), i / 25)
-    return path
+    return filmed(path, [np.full((HEIGHT, WIDTH, 3), code, np.float32)] * 3, encoding=encoding, as_codes=True)
 
 
 @pytest.fixture
@@ -43,11 +38,6 @@ def settings(tmp_path: Path) -> list[str]:
     write_layer(tmp_path / "layer.exr", Layer(rgb, alpha, np.where(alpha > 0, np.float32(2.0), np.float32(np.inf))), half=False)
     write_lens(tmp_path / "lens.json", Lens(50.0, 2.0, 2.0, 6.0))
     return ["--layer", str(tmp_path / "layer.exr"), "--lens", str(tmp_path / "lens.json"), "--workers", "1"]
-
-
-def run(*words: object) -> None:
-    result = CliRunner().invoke(app, [*map(str, words)], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
 
 
 def codes_of(path: Path) -> tuple[np.ndarray, int, int]:
@@ -124,15 +114,9 @@ def test_a_virtual_layer_keeps_its_coverage_through_a_curve(tmp_path: Path, sett
 def test_video_of_high_dynamic_range_is_read_where_its_space_is_named(tmp_path: Path, settings: list[str]) -> None:
     """A clip tagged PQ is refused, unless the user says what its codes are; reference white, 203 cd/m2, is 0.58 of PQ (BT.2408)."""
     clip = tmp_path / "pq.mkv"
-    with av.open(str(clip), "w") as container:
-        stream = container.add_stream("ffv1", rate=25)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "gbrp16le"
-        stream.codec_context.color_trc, stream.codec_context.color_primaries = 16, 9
-        codes = np.full((HEIGHT, WIDTH, 3), round(0.58 * 65535), np.uint16)
-        frame = av.VideoFrame.from_ndarray(codes, "rgb48le").reformat(format="gbrp16le")
-        frame.pts, frame.time_base, frame.color_trc, frame.color_primaries = 0, Fraction(1, 25), 16, 9
-        container.mux(stream.encode(frame))
-        container.mux(stream.encode(None))
+    codes = np.full((HEIGHT, WIDTH, 3), round(0.58 * 65535), np.uint16)
+    frame = av.VideoFrame.from_ndarray(codes, "rgb48le").reformat(format="gbrp16le")
+    encoded(clip, "ffv1", "gbrp16le", frame, color_trc=16, color_primaries=9)
     with pytest.raises(InputError, match="HDR video"):
         run(clip, *settings, "--out", tmp_path / "no.%d.exr")
     run(clip, *settings, "--input-space", "Rec.2100-PQ - Display", "--out", tmp_path / "out.%d.exr")

@@ -34,7 +34,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from mrbokeh.system.errors import InputError
-from tests.scenes.commands import printed_by
+from tests.scenes.command_line import printed_by
 
 FOCUS = np.linspace(1.6, 0.5, 10)
 LENS = Lens(35.0, 2.0, 1.0, 23.5)

@@ -10,8 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from capture.commands.dataset import dataset_command
 from capture.dataset.stack_writer import RadianceHistogram, StackWriting, coc_maps, largest_coc_px
@@ -21,8 +19,9 @@ from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from mrbokeh.stacks.focal_stack_dataset import network_blocks, read_focal_stack_dataset
+from mrbokeh.stacks.focal_stack_dataset import read_focal_stack_dataset
 from mrbokeh.system.errors import InputError
+from tests.scenes.command_line import printed_by
 
 SIZE = (24, 32)
 LENS = Lens(50.0, 1.4, 1.0, 36.0)
@@ -98,11 +97,6 @@ def test_largest_blur_counts_what_is_not_excluded(tmp_path: Path) -> None:
     expected_px = nearest.coc_px_per_dioptre(SIZE[1]) * (1 / 0.8 - 1 / 2.0)
     assert record.largest_coc_px == pytest.approx(expected_px, rel=1e-5)
     assert record.excluded_shares["any"] == 8 / 32 and record.excluded_shares["moving"] == 4 / 32 and record.excluded_shares["board"] == 0.0
-
-
-def test_the_networks_size_covers_the_blur() -> None:
-    """Kernels of 2 N + 1: 81 px, the paper's large lens, needs N = 40; 7.2 px needs 4 (a kernel of 9)."""
-    assert [network_blocks(each) for each in (81.0, 7.2, 7.0, 0.3)] == [40, 4, 3, 1]
 
 
 def test_the_radiance_scale_is_one_number_for_all(scenes: list[Path], tmp_path: Path) -> None:
@@ -239,17 +233,14 @@ def test_bad_input_gets_one_sentence(scenes: list[Path], tmp_path: Path) -> None
 
 
 def test_the_command_writes_and_verifies(scenes: list[Path], tmp_path: Path) -> None:
-    app = typer.Typer()
-    app.command()(dataset_command)
     (tmp_path / "licence.md").write_text("CC BY 4.0, Jane Doe\n")
     out = tmp_path / "out"
-    arguments = [*map(str, scenes), "--out", str(out), "--licence", str(tmp_path / "licence.md"), "--test", "view_2"]
-    result = CliRunner().invoke(app, arguments)
-    assert result.exit_code == 0 and "4 stacks to train on, 1 to test on" in result.output
+    told = printed_by(dataset_command, *scenes, "--out", out, "--licence", tmp_path / "licence.md", "--test", "view_2")
+    assert "4 stacks to train on, 1 to test on" in told
     assert read_focal_stack_dataset(out).licence == "CC BY 4.0, Jane Doe\n"
-    assert CliRunner().invoke(app, ["--out", str(out), "--verify"]).exit_code == 0
+    printed_by(dataset_command, "--out", out, "--verify")
     (out / "a/view_0/stack.json").unlink()
-    assert CliRunner().invoke(app, ["--out", str(out), "--verify"]).exit_code == 1
+    printed_by(dataset_command, "--out", out, "--verify", exit_code=1)
 
 
 @pytest.mark.slow

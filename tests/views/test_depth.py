@@ -23,7 +23,7 @@ from mrbokeh.stacks.focal_stack import find_focal_stacks, read_focal_stack
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.errors import InputError
 from tests.scenes.capture_truth import ViewTruth, picture_db, view_truth
-from tests.scenes.commands import printed_by
+from tests.scenes.command_line import printed_by
 
 RAW = DATA / "raw_stack"
 POINTS_A_VIEW = 400

@@ -187,7 +187,6 @@ def test_what_moved_is_found_where_it_moved(truth: TracedStack, tmp_path: Path) 
     transient = np.concatenate([truth.slices[:3], later.slices[3:4], truth.slices[4:]])
     found = examined(write_stack(tmp_path / "view_0", replace(truth, slices=transient))).moving
     differs = (np.abs(truth.all_in_focus - later.all_in_focus).max(axis=2) > 0.1) & inside(truth.depth_m.shape)
-    assert found is not None
     assert found[differs].mean() > 0.75
     # Blur of up to 10 px carries the change beyond its outline; farther off nothing is marked.
     assert found.mean() < 3.0 * differs.mean()

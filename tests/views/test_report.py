@@ -8,13 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
+from capture.commands.report import report_command
 from capture.poses.sparse_model import SparseModel, SparseView, write_sparse_model
 from capture.report.exclusion import REASONS, board_mask, exclusion_masks
 from capture.report.findings import SliceFindings, StackFindings, focus_curve, focus_spacing
 from capture.report.picture_sharpness import PictureFindings
-from capture.report.registration_check import drift_of, registration_drift
+from capture.report.registration_check import drift_of
 from capture.report.scene_gates import Reconstruction, scales_in, scene_gates
 from capture.report.scene_report import SceneReport, poses_view, report_scene, scene_of
 from capture.report.slice_fit import low_frequency_gain
@@ -28,6 +28,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
 from mrbokeh.system.atomic_files import write_json
+from tests.scenes.command_line import printed_by
 from tests.scenes.traced_focal_stack import FOCUS_M, traced, write_stack
 
 REBLUR = Reblur(PolygonDifferences(layering=Layering(slices=8), threads=1))
@@ -133,17 +134,10 @@ def test_the_report_leaves_exclusion_masks_with_the_stack(reported: Path) -> Non
 
 def test_strict_is_told_by_the_exit_code(tmp_path: Path) -> None:
     """A stack that is not merged: quick to judge, and a failure."""
-    import typer
-
-    from capture.commands.report import report_command
-
-    app = typer.Typer()
-    app.command()(report_command)
     folder = tmp_path / "view_0"
     write_focal_stack(FocalStack(folder, (Slice("a.exr", 1.0),)))
-    assert CliRunner().invoke(app, [str(tmp_path)]).exit_code == 0
-    strict = CliRunner().invoke(app, [str(tmp_path), "--strict"])
-    assert strict.exit_code == 1 and "failed: scene: all stacks merged" in strict.output
+    printed_by(report_command, tmp_path)
+    assert "failed: scene: all stacks merged" in printed_by(report_command, tmp_path, "--strict", exit_code=1)
 
 
 def test_a_stack_without_lens_is_judged_by_what_is_there(tmp_path: Path) -> None:
@@ -185,10 +179,6 @@ def test_registration_is_read_as_movement() -> None:
     np.testing.assert_allclose(drift.magnification, [1, 1, 1.01])
     assert drift.largest_jump_px == pytest.approx(np.hypot(3, 1))
     assert drift.least_correlation == 0.7 and drift.width_px == 160
-
-
-def test_a_stack_that_was_not_registered_has_no_drift() -> None:
-    assert registration_drift(FocalStack(Path("nowhere"), (Slice("a.exr", 1.0),)), 10, 10) is None
 
 
 def test_a_jump_or_a_pair_that_does_not_match_fails_registration(scene: Path, tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from capture.report import report_cache, stack_view
 from capture.report.examination import examine
@@ -24,6 +23,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack, write_focal_stack
 from mrbokeh.system.atomic_files import read_json, write_json
+from tests.scenes.command_line import printed_by
 from tests.scenes.traced_focal_stack import HEIGHT_PX, SLICES, WIDTH_PX, traced, write_stack
 
 NAMES = ("view_0", "view_1")
@@ -216,12 +216,8 @@ def test_finished_stacks_hold_neither_pictures_nor_maps(reported: Path) -> None:
 
 def test_the_command_tells_what_was_kept(tmp_path: Path) -> None:
     """Examined, kept, examined again. Without a lens nothing is rendered."""
-    import typer
-
     from capture.commands.report import report_command
 
-    app = typer.Typer()
-    app.command()(report_command)
     write_focal_stack(replace(write_stack(tmp_path / "view_0", traced()), lens=None))
-    told = [CliRunner().invoke(app, [str(tmp_path), *more]).output for more in ([], [], ["--overwrite"])]
+    told = [printed_by(report_command, tmp_path, *more) for more in ([], [], ["--overwrite"])]
     assert ["1 of 1 stacks were examined before" in each for each in told] == [False, True, False]

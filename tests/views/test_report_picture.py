@@ -2,16 +2,13 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-import typer
 from jaxtyping import Float32
-from typer.testing import CliRunner
 
 from capture.commands.process import process_command
 from capture.commands.report import report_command
@@ -28,6 +25,7 @@ from mrbokeh.images.image_io import read_image
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.errors import InputError
+from tests.scenes.command_line import printed_by
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Made = tuple[list[Rgb], Rgb]
@@ -303,50 +301,39 @@ def test_a_picture_too_small_to_be_judged_never_passes(tmp_path: Path) -> None:
     assert "Not passed: not all gates of the all-in-focus pictures could be judged." in page and "nobody looked" not in page
 
 
-def app(command: Callable[..., None]) -> typer.Typer:
-    made = typer.Typer()
-    made.command()(command)
-    return made
-
-
 def test_strict_asks_for_every_gate(tmp_path: Path) -> None:
     """A right stack without lens: 1 for the gates that could not be judged, 0 where each of them was allowed, 1 where one was not."""
     write_made(tmp_path / "view_0", right())
-    plain = CliRunner().invoke(app(report_command), [str(tmp_path)])
-    assert plain.exit_code == 0 and "9 of 20 gates judged, 0 failed, 11 absent: all viewpoints placed" in plain.output
-    assert "--strict" not in plain.output
-    assert "all-in-focus pictures: passed: as sharp as its slices, no seams, no invented light" in plain.output
-    assert "absent: all viewpoints placed, points lie where they are seen, scales agree: no reconstruction" in plain.output
+    plain = printed_by(report_command, tmp_path)
+    assert "9 of 20 gates judged, 0 failed, 11 absent: all viewpoints placed" in plain and "--strict" not in plain
+    assert "all-in-focus pictures: passed: as sharp as its slices, no seams, no invented light" in plain
+    assert "absent: all viewpoints placed, points lie where they are seen, scales agree: no reconstruction" in plain
     absences = [each.name for each in report_scene(tmp_path).absences]
     allowed = [option for name in absences for option in ("--allow-absent", name.upper())]
-    assert CliRunner().invoke(app(report_command), [str(tmp_path), "--strict"]).exit_code == 1
-    assert CliRunner().invoke(app(report_command), [str(tmp_path), "--strict", *allowed]).exit_code == 0
-    assert CliRunner().invoke(app(report_command), [str(tmp_path), "--strict", *allowed[2:]]).exit_code == 1
+    for options, exit_code in (((), 1), (allowed, 0), (allowed[2:], 1)):
+        printed_by(report_command, tmp_path, "--strict", *options, exit_code=exit_code)
 
 
 def test_strict_fails_on_a_fault_whatever_is_allowed(tmp_path: Path) -> None:
     write_made(tmp_path / "view_0", lost_disc())
     allowed = [option for name in GATE_NAMES for option in ("--allow-absent", name)]
-    failed = CliRunner().invoke(app(report_command), [str(tmp_path), "--strict", *allowed])
-    assert failed.exit_code == 1
-    *lines, last = CliRunner().invoke(app(report_command), [str(tmp_path)]).output.splitlines()
+    failed = printed_by(report_command, tmp_path, "--strict", *allowed, exit_code=1)
+    *lines, last = printed_by(report_command, tmp_path).splitlines()
     count = sum(each.startswith("failed: ") for each in lines)
     assert count and last.startswith(f"{count} gate{'s' if count > 1 else ''} failed: --strict would make this an error")
-    line = next(each for each in failed.output.splitlines() if each.startswith("failed: "))
+    line = next(each for each in failed.splitlines() if each.startswith("failed: "))
     assert f"view_0: {SHARP.name}: " in line and "Look at the crops." in line, "what failed, and what to do"
 
 
 @pytest.mark.parametrize("command", [report_command, process_command])
 def test_a_gate_that_nobody_knows_is_refused_before_the_work(command: Callable[..., None], tmp_path: Path) -> None:
-    arguments = [str(tmp_path)] + (["--out", str(tmp_path / "scene")] if command is process_command else [])
-    refused = CliRunner().invoke(app(command), [*arguments, "--strict", "--allow-absent", "no seems"])
-    assert isinstance(refused.exception, InputError)
-    assert '"no seems"' in str(refused.exception) and '"no seams"' in str(refused.exception)
-    idle = CliRunner().invoke(app(command), [*arguments, "--allow-absent", "no seams"])
-    assert isinstance(idle.exception, InputError) and "--strict" in str(idle.exception)
+    arguments = [tmp_path, *(["--out", tmp_path / "scene"] if command is process_command else [])]
+    with pytest.raises(InputError, match=r'"no seems".*"no seams"'):
+        printed_by(command, *arguments, "--strict", "--allow-absent", "no seems")
+    with pytest.raises(InputError, match="--strict"):
+        printed_by(command, *arguments, "--allow-absent", "no seams")
     assert not (tmp_path / "report.html").exists() and not (tmp_path / "scene").exists()
 
 
 def test_names_of_gates_are_told_apart() -> None:
     assert len(set(GATE_NAMES)) == len(GATE_NAMES) == 20
-    assert replace(NeighbourDisplacement(0, 1.4, 0.3, (0, 0)), error_px=0.6).exceeds(1.0) is False

@@ -23,7 +23,7 @@ from capture.scale.board import (
     triangulate,
     umeyama,
 )
-from capture.scale.focus import FocusSample, SharpnessPeaks, focus_scale, sharpness_curves, sharpness_peaks, stated_sigma_dioptre
+from capture.scale.focus import FocusSample, focus_scale, sharpness_curves, sharpness_peaks, stated_sigma_dioptre
 from mrbokeh.optics.camera import Camera
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
 from mrbokeh.system.errors import InputError
@@ -280,8 +280,3 @@ def test_the_board_counts_most_and_the_others_are_kept(tmp_path: Path) -> None:
 def test_no_answer_at_all_tells_what_each_looked_for() -> None:
     with pytest.raises(InputError, match="board: none was given; focus: unknown"):
         ScaleResult.of([], {"focus": "unknown", "board": "none was given"})
-
-
-def test_peaks_remember_their_points() -> None:
-    peaks = SharpnessPeaks(np.array([4]), np.log([[1.0], [2.0], [1.0]]), np.array([1]))
-    np.testing.assert_allclose(peaks.dioptres(np.array([1.5, 1.0, 0.5])), [1.0])
