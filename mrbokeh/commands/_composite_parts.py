@@ -236,7 +236,7 @@ class _FileLayers:
         """Return the deep layers among others, front first."""
         if not self.deep:
             return layers
-        from mrbokeh.stacks.exr_layers.deep_interleaved import interleaved
+        from mrbokeh.stacks.exr_layers.deep_layers import interleaved
 
         return interleaved(self.deep, layers)
 

@@ -1,26 +1,27 @@
 """`mrbokeh video`: virtual objects in every frame of a clip, blurred by its lens.
 
-The shot of `mrbokeh video`, as options say: what makes its frames, where they go, and which of the clip they are.
+Options alone say what the shot is: what makes its frames, where they go, and which of the clip they are.
 """
 
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mrbokeh.commands import _video_options as options
-from mrbokeh.commands._insertion_options import ColourOptions, LookGroup, VirtualOptions
+from mrbokeh.commands import _insertion_options as shared
+from mrbokeh.commands._insertion_options import LENS, PLATE, RESULT, VIRTUAL, ColourOptions, LookGroup, VirtualOptions
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.compositing.choose import DEFAULT_MODE
 from mrbokeh.compositing.plate_look.finishing import LookOptions
 from mrbokeh.optics.lens_file import read_lens
-from mrbokeh.renderers.choose import BY_NAME
+from mrbokeh.renderers.choose import BY_NAME, DEFAULT
 from mrbokeh.shots.composite_recipe import CompositeRecipe
 from mrbokeh.shots.executors import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
 from mrbokeh.shots.frame_sources import CameraFile, ClipLook, DepthFiles, FocusPulled, MatteFiles
 from mrbokeh.shots.layer_sources import LayerFiles, sources_by_depth
 from mrbokeh.shots.render_shot import SequenceTarget, VideoTarget, render_shot
-from mrbokeh.shots.shot import Shot, Target
+from mrbokeh.shots.shot import SEGMENT_S, Shot, Target
 from mrbokeh.stacks.photograph import SensorOrientation, lens_for_orientation
 from mrbokeh.system.atomic_files import require_safe_outputs
 from mrbokeh.system.console import kept_when_interrupted, progress_bars
@@ -31,6 +32,122 @@ from mrbokeh.video.encodings import with_alpha
 from mrbokeh.video.image_sequence import is_pattern
 from mrbokeh.video.picture_source import PictureSource, open_source, parse_rate
 
+WORK = "Who works"
+
+ClipArgument = Annotated[
+    Path,
+    typer.Argument(metavar="CLIP", help="A video; or, with --rate, numbered pictures: frames.%04d.exr, frames.####.exr or their folder."),
+]
+LensOption = Annotated[
+    Path, typer.Option(metavar="LENS.json", help="The lens, focused as it was when the clip was shot.", rich_help_panel=LENS)
+]
+OutOption = Annotated[
+    Path,
+    typer.Option(
+        metavar="VIDEO",
+        help=".mov (ProRes 4444), .mp4 (H.264), .mxf (DNxHR), .mkv (FFV1, lossless) or frames.%04d.exr|png|tif|jpg.",
+        rich_help_panel=RESULT,
+    ),
+]
+
+
+@dataclass(frozen=True)
+class ClipOptions(shared.NearOptions):
+    """Options of the clip: which frames are taken, their numbers, and depth."""
+
+    rate: Annotated[
+        str | None, typer.Option(help="Frames per second of numbered pictures: 25, 23.976, 24000/1001.", rich_help_panel=PLATE)
+    ] = None
+    frames: Annotated[
+        str, typer.Option(metavar="START:STOP", help="Frames to take, counted from 0; STOP is left out.", rich_help_panel=PLATE)
+    ] = ":"
+    first_number: Annotated[
+        int | None,
+        typer.Option(
+            help="What the clip's frame 0 is called in sequences, tracks and focus pulls; default: as its own files, or 0.",
+            rich_help_panel=PLATE,
+        ),
+    ] = None
+    depth: Annotated[
+        Path | None,
+        typer.Option(metavar="DEPTH.exr", help="Depth of the filmed scene in metres, one file or depth.%04d.exr.", rich_help_panel=PLATE),
+    ] = None
+    steady_depth: Annotated[
+        bool, typer.Option("--steady-depth", help="Filter numbered depth in time, against flicker.", rich_help_panel=PLATE)
+    ] = False
+
+
+@dataclass(frozen=True)
+class RenderingOptions(shared.RenderingOptions):
+    """Options of filming --scene. shutter: angle in degrees; readout, scene_begin: in seconds."""
+
+    scene_begin: Annotated[
+        float, typer.Option(help="Second of the clip at which the animations of --scene begin.", rich_help_panel=VIRTUAL)
+    ] = 0.0
+    shutter: Annotated[
+        float | None,
+        typer.Option(min=0.0, max=360.0, metavar="DEGREES", help="Shutter angle: --scene is blurred by its motion.", rich_help_panel=LENS),
+    ] = None
+    readout: Annotated[
+        float, typer.Option(help="Seconds from the first to the last row of a rolling shutter, with --shutter.", rich_help_panel=LENS)
+    ] = 0.0
+
+
+@dataclass(frozen=True)
+class BlurOptions:
+    """Focus by frame, and the renderer."""
+
+    focus_pull: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KEYS|FILE.csv", help="Focus by frame: FRAME:METRES,FRAME:METRES or metadata of a camera.", rich_help_panel=LENS
+        ),
+    ] = None
+    renderer: Annotated[
+        str, typer.Option("--renderer", "--method", help="polygon, low-rank, scatter, or a network (.onnx).", rich_help_panel=LENS)
+    ] = DEFAULT
+
+
+@dataclass(frozen=True)
+class ResultOptions:
+    """Options of the written result."""
+
+    encoding: Annotated[
+        str | None,
+        typer.Option(
+            help="h264, h264-10bit, h265-10bit, prores4444, prores4444-alpha, prores422, dnxhr-hqx, ffv1 or ffv1-alpha; by default the "
+            "usual one of OUT, with alpha where CLIP has some.",
+            rich_help_panel=RESULT,
+        ),
+    ] = None
+    constant_rate: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FPS",
+            help="Hold or leave out pictures of a clip of uneven times, so that OUT has this even rate (as MXF needs it).",
+            rich_help_panel=RESULT,
+        ),
+    ] = None
+    virtual_only: Annotated[
+        bool,
+        typer.Option("--virtual-only", help="Write the blurred virtual layer with alpha: EXR files, .mov or .mkv.", rich_help_panel=RESULT),
+    ] = False
+    overwrite: shared.OverwriteOption = False
+
+
+@dataclass(frozen=True)
+class WorkOptions:
+    """Options of the workers. workers: processes here; cluster: a scheduler elsewhere; segment: in seconds."""
+
+    workers: Annotated[int, typer.Option(min=0, help="Processes on this machine; 0 takes one for each core.", rich_help_panel=WORK)] = 0
+    cluster: Annotated[
+        str | None, typer.Option(metavar="tcp://HOST:8786", help="Dask scheduler whose workers see the same files.", rich_help_panel=WORK)
+    ] = None
+    segment: Annotated[
+        float, typer.Option(min=0.01, help="Seconds of a segment, the least that a kill can lose.", rich_help_panel=WORK)
+    ] = SEGMENT_S
+
+
 if TYPE_CHECKING:
     from mrbokeh.shots.layer_sources import SceneLayers
 
@@ -38,11 +155,11 @@ if TYPE_CHECKING:
 def recipe_of(
     source: PictureSource,
     lens: Path,
-    taken: options.ClipOptions,
+    taken: ClipOptions,
     virtual: VirtualOptions,
-    rendering: options.RenderingOptions,
+    rendering: RenderingOptions,
     look: LookGroup,
-    blur: options.BlurOptions,
+    blur: BlurOptions,
     *,
     virtual_only: bool,
 ) -> CompositeRecipe:
@@ -67,7 +184,7 @@ def recipe_of(
     )
 
 
-def target_of(out: Path, source: PictureSource, recipe: CompositeRecipe, colour: ColourOptions, result: options.ResultOptions) -> Target:
+def target_of(out: Path, source: PictureSource, recipe: CompositeRecipe, colour: ColourOptions, result: ResultOptions) -> Target:
     if is_pattern(out):
         for name, value in (("--encoding", result.encoding), ("--constant-rate", result.constant_rate)):
             if value is not None:
@@ -102,7 +219,7 @@ def parse_frames(text: str) -> tuple[int, int | None]:
     return parsed
 
 
-def _check_virtual(virtual: VirtualOptions, rendering: options.RenderingOptions) -> None:
+def _check_virtual(virtual: VirtualOptions, rendering: RenderingOptions) -> None:
     if not virtual.layer and virtual.scene is None:
         raise InputError("nothing to put into the clip: give --layer RGBAZ.exr or --scene SCENE.toml")
     for_scenes = (rendering.shutter, rendering.distortion, virtual.camera)
@@ -110,7 +227,7 @@ def _check_virtual(virtual: VirtualOptions, rendering: options.RenderingOptions)
         raise InputError("--camera, --shutter and --distortion are for what --scene renders: layers in files have theirs in them")
 
 
-def _scene_layers(source: PictureSource, virtual: VirtualOptions, rendering: options.RenderingOptions) -> "tuple[SceneLayers, ...]":
+def _scene_layers(source: PictureSource, virtual: VirtualOptions, rendering: RenderingOptions) -> "tuple[SceneLayers, ...]":
     if virtual.scene is None:
         return ()
     from mrbokeh.scene.moving_layers import ShutterTiming
@@ -129,7 +246,7 @@ def _camera(source: PictureSource, virtual: VirtualOptions) -> CameraFile | None
     return CameraFile.of_clip(virtual.camera.resolve(), source.info, read_scene_file(virtual.scene).up)
 
 
-def _look(look: LookGroup, source: PictureSource, taken: options.ClipOptions) -> ClipLook | None:
+def _look(look: LookGroup, source: PictureSource, taken: ClipOptions) -> ClipLook | None:
     if look.wanted == LookOptions(seed=look.seed):
         return None
     start, _ = parse_frames(taken.frames)
@@ -145,7 +262,7 @@ def _holding(source: PictureSource, lens: Path) -> SensorOrientation:
     return holding
 
 
-def _first_number(source: PictureSource, taken: options.ClipOptions) -> int:
+def _first_number(source: PictureSource, taken: ClipOptions) -> int:
     return source.first_number if taken.first_number is None else taken.first_number
 
 
@@ -160,17 +277,17 @@ app = typer.Typer(add_completion=False)
 @app.command()
 @grouped
 def video(
-    clip: options.ClipArgument,
-    taken: options.ClipOptions,
+    clip: ClipArgument,
+    taken: ClipOptions,
     virtual: VirtualOptions,
-    rendering: options.RenderingOptions,
+    rendering: RenderingOptions,
     look: LookGroup,
-    lens: options.LensOption,
-    blur: options.BlurOptions,
-    out: options.OutOption,
+    lens: LensOption,
+    blur: BlurOptions,
+    out: OutOption,
     colour: ColourOptions,
-    result: options.ResultOptions,
-    work: options.WorkOptions,
+    result: ResultOptions,
+    work: WorkOptions,
 ) -> None:
     """Blur virtual layers with the lens and put them into each frame in linear light; sound and times are kept.
 
@@ -203,7 +320,7 @@ def _alpha_lost(clip: Path, source: PictureSource, target: Target) -> str | None
     return None
 
 
-def _executor(work: options.WorkOptions, segments: int) -> Executor:
+def _executor(work: WorkOptions, segments: int) -> Executor:
     if work.cluster is not None:
         return DaskExecutor(work.cluster)
     count = min(work.workers or cores(), segments)

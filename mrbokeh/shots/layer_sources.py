@@ -12,8 +12,7 @@ from mrbokeh.scene.staging.filming import FilmedLayers, Filming
 from mrbokeh.scene.staging.scene_file import read_scene_file
 from mrbokeh.shots.inputs import CameraSource, Description, Kept, LayerSource, Moment
 from mrbokeh.stacks.exr_layers.cryptomatte import ObjectSplit
-from mrbokeh.stacks.exr_layers.deep_interleaved import interleaved
-from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples
+from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, interleaved
 from mrbokeh.stacks.exr_layers.sequence import ExrSequence
 from mrbokeh.system.errors import InputError
 

@@ -3,7 +3,6 @@
 import os
 import time
 from collections.abc import Callable, Iterator
-from fractions import Fraction
 from io import BytesIO
 from pathlib import Path
 from threading import Event
@@ -17,12 +16,11 @@ from mrbokeh.lens_measuring.matching.photo_facts import read_facts
 from mrbokeh.system.errors import InputError, MissingExtraError
 from mrbokeh.video.clip import probe
 from mrbokeh.video.color import linear_from_code
-from mrbokeh.video.writer import VideoWriter
+from tests.scenes.video_files import filmed
 from viewfinder.frames import CameraFrame, LensState
 from viewfinder.sources.choose import open_source
 from viewfinder.sources.frame_source import FrameSource, SizeLimit
-from viewfinder.sources.playback import Rhythm
-from viewfinder.sources.watched_folder import NotWholeError, WatchedFolderSource, read_tethered
+from viewfinder.sources.playback import NotWholeError, Rhythm, WatchedFolderSource, read_tethered
 
 WIDTH, HEIGHT = 96, 64
 RNG = np.random.default_rng(3)
@@ -169,16 +167,10 @@ def test_what_is_no_photograph_is_not_whole(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_tethered(path, SizeLimit()).bgr, NOISE[..., ::-1])
 
 
-# --- videos, sizes, rhythm ------------------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def clip(tmp_path: Path) -> Path:
-    path = tmp_path / "clip.mkv"
-    with VideoWriter(path, WIDTH, HEIGHT, Fraction(50)) as writer:
-        for index in range(4):
-            writer.write(linear_from_code(np.full((HEIGHT, WIDTH, 3), 0.2 * (index + 1)), "bt709"), index / 50)
-    return path
+    pictures = [linear_from_code(np.full((HEIGHT, WIDTH, 3), code), "bt709") for code in (0.2, 0.4, 0.6, 0.8)]
+    return filmed(tmp_path / "clip.mkv", pictures, 50)
 
 
 def test_a_video_goes_round_in_its_own_size(clip: Path) -> None:
@@ -235,9 +227,6 @@ def test_what_is_late_is_not_hurried_after() -> None:
     rhythm.restart(0.1)
     assert rhythm.wait_for(5.0)
     np.testing.assert_allclose(waits, [0.0, 0.1, 0.0, 0.1, 0.1], atol=1e-9)
-
-
-# --- the word on the command line -----------------------------------------------------------------------------------
 
 
 def test_words_and_addresses_open_what_they_name(tmp_path: Path, clip: Path) -> None:

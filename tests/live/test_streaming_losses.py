@@ -12,7 +12,7 @@ from mrbokeh.video.color import color_of
 from mrbokeh.video.frames import display_bgr
 from tests.scenes.streaming_viewers import HEIGHT, PATIENT, WIDTH, Feed, Line, Viewer, noise, standing_still, streaming, watching, whep_of
 from tests.scenes.waiting import comes_true
-from viewfinder.streaming import viewer_connection
+from viewfinder.streaming import whep
 from viewfinder.streaming.encoders import StreamQuality
 
 
@@ -28,8 +28,8 @@ async def test_a_request_for_a_keyframe_reaches_the_encoder() -> None:
 
 async def test_without_aiortcs_private_method_keyframes_come_at_intervals(monkeypatch: pytest.MonkeyPatch) -> None:
     with streaming() as stream, Feed(stream):
-        assert viewer_connection.keyframe_requests_arrive()
-        monkeypatch.setattr(viewer_connection, "_KEYFRAME_REQUEST", "_renamed_in_some_release")
+        assert whep.keyframe_requests_arrive()
+        monkeypatch.setattr(whep, "_KEYFRAME_REQUEST", "_renamed_in_some_release")
         async with whep_of(stream) as (_whep, url), watching(url) as viewer:
             await viewer.next()
             assert stream.keyframe_every_s == 2.0

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from datasets_scripts.public_datasets import KINDS, crop_of, main
+from datasets_scripts.public_datasets import KINDS, Conversion, DepthMaps, convert, crop_of, main, sharpest_depth_m
 from datasets_scripts.public_sets.adapters import f_number_of
-from datasets_scripts.public_sets.conversion import Conversion, DepthMaps, convert, sharpest_depth_m
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.image_io import write_image
 from mrbokeh.optics.aperture import Aperture

@@ -9,8 +9,7 @@ from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.image_io import read_layer, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.stacks.exr_layers.cryptomatte import ObjectSplit
-from mrbokeh.stacks.exr_layers.flat_render import FlatRender, LayerReader
-from mrbokeh.stacks.exr_layers.render_channels import RenderChannels
+from mrbokeh.stacks.exr_layers.render_channels import FlatRender, LayerReader, RenderChannels
 from mrbokeh.stacks.exr_layers.sequence import ExrSequence
 from mrbokeh.system.errors import InputError
 

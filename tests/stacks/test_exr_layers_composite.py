@@ -9,7 +9,7 @@ from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import read_depth, read_image
 from mrbokeh.images.layer import Layer
 from mrbokeh.stacks.exr_layers.composite_exr import CompositeLayers, write_composite_exr
-from mrbokeh.stacks.exr_layers.flat_render import FlatRender
+from mrbokeh.stacks.exr_layers.render_channels import FlatRender
 from mrbokeh.system.errors import InputError
 from tests.scenes.composite_exr_reader import read_composite_exr
 

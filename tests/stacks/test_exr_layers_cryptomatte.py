@@ -12,8 +12,7 @@ from mrbokeh.images.layer import flatten
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.stacks.exr_layers.cryptomatte import ObjectSplit, cryptomattes, id_bits, murmur3_32
-from mrbokeh.stacks.exr_layers.flat_render import FlatRender
-from mrbokeh.stacks.exr_layers.render_channels import RenderChannels
+from mrbokeh.stacks.exr_layers.render_channels import FlatRender, RenderChannels
 from mrbokeh.system.errors import InputError
 
 HEIGHT, WIDTH = 6, 10

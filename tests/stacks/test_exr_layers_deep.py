@@ -14,7 +14,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.stacks.exr_layers.composite_exr import write_deep_exr
 from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces, is_deep, merged, peeled
-from mrbokeh.stacks.exr_layers.flat_render import LayerReader
+from mrbokeh.stacks.exr_layers.render_channels import LayerReader
 from mrbokeh.stacks.exr_layers.sequence import ExrSequence
 from mrbokeh.system.errors import InputError
 from tests.scenes.deep_pixels_reference import DeepSample, flattened, split, tidied

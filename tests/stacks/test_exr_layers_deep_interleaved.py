@@ -12,8 +12,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.shots.inputs import Moment
 from mrbokeh.shots.layer_sources import AmongDeep, LayerFiles, sources_by_depth
-from mrbokeh.stacks.exr_layers.deep_interleaved import cut_at, interleaved
-from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, merged, peeled
+from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, cut_at, interleaved, merged, peeled
 from mrbokeh.system.errors import InputError
 from tests.scenes.command_line import printed_by
 from tests.scenes.deep_pixels_reference import DeepSample, flattened, tidied

@@ -48,12 +48,11 @@ def _named(kind: str, rest: str | None, limit: SizeLimit, fps: float | None) -> 
 
         return Gphoto2PreviewSource(rest or None, limit)
     if kind == "folder":
-        from viewfinder.sources.watched_folder import DEFAULT_FPS as REPEATS
-        from viewfinder.sources.watched_folder import WatchedFolderSource
+        from viewfinder.sources.playback import REPEATED_FPS, WatchedFolderSource
 
         if not rest:
             raise InputError("--source folder: expected the folder after the colon, as in folder:/home/me/tethered")
-        return WatchedFolderSource(Path(rest), limit, fps or REPEATS)
+        return WatchedFolderSource(Path(rest), limit, fps or REPEATED_FPS)
     if rest is not None:
         raise InputError(f"--source: expected the word whip alone, got whip:{rest}; the camera's address is shown when the server runs")
     if find_spec("aiortc") is None:

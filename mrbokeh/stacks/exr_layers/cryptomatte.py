@@ -22,8 +22,7 @@ import numpy as np
 from jaxtyping import Float32, UInt32
 
 from mrbokeh.images.layer import Layer
-from mrbokeh.stacks.exr_layers.flat_render import layer_of, nearest_depth
-from mrbokeh.stacks.exr_layers.render_channels import RenderChannels
+from mrbokeh.stacks.exr_layers.render_channels import RenderChannels, layer_of, nearest_depth
 from mrbokeh.system.errors import InputError
 
 _MASK = 0xFFFFFFFF

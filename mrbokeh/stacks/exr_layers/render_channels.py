@@ -1,4 +1,5 @@
-"""All channels of an EXR file by their full name, whatever parts and views they are spread over, and the names that programs give them.
+"""Renders of other programs: all channels of an EXR file by their full name, whatever parts and views they are spread over, and RGBA with Z
+as one layer.
 
 | program | colour | depth along the axis |
 |---|---|---|
@@ -9,17 +10,19 @@
 
 Blender 4 writes one part, 5 one for each layer if not told otherwise; its File Output node calls depth Depth.V. Some of these programs
 can write a depth that is not along the axis (Nuke 1/z, Arnold and Karma the distance along the ray): nobody can tell from the numbers.
+Z is that of one ray, which may have passed by what covers part of the pixel: depth at edges is mended from the nearest known pixel.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Bool, Float, Float32
 
-from mrbokeh.images.exr_io import Channels, ExrPart, read_exr, stated_primaries
+from mrbokeh.images.exr_io import Channels, ExrPart, in_rec709, read_exr, stated_primaries
+from mrbokeh.images.image_io import require_depth_ahead, require_numbers
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.motion import with_motion
 from mrbokeh.system.errors import InputError
@@ -170,3 +173,64 @@ def _of_first_view(channels: Channels, views: Sequence[str]) -> Channels:
         elif owner == views[0]:
             result[".".join([*layer[:-1], channel])] = pixels
     return result
+
+
+# The eight neighbours.
+_BESIDE_PX = 1.5
+
+
+def edges_mended(layer: Layer) -> Layer:
+    """Give partly covered pixels without depth that of a pixel beside them. Opaque ones without depth are sky and stay."""
+    is_known = np.isfinite(layer.depth_m)
+    is_lost = ~is_known & (layer.alpha > 0) & (layer.alpha < 1)
+    if not is_lost.any() or not is_known.any():
+        return layer
+    nearest_m, distance_px = nearest_depth(layer.depth_m, is_known)
+    depth_m = np.where(is_lost & (distance_px < _BESIDE_PX), nearest_m, layer.depth_m)
+    return Layer(layer.rgb, layer.alpha, depth_m, layer.extra)
+
+
+def nearest_depth(
+    depth_m: Float32[np.ndarray, "height width"], is_known: Bool[np.ndarray, "height width"]
+) -> tuple[Float32[np.ndarray, "height width"], np.ndarray]:
+    """Return the depth of the nearest known pixel, and how far away that is, in pixels; at least one must be known."""
+    from scipy.ndimage import distance_transform_edt
+
+    distance_px, (rows, columns) = distance_transform_edt(~is_known, return_indices=True)
+    return depth_m[rows, columns], distance_px
+
+
+@runtime_checkable
+class LayerReader(Protocol):
+    """Way of reading one file of a render; its settings are its constructor's."""
+
+    def layers(self, path: Path | str) -> list[Layer]:
+        """Return sharp layers, front first, linear Rec.709, depth in metres. Raises InputError if the file lacks what is asked for."""
+        ...
+
+
+class FlatRender:
+    """Reader of a flat render: premultiplied colour, depth along the axis in metres."""
+
+    def layers(self, path: Path | str) -> list[Layer]:
+        """Return the one layer; pixels at edges whose depth is that of the background behind are mended."""
+        return [edges_mended(layer_of(RenderChannels.read(path)))]
+
+
+def layer_of(render: RenderChannels) -> Layer:
+    """Return the picture of channels, without mending depth at edges. Colour above alpha is light of its own (flames) and stays as it is.
+
+    Depths not above 0 or farther than any scene are background.
+    """
+    name = render.colour_layer()
+    rgb = np.stack([render.plane(joined(name, each)) for each in "RGB"], axis=2).astype(np.float32)
+    alpha_name = joined(name, "A")
+    alpha = render.plane(alpha_name).astype(np.float32) if alpha_name in render.channels else np.ones(rgb.shape[:2], np.float32)
+    require_numbers(render.path, {"colour": rgb, "alpha": alpha})
+    rgb = in_rec709(rgb, render.primaries, render.path)
+    depth_name, is_seen = render.depth_name(name), (alpha > 0) | (rgb != 0).any(axis=2)
+    depth_m = render.plane(depth_name).astype(np.float32)
+    require_depth_ahead(render.path, depth_name, render.plane(depth_name)[is_seen])
+    require_numbers(render.path, {depth_name: depth_m})
+    is_there = is_seen & (depth_m > 0) & (depth_m < BACKGROUND_FROM)
+    return Layer(rgb, alpha, np.where(is_there, depth_m, np.float32(np.inf)))

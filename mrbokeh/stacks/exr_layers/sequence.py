@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mrbokeh.images.layer import Layer
 from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces, is_deep
-from mrbokeh.stacks.exr_layers.flat_render import FlatRender, LayerReader
+from mrbokeh.stacks.exr_layers.render_channels import FlatRender, LayerReader
 from mrbokeh.system.errors import InputError
 
 _PLACE = re.compile(r"%0?(\d*)d|(#+)|\$F(\d*)")
