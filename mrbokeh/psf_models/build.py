@@ -191,7 +191,7 @@ def _volume(options: ModelOptions) -> PsfModel:
 
 def _stylized(options: ModelOptions) -> PsfModel:
     from mrbokeh.images.image_io import read_image
-    from mrbokeh.psf_models.stylized import Stylized
+    from mrbokeh.psf_models.simple_lens import Stylized
 
     if options.image is None:
         raise InputError("a stylized PSF is made from a picture: give one with --image")

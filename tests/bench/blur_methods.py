@@ -32,8 +32,7 @@ from mrbokeh.optics.psf_bank_file import HEAD, missing_cells, read_bank, read_he
 from mrbokeh.psf_models.base import PsfModel
 from mrbokeh.psf_models.build import Combined, bank_head, build_bank
 from mrbokeh.psf_models.physical_lens import PhysicalLens, biconvex_lens
-from mrbokeh.psf_models.simple_lens import SimpleLens
-from mrbokeh.psf_models.stylized import Stylized
+from mrbokeh.psf_models.simple_lens import SimpleLens, Stylized
 from mrbokeh.psf_models.volume import Volume
 from mrbokeh.renderers.bank.tables import BankTables, Place
 from mrbokeh.renderers.kernels.laplacian_tables import Points

@@ -8,8 +8,7 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.psf_bank import Axis
 from mrbokeh.psf_models.base import PsfModel, sobol_blocks
 from mrbokeh.psf_models.build import PAPER_COUNTS, Combined
-from mrbokeh.psf_models.simple_lens import SimpleLens, banded_edges
-from mrbokeh.psf_models.stylized import Stylized
+from mrbokeh.psf_models.simple_lens import SimpleLens, Stylized, banded_edges
 from mrbokeh.system.errors import InputError
 
 RAYS = 1 << 20

@@ -10,8 +10,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.psf_models.base import PsfModel, centred
 from mrbokeh.psf_models.build import Combined
 from mrbokeh.psf_models.physical_lens import PhysicalLens, biconvex_lens
-from mrbokeh.psf_models.simple_lens import SimpleLens
-from mrbokeh.psf_models.stylized import Stylized
+from mrbokeh.psf_models.simple_lens import SimpleLens, Stylized
 from mrbokeh.psf_models.volume import Volume
 
 RAYS = 1 << 18

@@ -23,8 +23,7 @@ from mrbokeh.psf_models.base import PsfModel, sobol_blocks
 from mrbokeh.psf_models.build import Combined, bank_head, build_bank
 from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface
 from mrbokeh.psf_models.physical_lens import PhysicalLens
-from mrbokeh.psf_models.simple_lens import SimpleLens
-from mrbokeh.psf_models.stylized import Stylized
+from mrbokeh.psf_models.simple_lens import SimpleLens, Stylized
 from mrbokeh.psf_models.volume import Volume
 from mrbokeh.system.errors import InputError, MissingExtraError
 
