@@ -27,7 +27,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from mrbokeh.compositing.edge_refinement import EdgeRefinement
+from mrbokeh.compositing.edge_refinement import with_refined_edges
 from mrbokeh.compositing.near_and_far import (
     NO_HIGHLIGHTS,
     Highlights,
@@ -35,6 +35,7 @@ from mrbokeh.compositing.near_and_far import (
     continued,
     cut_in_two,
     nearer_than,
+    reach_px,
     shows_anything,
     virtual_depth_m,
 )
@@ -42,7 +43,6 @@ from mrbokeh.compositing.plate import Inserted, Plate, same_size
 from mrbokeh.compositing.pupil_shares import PupilMeans, Rays, pupil_points
 from mrbokeh.images.layer import Layer, clear, flatten
 from mrbokeh.layering.highlights import find_highlights
-from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.system.errors import InputError
 
@@ -231,7 +231,6 @@ _LEAST = np.float32(1e-5)
 Picture = Float32[np.ndarray, "height width 3"]
 
 _HALF = 0.5
-_NEAR_EDGE_PX, _FAR_EDGE_PX = 3, 1  # the depth of what is near has a median over 5x5 pixels
 
 
 @dataclass(frozen=True)
@@ -257,7 +256,14 @@ class Between:
         sharp = flatten([replace(layer, extra={}) for layer in layers])
         depth_m = virtual_depth_m(sharp)
         blurred = renderer.render(layers, plate.lens)
-        scene, near = self._scene(plate, depth_m, renderer)
+        known, matte = self._near(plate, depth_m, renderer)
+        near_m = self._near_depth_m(known, matte)
+        if plate.sharp_rgb is None:
+            white = Layer(np.repeat(matte[..., None], 3, axis=2), matte, near_m)
+            scene, near = _without_sharp_picture(known, white, renderer)
+        else:
+            scene = self._cut(known, matte, near_m)
+            near = renderer.render([scene.near], plate.lens) if scene.near.alpha.any() else clear(*matte.shape)
         return put_together(plate, near, blurred, Rays.of(scene, sharp, depth_m, plate.lens, self.pupil_points))
 
     def cut(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> NearAndFar:
@@ -265,35 +271,22 @@ class Between:
         depth_m = virtual_depth_m(flatten([replace(layer, extra={}) for layer in layers]))
         if plate.sharp_rgb is None:
             raise InputError("to cut the scene in two its all-in-focus picture is needed: give a focal stack")
-        plate, matte = self._with_refined_edges(plate, self._matte(plate, depth_m), renderer)
+        plate, matte = self._near(plate, depth_m, renderer)
         return self._cut(plate, matte, self._near_depth_m(plate, matte))
 
-    def _scene(self, plate: Plate, depth_m: Plane, renderer: Renderer) -> tuple[NearAndFar, Layer]:
-        """The scene cut in two, and its near part as the lens sees it."""
-        plate, matte = self._with_refined_edges(plate, self._matte(plate, depth_m), renderer)
-        near_m = self._near_depth_m(plate, matte)
-        if plate.sharp_rgb is None:
-            return _without_sharp_picture(plate, Layer(np.repeat(matte[..., None], 3, axis=2), matte, near_m), renderer)
-        scene = self._cut(plate, matte, near_m)
-        return scene, renderer.render([scene.near], plate.lens) if scene.near.alpha.any() else clear(*matte.shape)
-
-    def _matte(self, plate: Plate, depth_m: Plane) -> Plane:
-        """Return the sharp matte of what is near: the user's matte, else by depth."""
+    def _near(self, plate: Plate, depth_m: Plane, renderer: Renderer) -> tuple[Plate, Plane]:
+        """Return the plate with its depth right at rims, and the sharp matte of what is near: the user's matte as it is, else by depth."""
         if plate.near_alpha is not None:
-            return plate.near_alpha
+            return plate, plate.near_alpha
         if plate.depth_m is None:
             raise InputError(
                 "to put objects between the layers of a photograph it needs depth (a focal stack or --depth) or a matte of what "
                 "is near: give one, or use the mode front"
             )
-        return nearer_than(plate.depth_m, depth_m, self.tolerance).astype(np.float32)
-
-    def _with_refined_edges(self, plate: Plate, matte: Plane, renderer: Renderer) -> tuple[Plate, Plane]:
-        """Plate and matte; a user's matte stays as it is."""
-        if not self.refine_edges or plate.near_alpha is not None:
-            return plate, matte
-        better, near = EdgeRefinement(self._cut_by_depth, renderer, self.tolerance).found(plate, matte > _HALF)
-        return better, matte if better is plate else near.astype(np.float32)
+        near = nearer_than(plate.depth_m, depth_m, self.tolerance)
+        if self.refine_edges:
+            plate, near = with_refined_edges(plate, near, renderer, self.tolerance)
+        return plate, near.astype(np.float32)
 
     def _near_depth_m(self, plate: Plate, matte: Plane) -> Plane:
         """Depth of the near things, continued to all places."""
@@ -307,14 +300,11 @@ class Between:
         """Cut the sharp scene in two. near_m: depth of what a user's matte holds."""
         assert plate.sharp_rgb is not None
         if plate.near_alpha is None and plate.depth_m is not None:
-            return self._cut_by_depth(plate, matte > _HALF)
+            near = matte > _HALF
+            return cut_in_two(plate.sharp_rgb, plate.depth_m, near, reach_px(plate.lens, plate.depth_m, near), self.tolerance)
         front, behind = clean_colours(plate.sharp_rgb, matte)
         far_m = None if plate.depth_m is None else continued(plate.depth_m, matte <= _HALF)
         return NearAndFar(Layer(front * matte[..., None], matte, near_m), behind, far_m, NO_HIGHLIGHTS)
-
-    def _cut_by_depth(self, plate: Plate, is_near: Mask) -> NearAndFar:
-        assert plate.sharp_rgb is not None and plate.depth_m is not None
-        return cut_in_two(plate.sharp_rgb, plate.depth_m, is_near, _reach_px(plate.lens, plate.depth_m, is_near), self.tolerance)
 
 
 @dataclass(frozen=True)
@@ -363,25 +353,6 @@ def _mean(picture: Picture, weight: Plane, size_px: int) -> Picture:
 
     total = blur(weight, (size_px, size_px))
     return blur(picture * weight[..., None], (size_px, size_px)) / (total + _LEAST)[..., None]
-
-
-def _reach_px(lens: Lens, depth_m: Plane, is_near: Mask) -> float:
-    """Return how far the lens looks past the edges of what is near: half of the difference of the circles of confusion there, at most.
-
-    Behind a near thing and before what is far, both continue as they are at the edge (see `continued`).
-    """
-    if not is_near.any() or is_near.all():
-        return 0.0
-    coc_px = np.asarray(lens.coc_px(depth_m, depth_m.shape[1]))
-    near_px, far_px = coc_px[is_near & _within(_NEAR_EDGE_PX, ~is_near)], coc_px[~is_near & _within(_FAR_EDGE_PX, is_near)]
-    return 0.5 * lens.aperture.unit_radius * float(max(far_px.max() - near_px.min(), 0.0))
-
-
-def _within(distance_px: int, mask: Mask) -> Mask:
-    """Return the pixels no farther from the mask than that, along rows and columns."""
-    from cv2 import dilate
-
-    return np.asarray(dilate(mask.astype(np.uint8), np.ones((2 * distance_px + 1, 2 * distance_px + 1), np.uint8)) > 0)
 
 
 def _without_sharp_picture(plate: Plate, white: Layer, renderer: Renderer) -> tuple[NearAndFar, Layer]:

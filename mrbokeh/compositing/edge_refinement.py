@@ -10,13 +10,12 @@ pixels around them best (Fisher, The Use of Multiple Measurements in Taxonomic P
 around), so that highlights do not outweigh all else and twice the light gives the same answer.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
 
-from mrbokeh.compositing.near_and_far import NearAndFar, continued, without_edge
+from mrbokeh.compositing.near_and_far import continued, cut_in_two, reach_px, without_edge
 from mrbokeh.compositing.plate import Plate
 from mrbokeh.layering.highlights import find_highlights
 from mrbokeh.renderers.base import Renderer
@@ -107,50 +106,44 @@ _PROPOSED = ((EdgeColours.without_rim, np.float32(0.9)), (EdgeColours.by_colour,
 """One after the other. Each wins where it leaves less than this part of the error."""
 
 
-@dataclass(frozen=True)
-class EdgeRefinement:
-    """Refinement of depth edges. cut: cuts a plate's sharp scene in two. tolerance: see `Between`."""
+def with_refined_edges(plate: Plate, near: Mask, renderer: Renderer, tolerance: float) -> tuple[Plate, Mask]:
+    """Return the plate with its depth moved at rims, and what is near then. near: by the depth that it has. tolerance: see `Between`.
 
-    cut: Callable[[Plate, Mask], NearAndFar]
-    renderer: Renderer
-    tolerance: float
+    The very same where nothing better is found, or where there is no sharp picture and depth to look at.
+    """
+    if plate.sharp_rgb is None or plate.depth_m is None or not near.any() or near.all():
+        return plate, near
+    at_edge = ~without_edge(plate.depth_m, tolerance)
+    best, error = near, None
+    for propose, part in _PROPOSED:
+        proposed = propose(EdgeColours.of(plate.sharp_rgb, best, at_edge))
+        if not (proposed != best).any():
+            continue
+        error = _error(plate, near, best, renderer, tolerance) if error is None else error
+        other = _error(plate, near, proposed, renderer, tolerance)
+        better = other < part * error
+        best, error = np.where(better, proposed, best), np.where(better, other, error)
+    return (plate, near) if best is near else (replace(plate, depth_m=moved(plate.depth_m, near, best)), best)
 
-    def found(self, plate: Plate, near: Mask) -> tuple[Plate, Mask]:
-        """The plate with its depth moved at rims, and what is near then. near: by the depth that it has.
 
-        The very same where nothing better is found, or where there is no sharp picture and depth to look at.
-        """
-        if plate.sharp_rgb is None or plate.depth_m is None or not near.any() or near.all():
-            return plate, near
-        at_edge = ~without_edge(plate.depth_m, self.tolerance)
-        best, error = near, None
-        for propose, part in _PROPOSED:
-            proposed = propose(EdgeColours.of(plate.sharp_rgb, best, at_edge))
-            if not (proposed != best).any():
-                continue
-            error = self._error(plate, near, best) if error is None else error
-            other = self._error(plate, near, proposed)
-            better = other < part * error
-            best, error = np.where(better, proposed, best), np.where(better, other, error)
-        return (plate, near) if best is near else (replace(plate, depth_m=moved(plate.depth_m, near, best)), best)
+def _error(plate: Plate, near: Mask, proposed: Mask, renderer: Renderer, tolerance: float) -> Plane:
+    """Return how badly the scene, cut so and blurred anew, explains the photograph around each pixel; relative to its light,
+    squared.
+    """
+    from cv2 import GaussianBlur, resize
 
-    def _error(self, plate: Plate, near: Mask, proposed: Mask) -> Plane:
-        """Return how badly the scene, cut so and blurred anew, explains the photograph around each pixel; relative to its light,
-        squared.
-        """
-        from cv2 import GaussianBlur, resize
-
-        assert plate.depth_m is not None
-        tried, mask = replace(plate, depth_m=moved(plate.depth_m, near, proposed)), proposed
-        around_px = _AROUND_PX
-        if near.size > _LARGE_PX:
-            tried, mask, around_px = _halved(tried), _half_of(proposed), 0.5 * _AROUND_PX
-        scene = self.cut(tried, mask)
-        anew = np.maximum(self.renderer.render([scene.near, scene.far], tried.lens).rgb, 0.0)
-        around = GaussianBlur(tried.rgb, (0, 0), around_px)
-        off = (np.abs(anew - tried.rgb) / (anew + tried.rgb + _FLOOR * around + _ROUND)).sum(axis=2)
-        found = GaussianBlur(off * off, (0, 0), around_px)
-        return np.asarray(found if found.shape == near.shape else resize(found, near.shape[::-1]), np.float32)
+    assert plate.depth_m is not None
+    tried, mask = replace(plate, depth_m=moved(plate.depth_m, near, proposed)), proposed
+    around_px = _AROUND_PX
+    if near.size > _LARGE_PX:
+        tried, mask, around_px = _halved(tried), _half_of(proposed), 0.5 * _AROUND_PX
+    assert tried.sharp_rgb is not None and tried.depth_m is not None
+    scene = cut_in_two(tried.sharp_rgb, tried.depth_m, mask, reach_px(tried.lens, tried.depth_m, mask), tolerance)
+    anew = np.maximum(renderer.render([scene.near, scene.far], tried.lens).rgb, 0.0)
+    around = GaussianBlur(tried.rgb, (0, 0), around_px)
+    off = (np.abs(anew - tried.rgb) / (anew + tried.rgb + _FLOOR * around + _ROUND)).sum(axis=2)
+    found = GaussianBlur(off * off, (0, 0), around_px)
+    return np.asarray(found if found.shape == near.shape else resize(found, near.shape[::-1]), np.float32)
 
 
 def _halved(plate: Plate) -> Plate:

@@ -14,11 +14,13 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.layering.hidden_background import split_edges
 from mrbokeh.layering.highlights import find_highlights, without_highlights
 from mrbokeh.layering.padded_layers import PaddedLayer
+from mrbokeh.optics.lens import Lens
 from mrbokeh.system.resources import workers
 
 _TWO_DEEP = 2.0
 _SPECK_PX = 5
 _EDGE_PX = 5
+_NEAR_EDGE_PX, _FAR_EDGE_PX = 3, 1  # the depth of what is near has a median over 5x5 pixels
 _NEIGHBOURS = [(dy, dx) for dy in range(-2, 3) for dx in range(-2, 3)]
 
 Plane = Float32[np.ndarray, "height width"]
@@ -95,6 +97,25 @@ def cut_in_two(sharp_rgb: Picture, depth_m: Plane, near: Mask, reach_px: float, 
     far_highlights = Highlights(places, (rgb - dark).reshape(-1, 3)[places], far_depth_m.reshape(-1)[places])
     alpha = np.ascontiguousarray(near_values[..., 3])
     return NearAndFar(Layer(np.ascontiguousarray(near_values[..., :3]), alpha, near_depth_m), far_rgb, far_depth_m, far_highlights)
+
+
+def reach_px(lens: Lens, depth_m: Plane, is_near: Mask) -> float:
+    """Return how far the lens looks past the edges of what is near: half of the difference of the circles of confusion there, at most.
+
+    Behind a near thing and before what is far, both continue as they are at the edge (see `continued`).
+    """
+    if not is_near.any() or is_near.all():
+        return 0.0
+    coc_px = np.asarray(lens.coc_px(depth_m, depth_m.shape[1]))
+    near_px, far_px = coc_px[is_near & _within(_NEAR_EDGE_PX, ~is_near)], coc_px[~is_near & _within(_FAR_EDGE_PX, is_near)]
+    return 0.5 * lens.aperture.unit_radius * float(max(far_px.max() - near_px.min(), 0.0))
+
+
+def _within(distance_px: int, mask: Mask) -> Mask:
+    """Return the pixels no farther from the mask than that, along rows and columns."""
+    from cv2 import dilate
+
+    return np.asarray(dilate(mask.astype(np.uint8), np.ones((2 * distance_px + 1, 2 * distance_px + 1), np.uint8)) > 0)
 
 
 def _without_specks(depth_m: Plane) -> Plane:

@@ -248,7 +248,8 @@ def test_what_hides_behind_near_things_is_filled_in_as_far_as_the_lens_sees_at_t
     virtual = Layer(alpha[..., None] * RED, alpha, np.where(alpha > 0, VIRTUAL_M, np.inf).astype(np.float32))
     found = [(Between().cut(plate, [virtual], ScatterReference()), Between().insert(plate, [virtual], ScatterReference()))]
     coc_px = lens.coc_px(depth_m, size[1])
-    monkeypatch.setattr("mrbokeh.compositing.between._reach_px", lambda *_: 0.5 * float(coc_px.max() - coc_px.min()))
+    for module in ("between", "edge_refinement"):
+        monkeypatch.setattr(f"mrbokeh.compositing.{module}.reach_px", lambda *_: 0.5 * float(coc_px.max() - coc_px.min()))
     found.append((Between().cut(plate, [virtual], ScatterReference()), Between().insert(plate, [virtual], ScatterReference())))
     (small, short), (large, whole) = found
     only_large = (small.far_rgb != large.far_rgb).any(axis=(0, 2))
