@@ -174,11 +174,16 @@ class LeftOut:
     nearest_slice_db: float
 
 
-def leave_one_out(stack: FocalStack, renderer: Renderer) -> Iterator[LeftOut]:
-    """Each slice but the first and the last, predicted from the others. The all-in-focus picture has seen it, as in use it has not."""
+def leave_one_out(stack: FocalStack, renderer: Renderer, most: int | None = None) -> Iterator[LeftOut]:
+    """Predict each slice but the first and the last from the others. The all-in-focus picture has seen it, as in use it has not.
+
+    most: so many slices at most, evenly taken; None for all.
+    """
     plain, full = Refocusing(stack, renderer, residuals=False), Refocusing(stack, renderer)
     order = sorted(range(len(stack)), key=lambda index: 1.0 / float(stack.slices[index].focus_distance_m or np.inf))
-    for before, index, after in zip(order, order[1:], order[2:], strict=False):
+    inner = range(1, len(order) - 1)
+    for place in inner if most is None or len(inner) <= most else np.linspace(1, len(order) - 2, most).round().astype(int):
+        before, index, after = order[place - 1 : place + 2]
         truth, focus_m = stack.slice_rgb(index), float(stack.slices[index].focus_distance_m or np.inf)
         mask = stack.slice_masks(index).valid
         nearest = max(psnr(stack.slice_rgb(other), truth, mask=mask) for other in (before, after))

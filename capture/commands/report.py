@@ -35,7 +35,7 @@ def report_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="examine again what was examined already")] = False,
 ) -> None:
     from capture.report import HTML_NAME
-    from capture.report.gates import picture_verdict, tally, verdict_lines
+    from capture.report.gates import by_use, tally, verdict_line, verdict_lines
     from capture.report.scene_report import report_scene, require_gates, unmet
     from capture.report.stack_view import reblur_by
     from mrbokeh.system.console import kept_when_interrupted
@@ -47,7 +47,8 @@ def report_command(
         report = report_scene(scene, reblur_by(renderer), width, overwrite=overwrite)
     for line in verdict_lines(report.gates):
         typer.echo(line)
-    typer.echo(picture_verdict(report.gates))
+    for use, gates in by_use(report.gates).items():
+        typer.echo(verdict_line(use, gates))
     reused = sum(each.reused for each in report.stacks)
     before = f" ({reused} of {len(report.stacks)} stacks were examined before; --overwrite examines them again)" if reused else ""
     typer.echo(f"{scene / HTML_NAME}: {tally(report.gates)}{before}")

@@ -108,10 +108,13 @@ def _enlarged(mask: Mask, shape: tuple[int, ...]) -> Bool[np.ndarray, "rows colu
     return cv2.resize(mask.astype(np.uint8), shape[1::-1], interpolation=cv2.INTER_NEAREST) > 0
 
 
-def moving(slices: Sequence[Disagreement], depth_off_px: Plane) -> Mask:
-    """Return (H, W) where something moved during the stack. depth_off_px: by how much diameters are known to be wrong (see `slice_fit`)."""
+def moving(slices: Sequence[Disagreement], depth_off_px: Plane) -> Mask | None:
+    """Return (H, W) where something moved during the stack; None where fewer than FEWEST_SLICES slices cannot tell.
+
+    depth_off_px: by how much diameters are known to be wrong (see `slice_fit`).
+    """
     if len(slices) < FEWEST_SLICES:
-        return np.zeros(depth_off_px.shape, bool)
+        return None
     blur_px = _BLUR_PX + np.abs(depth_off_px)
     jumps, allowed = zip(*(_jump(*pair, blur_px) for pair in pairwise(map(_Graded.of, slices))), strict=True)
     sizes = np.stack(jumps)

@@ -326,10 +326,16 @@ PICTURE_RULES = (SHARP, SEAMS, LIGHT)
 """Rules of the all-in-focus picture: a report that lacks a verdict on one of them is not passed."""
 
 
-def picture_verdict(gates: Sequence[Gate]) -> str:
-    """Return one line on the all-in-focus pictures alone: a picture can be flawless though its depth is no good for training."""
+def by_use(gates: Sequence[Gate]) -> dict[str, list[Gate]]:
+    """Return the gates of the all-in-focus pictures, and the others: a picture can be flawless though its depth is no good for training."""
     names = [rule.name for rule in (*PICTURE_RULES, PLACES)]
-    found = {
-        verdict: [name for name in names if any(each.name == name and each.verdict is verdict for each in gates)] for verdict in Verdict
+    return {
+        "all-in-focus pictures": [each for each in gates if each.name in names],
+        "depth and blur, for refocusing and training": [each for each in gates if each.name not in names],
     }
-    return "all-in-focus pictures: " + "; ".join(f"{verdict}: {', '.join(which)}" for verdict, which in found.items() if which)
+
+
+def verdict_line(use: str, gates: Sequence[Gate]) -> str:
+    """Return one line: which gates failed, which were not judged, and which or how many passed."""
+    names = {verdict: list(dict.fromkeys(each.name for each in gates if each.verdict is verdict)) for verdict in Verdict}
+    return f"{use}: " + "; ".join(f"{verdict}: {', '.join(which)}" for verdict, which in names.items() if which)

@@ -14,7 +14,19 @@ from capture.report import HTML_NAME
 from capture.report.examination import Examination, examine
 from capture.report.exclusion import exclusion_masks, has_fresh_exclusions, write_exclusions
 from capture.report.findings import StackFindings, pair_document, picture_document, slice_document
-from capture.report.gates import PICTURE_RULES, STACK_RULES, Gate, Verdict, absent, absent_names, counts, failed, finite, picture_verdict
+from capture.report.gates import (
+    PICTURE_RULES,
+    STACK_RULES,
+    Gate,
+    Verdict,
+    absent,
+    absent_names,
+    by_use,
+    counts,
+    failed,
+    finite,
+    verdict_line,
+)
 from capture.report.pictures import Shown, ShownPlace, shown_places, slice_triple, stack_maps, worst_places
 from capture.report.report_cache import read_cache, signature_of, write_cache
 from capture.report.scene_gates import SCENE_RULES, WHERE, Reconstruction, merged_gate, read_reconstruction, scene_gates
@@ -240,11 +252,11 @@ def _stack_document(examined: ExaminedStack) -> dict[str, Any]:
 def write_html(report: SceneReport) -> None:
     """Write one file in the folder of the scene, with all pictures inside."""
     failures = report.failures
-    kind = "missed" if failures else "met" if report.passed else "muted"
     unseen = "" if failures or report.passed else " Not passed: not all gates of the all-in-focus pictures could be judged."
     blocks = [
         f"<h1>Capture report: {report.scene.resolve().name}</h1>",
-        f'<p class="{kind}">{html.escape(picture_verdict(report.gates))}. Of all: {counts(report.gates)}.{unseen}</p>',
+        *(f'<p class="{_kind(gates)}">{html.escape(verdict_line(use, gates))}.</p>' for use, gates in by_use(report.gates).items()),
+        f'<p class="muted">{counts(report.gates)}.{unseen}</p>',
         f'<p class="muted">Absent: {html.escape(absent_names(report.gates))}.</p>' if report.absences else "",
         f'<p class="muted">Merged stacks: {len(report.stacks)}. mrbokeh {__version__}.</p>',
         section("What failed", "The sections below have all gates.", [gate_table(failures, with_place=True)]) if failures else "",
@@ -252,6 +264,11 @@ def write_html(report: SceneReport) -> None:
         section("Stacks", "", _stack_sections(report.stacks)),
     ]
     write_page(report.scene / HTML_NAME, f"Capture report: {report.scene.resolve().name}", blocks, _STYLE)
+
+
+def _kind(gates: Sequence[Gate]) -> str:
+    """Return the class of a verdict: each use of the stacks has its own."""
+    return "missed" if failed(gates) else "muted" if absent(gates) else "met"
 
 
 def _scene_sections(report: SceneReport) -> list[str]:

@@ -6,6 +6,7 @@ import numpy as np
 
 from capture.merging.merge import HIGHLIGHTS
 from capture.report import gates as rules
+from capture.report.exclusion import FEWEST_SLICES
 from capture.report.findings import SliceFindings, StackFindings
 from capture.report.gates import Gate, Rule
 from capture.report.registration_check import NeighbourDisplacement
@@ -229,9 +230,16 @@ def _depth(findings: StackFindings) -> Gate:
 def _motion(findings: StackFindings) -> Gate:
     share = findings.moving_share
     if share is None:
-        clipped = "clipped highlights light nearly all of the picture: photograph with less exposure"
-        return rules.MOTION.absent(findings.name, rules.NO_PREDICTION if findings.depth_off_share is None else clipped)
+        return rules.MOTION.absent(findings.name, _why_movement_is_unknown(findings))
     return rules.MOTION.judge(findings.name, share, f"{share:.2%} of the picture", share <= rules.LARGEST_MOVING)
+
+
+def _why_movement_is_unknown(findings: StackFindings) -> str:
+    if findings.depth_off_share is None:
+        return rules.NO_PREDICTION
+    if len(findings.slices) < FEWEST_SLICES:
+        return f"movement shows from {FEWEST_SLICES} slices on, and here are {len(findings.slices)}: look at the picture yourself"
+    return "clipped highlights light nearly all of the picture: photograph with less exposure"
 
 
 def _worst(rule: Rule, findings: StackFindings, change_of: Callable[..., Change], limit: float, text: Callable[[float], str]) -> Gate:

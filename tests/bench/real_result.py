@@ -29,6 +29,7 @@ REFOCUS, PEERS = "refocus", "peers"
 """What can be left out with --skip."""
 LEFT_OUT_SET = "lytro_stacks/"
 """Slices are left out and made again in this set, for which there is a bar: 25 slices of 12 megapixels take half an hour."""
+MOST_LEFT_OUT = 4
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """Medians over the slices of a stack but the outermost, in dB; nearest: of the neighbouring slice. said: why there are none."""
+    """Medians over slices of a stack, MOST_LEFT_OUT at most and not the outermost, in dB; nearest: of the neighbouring slice. said: why there are none."""
 
     rendered_db: float | None = None
     with_residuals_db: float | None = None
@@ -172,7 +173,7 @@ def _left_out(made: FocalStack) -> LeaveOneOut:
 
     started = time.process_time()
     try:
-        slices = list(leave_one_out(made, lens_and_renderer(None, None)[1]))
+        slices = list(leave_one_out(made, lens_and_renderer(None, None)[1], MOST_LEFT_OUT))
     except InputError as refused:
         return LeaveOneOut(said=str(refused))
     if not slices:

@@ -307,6 +307,7 @@ def test_strict_asks_for_every_gate(tmp_path: Path) -> None:
     plain = printed_by(report_command, tmp_path)
     assert "9 of 20 gates judged, 0 failed, 11 absent: all viewpoints placed" in plain and "--strict" not in plain
     assert "all-in-focus pictures: passed: as sharp as its slices, no seams, no invented light" in plain
+    assert "depth and blur, for refocusing and training: passed: " in plain
     assert "absent: all viewpoints placed, points lie where they are seen, scales agree: no reconstruction" in plain
     absences = [each.name for each in report_scene(tmp_path).absences]
     allowed = [option for name in absences for option in ("--allow-absent", name.upper())]
