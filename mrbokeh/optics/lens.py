@@ -94,14 +94,14 @@ class Lens:
         """
         height_px, width_px = depth_m.shape
         if not (0.0 <= x_px < width_px and 0.0 <= y_px < height_px):
-            raise InputError(f"cannot focus at ({x_px:g}, {y_px:g}): the depth map has {width_px} x {height_px} pixels")
+            raise InputError(f"cannot focus at pixel ({x_px // 1:g}, {y_px // 1:g}): the depth map has {width_px} x {height_px} pixels")
         rows, columns = np.mgrid[:height_px, :width_px]
         near = np.hypot(columns + 0.5 - x_px, rows + 0.5 - y_px) <= radius_px
         near[int(y_px), int(x_px)] = True
         depths_m = np.sort(depth_m[near & np.isfinite(depth_m) & (depth_m > 0)])
         if depths_m.size == 0:
             raise InputError(
-                f"cannot focus at ({x_px:g}, {y_px:g}): no depth is known there (only background); "
+                f"cannot focus at pixel ({x_px // 1:g}, {y_px // 1:g}): no depth is known there (only background); "
                 f"choose a place on an object, a larger radius, or a focus distance in metres"
             )
         return self._focused_through(float(depths_m[(depths_m.size - 1) // 2]), *self._place_mm(x_px, y_px, width_px, height_px))
