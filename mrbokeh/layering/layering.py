@@ -68,10 +68,15 @@ def render_layers(layers: Sequence[Layer], lens: Lens, kernel_sum: KernelSum | P
     with ThreadPoolExecutor(cores()) as pool:
         slicing = Slicing(psf=psf, slices=layering.slices, frame=frame, pool=pool, memory=_KEPT)
         groups = _groups([pad_layer(layer, each, margin, pool) for layer, each in zip(layers, coc_px, strict=True)])
-        colour, taken = _rendered(groups[-1], layering, slicing)
-        for group in reversed(groups[:-1]):
-            colour, taken = _over(*_rendered(group, layering, slicing), colour, taken)
-    return _as_layer(colour, taken, layers)
+        found: tuple[Channels, Channels] | None = None
+        for group in reversed(groups):
+            is_filled = layering.fill and group[0].is_opaque
+            pixels = _with_hidden(group, pool) if is_filled else [Pixels.covered(layer) for layer in group]
+            front = composited(pixels, slicing, by_depth=not group[0].is_opaque)
+            front = _shared_out(*front) if any(layer.is_opaque for layer in group) else front
+            found = front if found is None else _over(*front, *found)
+    assert found is not None, "there is a layer"
+    return _as_layer(*found, layers)
 
 
 def _check(layers: Sequence[Layer]) -> None:
@@ -100,14 +105,6 @@ def _interleave(front: PaddedLayer, behind: PaddedLayer) -> bool:
     """Return whether a layer listed before another lies behind it anywhere."""
     both = (front.values[..., 3] > 0) & (behind.values[..., 3] > 0)
     return bool((both & (front.coc_px > behind.coc_px + _ONE_SURFACE_PX)).any())
-
-
-def _rendered(group: Sequence[PaddedLayer], layering: Layering, slicing: Slicing) -> tuple[Channels, Channels]:
-    """Return colour of one group and how much of the pupil it takes, within the frame."""
-    is_filled = layering.fill and group[0].is_opaque
-    layers = _with_hidden(group, slicing.pool) if is_filled else [Pixels.covered(layer) for layer in group]
-    colour, taken = composited(layers, slicing, by_depth=not group[0].is_opaque)
-    return _shared_out(colour, taken) if any(layer.is_opaque for layer in group) else (colour, taken)
 
 
 def _with_hidden(group: Sequence[PaddedLayer], pool: Executor) -> list[Pixels]:

@@ -8,11 +8,12 @@ its own. Components' lights do not overlap, so it makes no difference which of t
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
+from functools import partial
 from heapq import merge
 from operator import itemgetter
 
 import numpy as np
-from jaxtyping import Float32, Int32
+from jaxtyping import Float32
 
 from mrbokeh.layering.padded_layers import Part, Pixels, Shares
 from mrbokeh.layering.psf_over_field import Frame, PsfField
@@ -120,30 +121,28 @@ def _components_in_turn(layers: Sequence[Pixels], slicing: Slicing, by_depth: bo
     """Yield components of slices and how far their light travels at most, in the order in which they claim the pupil."""
     nearest, farthest = _range_px(layers, slicing.size[0] * slicing.size[1])
     step_px = max((farthest - nearest) / slicing.slices, _LEAST_STEP_PX)
-    for k, parts in _slices_in_turn(layers, slicing, by_depth, step_px):
-        largest_px = min((abs(k) + _HALF_A_SLICE) * step_px, max(-nearest, farthest))
-        reach = slicing.psf.reach_px(parts, largest_px, slicing.frame)
-        for component in connected_components(parts, reach, slicing.size):
-            yield component, reach
+    cut = partial(sorted_slices, layers, step_px=step_px, width=slicing.size[1], pool=slicing.pool)
+    for together in _shares_in_turn(layers, slicing, by_depth):
+        for k, parts in merge(*map(cut, together), key=itemgetter(0)):
+            largest_px = min((abs(k) + _HALF_A_SLICE) * step_px, max(-nearest, farthest))
+            reach = slicing.psf.reach_px(parts, largest_px, slicing.frame)
+            for component in connected_components(parts, reach, slicing.size):
+                yield component, reach
 
 
-def _slices_in_turn(layers: Sequence[Pixels], slicing: Slicing, by_depth: bool, step_px: float) -> Iterator[tuple[int, list[Part]]]:
-    """Yield number and parts of the slices in the order in which they claim the pupil.
+def _shares_in_turn(layers: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> Iterator[list[list[Shares]]]:
+    """Yield shares of the pixels in the order in which they claim the pupil; those that come together, slice by slice in the order given.
 
     First, front to back, the pixels that the pinhole picture shows; last the hidden ones. But pixels hidden behind something on the other
     side of the focus go right before their slice: kernels are mirrored at the focus, so the pupil that an edge leaves free looks behind
     it.
     """
-
-    def cut(shares: list[Shares]) -> list[tuple[int, list[Part]]]:
-        return sorted_slices(layers, shares, step_px, slicing.size[1], slicing.pool)
-
     if len(layers) == 1:
-        yield from cut([np.ones_like(layers[0].coc_px)])
+        yield [[np.ones_like(layers[0].coc_px)]]
         return
     seen, crossing = _shown_by_depth(layers, slicing.size) if by_depth else _shown_in_order(layers, slicing)
-    yield from merge(cut(crossing), cut(seen), key=itemgetter(0))
-    yield from cut([1.0 - shown - across for shown, across in zip(seen, crossing, strict=True)])
+    yield [crossing, seen]
+    yield [[1.0 - shown - across for shown, across in zip(seen, crossing, strict=True)]]
 
 
 def _range_px(layers: Sequence[Pixels], pixels: int) -> tuple[float, float]:
@@ -194,25 +193,21 @@ def sorted_slices(
 
     width: of the frame that places are counted in.
     """
-    used = [(layer, share) for layer, share in zip(layers, shares, strict=True) if share.any()]
-    runs = [_runs(*each, np.float32(step_px), width, pool) for each in used]
-    slices = np.unique(np.concatenate([np.empty(0, np.int32), *(of_runs for of_runs, _ in runs)]))
-    cuts = [np.split(of_layer, np.searchsorted(of_runs, slices[1:])) for of_runs, of_layer in runs]
-    parts = [[Part(*each, cut) for each, cut in zip(used, cut_of, strict=True) if len(cut) > 0] for cut_of in zip(*cuts, strict=True)]
-    return list(zip(slices.tolist(), parts, strict=True))
-
-
-def _runs(
-    layer: Pixels, shares: Shares, step_px: np.float32, width: int, pool: Executor
-) -> tuple[Int32[np.ndarray, " runs"], Int32[np.ndarray, "runs 2"]]:
-    """Return the slices of a layer's runs, ascending, and the runs, in order within each slice."""
     from mrbokeh.layering._slices_numba import runs_of_slices
 
-    pixels = layer.places, layer.coc_px, shares, width, step_px
-    found = list(pool.map(lambda band: runs_of_slices(*pixels, *band), bands(len(shares), _SORTED_PIXELS)))
-    runs = np.concatenate([np.empty((0, 3), np.int32), *found])
-    runs = runs[np.argsort(runs[:, 0], kind="stable")]
-    return runs[:, 0].copy(), runs[:, 1:].copy()
+    used = [(layer, share) for layer, share in zip(layers, shares, strict=True) if share.any()]
+    of_runs, runs = [], []
+    for layer, share in used:
+        pixels = layer.places, layer.coc_px, share, width, np.float32(step_px)
+        found = list(pool.map(partial(runs_of_slices, *pixels), *zip(*bands(len(share), _SORTED_PIXELS), strict=True)))
+        all_runs = np.concatenate([np.empty((0, 3), np.int32), *found])
+        all_runs = all_runs[np.argsort(all_runs[:, 0], kind="stable")]
+        of_runs.append(all_runs[:, 0].copy())
+        runs.append(all_runs[:, 1:].copy())
+    slices = np.unique(np.concatenate([np.empty(0, np.int32), *of_runs]))
+    cuts = [np.split(of_layer, np.searchsorted(numbers, slices[1:])) for numbers, of_layer in zip(of_runs, runs, strict=True)]
+    parts = [[Part(*each, cut) for each, cut in zip(used, cut_of, strict=True) if len(cut) > 0] for cut_of in zip(*cuts, strict=True)]
+    return list(zip(slices.tolist(), parts, strict=True))
 
 
 def window_of(parts: Sequence[Part], reach: int, frame: Frame) -> Window | None:
