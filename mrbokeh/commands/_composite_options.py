@@ -30,35 +30,24 @@ OutOption = Annotated[
 class PlateOptions(shared.NearOptions):
     """Options of the photograph and its depth. disparity: NEAR:FAR as typed."""
 
-    slice_: Annotated[int | None, typer.Option("--slice", help="Which slice of the focal stack to put it into.", rich_help_panel=PLATE)] = (
-        None
-    )
-    all_slices: Annotated[
-        bool, typer.Option("--all-slices", help="Put it into every slice of the stack; OUT is a new stack.", rich_help_panel=PLATE)
-    ] = False
+    PANEL = PLATE
+
+    slice_: Annotated[int | None, typer.Option("--slice", help="Which slice of the focal stack to put it into.")] = None
+    all_slices: Annotated[bool, typer.Option("--all-slices", help="Put it into every slice of the stack; OUT is a new stack.")] = False
     depth: Annotated[
         Path | None,
-        typer.Option(
-            help="Depth of the photograph: EXR with Z, PNG or TIFF, a phone's JPEG, disparity (.npz) or a depth network (.onnx).",
-            rich_help_panel=PLATE,
-        ),
+        typer.Option(help="Depth of the photograph: EXR with Z, PNG or TIFF, a phone's JPEG, disparity (.npz) or a depth network (.onnx)."),
     ] = None
     disparity: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NEAR:FAR", help="--depth is even in 1/distance, largest number at NEAR, 0 at FAR metres.", rich_help_panel=PLATE
-        ),
+        str | None, typer.Option(metavar="NEAR:FAR", help="--depth is even in 1/distance, largest number at NEAR, 0 at FAR metres.")
     ] = None
-    depth_scale: Annotated[
-        float | None, typer.Option(help="--depth holds distance: metres for each step; 0 is unknown.", rich_help_panel=PLATE)
-    ] = None
+    depth_scale: Annotated[float | None, typer.Option(help="--depth holds distance: metres for each step; 0 is unknown.")] = None
     exact_depth: Annotated[
         bool,
         typer.Option(
             "--exact-depth",
             help="Depth is exact at rims, as of a render. By default between and rerender move the rims of near things, where a stack "
             "has an all-in-focus picture, to where the photograph shows them.",
-            rich_help_panel=PLATE,
         ),
     ] = False
 
@@ -67,16 +56,15 @@ class PlateOptions(shared.NearOptions):
 class ObjectOptions:
     """Options of how the --object stands: at or at_pixel, and its height, as typed; angles in degrees."""
 
-    object_: Annotated[Path | None, typer.Option("--object", help="GLB file to render and put in.", rich_help_panel=VIRTUAL)] = None
-    at: Annotated[
-        str | None, typer.Option(help="X,Y,Z in metres where the object stands: right, down, forward of the lens.", rich_help_panel=VIRTUAL)
-    ] = None
+    PANEL = VIRTUAL
+
+    object_: Annotated[Path | None, typer.Option("--object", help="GLB file to render and put in.")] = None
+    at: Annotated[str | None, typer.Option(help="X,Y,Z in metres where the object stands: right, down, forward of the lens.")] = None
     at_pixel: Annotated[
         str | None,
         typer.Option(
             help="X,Y of the pixel on which the object stands; needs depth. Without --object the layers stand there: their depth is scaled "
-            "so that it is the photograph's at that pixel, which leaves them as they look.",
-            rich_help_panel=VIRTUAL,
+            "so that it is the photograph's at that pixel, which leaves them as they look."
         ),
     ] = None
     height: Annotated[
@@ -85,11 +73,10 @@ class ObjectOptions:
             metavar="METRES|PIXELSpx",
             help="Height of the object in metres, or such as 120px: as long as so many pixels are where it stands. Default: as in the "
             "file, or a quarter of the picture where the metres of the stack are guessed.",
-            rich_help_panel=VIRTUAL,
         ),
     ] = None
-    turn: Annotated[float, typer.Option(help="Turn of the object about the vertical in degrees.", rich_help_panel=VIRTUAL)] = 0.0
-    tilt: Annotated[float, typer.Option(help="How far the camera looks down, in degrees.", rich_help_panel=VIRTUAL)] = 0.0
+    turn: Annotated[float, typer.Option(help="Turn of the object about the vertical in degrees.")] = 0.0
+    tilt: Annotated[float, typer.Option(help="How far the camera looks down, in degrees.")] = 0.0
     environment: Annotated[Path | None, typer.Option(help="Panorama (.hdr, .exr) that lights the --object.", rich_help_panel=LIGHT)] = None
     exposure: Annotated[float, typer.Option(min=0.0, help="Factor on the object's light.", rich_help_panel=LIGHT)] = 1.0
     shadow: Annotated[float, typer.Option(min=0.0, max=1.0, help="Darkness of the object's shadow.", rich_help_panel=LIGHT)] = 0.0
@@ -99,28 +86,26 @@ class ObjectOptions:
 class RenderingOptions(shared.RenderingOptions):
     """Options of rendering in a photograph. time: of the animations, in seconds."""
 
+    PANEL = VIRTUAL
+
     scene_renderer: shared.BackendOption = "embree"
-    time: Annotated[float, typer.Option(help="Second of the animations that is shown.", rich_help_panel=VIRTUAL)] = 0.0
+    time: Annotated[float, typer.Option(help="Second of the animations that is shown.")] = 0.0
 
 
 @dataclass(frozen=True)
 class LensOptions:
     """Options of the lens. focus: distance of the photograph in metres."""
 
+    PANEL = LENS
+
     lens: Annotated[
-        Path | None,
-        typer.Option(
-            help="LENS.json, or LENS.onnx to blur with a trained network. Default: what the photograph tells.", rich_help_panel=LENS
-        ),
+        Path | None, typer.Option(help="LENS.json, or LENS.onnx to blur with a trained network. Default: what the photograph tells.")
     ] = None
-    focus: Annotated[float | None, typer.Option(help="Focus distance of the photograph in metres.", rich_help_panel=LENS)] = None
+    focus: Annotated[float | None, typer.Option(help="Focus distance of the photograph in metres.")] = None
     renderer: Annotated[
         str | None,
         typer.Option(
-            "--renderer",
-            "--method",
-            help="polygon, low-rank, scatter or NETWORK.onnx. Default: --lens if a network, else polygon.",
-            rich_help_panel=LENS,
+            "--renderer", "--method", help="polygon, low-rank, scatter or NETWORK.onnx. Default: --lens if a network, else polygon."
         ),
     ] = None
 
@@ -129,13 +114,10 @@ class LensOptions:
 class ResultOptions:
     """Files beside OUT."""
 
-    save_layer: Annotated[
-        Path | None, typer.Option(help="Also write the blurred virtual layer (EXR with alpha).", rich_help_panel=RESULT)
-    ] = None
+    PANEL = RESULT
+
+    save_layer: Annotated[Path | None, typer.Option(help="Also write the blurred virtual layer (EXR with alpha).")] = None
     deep_out: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.exr", help="Also write the sharp virtual layers as a deep EXR, one sample per layer.", rich_help_panel=RESULT
-        ),
+        Path | None, typer.Option(metavar="FILE.exr", help="Also write the sharp virtual layers as a deep EXR, one sample per layer.")
     ] = None
     overwrite: shared.OverwriteOption = False

@@ -25,16 +25,17 @@ LOOK = "Its look"
 class NearOptions:
     """Options of what stands in front of virtual things. near_distance: in metres."""
 
+    PANEL = PLATE
+
     matte: Annotated[
         Path | None,
         typer.Option(
             metavar="MATTE.png",
             help="White where something real stands in front, sharp, for --mode between; of a clip also matte.%04d.png.",
-            rich_help_panel=PLATE,
         ),
     ] = None
     near_distance: Annotated[
-        float | None, typer.Option(metavar="METRES", help="How far what --matte shows is, where there is no depth.", rich_help_panel=PLATE)
+        float | None, typer.Option(metavar="METRES", help="How far what --matte shows is, where there is no depth.")
     ] = None
 
 
@@ -42,22 +43,19 @@ class NearOptions:
 class VirtualOptions:
     """Layers of other renderers and a scene, and how they go in."""
 
+    PANEL = VIRTUAL
+
     layer: Annotated[
         list[Path] | None,
         typer.Option(
             metavar="RGBAZ.exr",
             help="All-in-focus virtual layer: EXR with R, G, B, A (linear, premultiplied) and Z in metres, of a clip also "
             "layer.%04d.exr; may be given several times, front first. Deep EXR goes among all others by depth.",
-            rich_help_panel=VIRTUAL,
         ),
     ] = None
-    objects: Annotated[
-        str | None,
-        typer.Option(metavar="NAME,NAME", help="Only these objects of the layers, by their Cryptomatte.", rich_help_panel=VIRTUAL),
-    ] = None
+    objects: Annotated[str | None, typer.Option(metavar="NAME,NAME", help="Only these objects of the layers, by their Cryptomatte.")] = None
     scene: Annotated[
-        Path | None,
-        typer.Option(metavar="SCENE.toml", help="Scene file with objects, lights and shadow, which is rendered.", rich_help_panel=VIRTUAL),
+        Path | None, typer.Option(metavar="SCENE.toml", help="Scene file with objects, lights and shadow, which is rendered.")
     ] = None
     camera: Annotated[
         Path | None,
@@ -65,15 +63,13 @@ class VirtualOptions:
             metavar="CAMERA",
             help="For --scene: a fixed camera (JSON) or a track (JSON, .chan, nerfstudio, COLMAP, OpenTrackIO); in a photograph by "
             "default one that looks along z from the origin.",
-            rich_help_panel=VIRTUAL,
         ),
     ] = None
     mode: Annotated[
         str | None,
         typer.Option(
             help="How layers go in: front, over (by depth), matte, between (behind blurred near things) or rerender. Default: the best "
-            "that what is known of the plate allows.",
-            rich_help_panel=VIRTUAL,
+            "that what is known of the plate allows."
         ),
     ] = None
 
@@ -94,14 +90,13 @@ class VirtualOptions:
 class RenderingOptions:
     """Options of rendering --scene and --object."""
 
+    PANEL = VIRTUAL
+
     scene_renderer: BackendOption = "auto"
-    samples: Annotated[int, typer.Option(min=1, help="Paths per pixel of mitsuba.", rich_help_panel=VIRTUAL)] = 64
-    catch: Annotated[
-        str,
-        typer.Option(
-            help="What the ground under them catches: shadow, or light (also reflections, with mitsuba).", rich_help_panel=VIRTUAL
-        ),
-    ] = "shadow"
+    samples: Annotated[int, typer.Option(min=1, help="Paths per pixel of mitsuba.")] = 64
+    catch: Annotated[str, typer.Option(help="What the ground under them catches: shadow, or light (also reflections, with mitsuba).")] = (
+        "shadow"
+    )
     distortion: Annotated[
         Path | None,
         typer.Option(
@@ -122,16 +117,15 @@ class RenderingOptions:
 class ColourOptions:
     """Colour spaces of OpenColorIO, by name; None is as files state, and linear Rec.709 or sRGB out."""
 
+    PANEL = RESULT
+
     input_space: Annotated[
         str | None, typer.Option(help="OpenColorIO space of the plate's numbers, such as ACEScg or 'ARRI LogC4'.", rich_help_panel=PLATE)
     ] = None
     output_space: Annotated[
-        str | None,
-        typer.Option(help="OpenColorIO space of OUT, such as ACEScg; OUT then holds the picture alone.", rich_help_panel=RESULT),
+        str | None, typer.Option(help="OpenColorIO space of OUT, such as ACEScg; OUT then holds the picture alone.")
     ] = None
-    ocio: Annotated[
-        str, typer.Option(metavar="CONFIG", help="OpenColorIO configuration: aces, aces-cg or a file.", rich_help_panel=RESULT)
-    ] = "aces"
+    ocio: Annotated[str, typer.Option(metavar="CONFIG", help="OpenColorIO configuration: aces, aces-cg or a file.")] = "aces"
 
     @property
     def of_plate(self) -> "NamedSpace | None":
@@ -155,17 +149,16 @@ if TYPE_CHECKING:
 class LookGroup:
     """Options that make virtual light look photographed: texts as typed, see `mrbokeh.compositing.plate_look.finishing.LookOptions`."""
 
-    match_grey: Annotated[
-        str | None,
-        typer.Option(metavar="X,Y[,R]", help="A grey card in the plate sets exposure and white balance.", rich_help_panel=LOOK),
-    ] = None
-    grey_value: Annotated[float, typer.Option(help="What the card reflects.", rich_help_panel=LOOK)] = 0.18
+    PANEL = LOOK
+
+    match_grey: Annotated[str | None, typer.Option(metavar="X,Y[,R]", help="A grey card in the plate sets exposure and white balance.")] = (
+        None
+    )
+    grey_value: Annotated[float, typer.Option(help="What the card reflects.")] = 0.18
     match_exposure: Annotated[
         Path | None,
         typer.Option(
-            metavar="PHOTO",
-            help="Photograph of which the virtual light was made: exposures are matched, by what both state of theirs.",
-            rich_help_panel=LOOK,
+            metavar="PHOTO", help="Photograph of which the virtual light was made: exposures are matched, by what both state of theirs."
         ),
     ] = None
     plate_exposure: Annotated[
@@ -173,25 +166,14 @@ class LookGroup:
         typer.Option(
             metavar="SECONDS,ISO,F",
             help="Exposure of the plate for --match-exposure, such as 1/50,400,2.8, where its file states none: any video.",
-            rich_help_panel=LOOK,
         ),
     ] = None
-    match_white: Annotated[
-        float | None, typer.Option(metavar="KELVIN", help="Light that the plate was balanced for.", rich_help_panel=LOOK)
-    ] = None
-    match_black: Annotated[
-        str | None, typer.Option(metavar="auto|X,Y[,R]", help="Virtual blacks are lifted to the plate's.", rich_help_panel=LOOK)
-    ] = None
-    vignetting: Annotated[
-        str | None, typer.Option(metavar="auto|K1,K2,K3|FLAT.png", help="The lens darkens virtual light too.", rich_help_panel=LOOK)
-    ] = None
-    grain: Annotated[
-        str | None, typer.Option(metavar="auto|FILE", help="Grain as measured in the plate, on virtual light.", rich_help_panel=LOOK)
-    ] = None
-    light_wrap: Annotated[
-        str | None, typer.Option(metavar="STRENGTH[,SIGMA]", help="Light of the plate over virtual edges.", rich_help_panel=LOOK)
-    ] = None
-    seed: Annotated[int, typer.Option(help="Of the grain.", rich_help_panel=LOOK)] = 0
+    match_white: Annotated[float | None, typer.Option(metavar="KELVIN", help="Light that the plate was balanced for.")] = None
+    match_black: Annotated[str | None, typer.Option(metavar="auto|X,Y[,R]", help="Virtual blacks are lifted to the plate's.")] = None
+    vignetting: Annotated[str | None, typer.Option(metavar="auto|K1,K2,K3|FLAT.png", help="The lens darkens virtual light too.")] = None
+    grain: Annotated[str | None, typer.Option(metavar="auto|FILE", help="Grain as measured in the plate, on virtual light.")] = None
+    light_wrap: Annotated[str | None, typer.Option(metavar="STRENGTH[,SIGMA]", help="Light of the plate over virtual edges.")] = None
+    seed: Annotated[int, typer.Option(help="Of the grain.")] = 0
 
     @property
     def wanted(self) -> "LookOptions":

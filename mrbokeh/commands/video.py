@@ -55,82 +55,68 @@ OutOption = Annotated[
 class ClipOptions(shared.NearOptions):
     """Options of the clip: which frames are taken, their numbers, and depth."""
 
-    rate: Annotated[
-        str | None, typer.Option(help="Frames per second of numbered pictures: 25, 23.976, 24000/1001.", rich_help_panel=PLATE)
-    ] = None
-    frames: Annotated[
-        str, typer.Option(metavar="START:STOP", help="Frames to take, counted from 0; STOP is left out.", rich_help_panel=PLATE)
-    ] = ":"
+    PANEL = PLATE
+
+    rate: Annotated[str | None, typer.Option(help="Frames per second of numbered pictures: 25, 23.976, 24000/1001.")] = None
+    frames: Annotated[str, typer.Option(metavar="START:STOP", help="Frames to take, counted from 0; STOP is left out.")] = ":"
     first_number: Annotated[
         int | None,
-        typer.Option(
-            help="What the clip's frame 0 is called in sequences, tracks and focus pulls; default: as its own files, or 0.",
-            rich_help_panel=PLATE,
-        ),
+        typer.Option(help="What the clip's frame 0 is called in sequences, tracks and focus pulls; default: as its own files, or 0."),
     ] = None
     depth: Annotated[
-        Path | None,
-        typer.Option(metavar="DEPTH.exr", help="Depth of the filmed scene in metres, one file or depth.%04d.exr.", rich_help_panel=PLATE),
+        Path | None, typer.Option(metavar="DEPTH.exr", help="Depth of the filmed scene in metres, one file or depth.%04d.exr.")
     ] = None
-    steady_depth: Annotated[
-        bool, typer.Option("--steady-depth", help="Filter numbered depth in time, against flicker.", rich_help_panel=PLATE)
-    ] = False
+    steady_depth: Annotated[bool, typer.Option("--steady-depth", help="Filter numbered depth in time, against flicker.")] = False
 
 
 @dataclass(frozen=True)
 class RenderingOptions(shared.RenderingOptions):
     """Options of filming --scene. shutter: angle in degrees; readout, scene_begin: in seconds."""
 
+    PANEL = LENS
+
     scene_begin: Annotated[
         float, typer.Option(help="Second of the clip at which the animations of --scene begin.", rich_help_panel=VIRTUAL)
     ] = 0.0
     shutter: Annotated[
-        float | None,
-        typer.Option(min=0.0, max=360.0, metavar="DEGREES", help="Shutter angle: --scene is blurred by its motion.", rich_help_panel=LENS),
+        float | None, typer.Option(min=0.0, max=360.0, metavar="DEGREES", help="Shutter angle: --scene is blurred by its motion.")
     ] = None
-    readout: Annotated[
-        float, typer.Option(help="Seconds from the first to the last row of a rolling shutter, with --shutter.", rich_help_panel=LENS)
-    ] = 0.0
+    readout: Annotated[float, typer.Option(help="Seconds from the first to the last row of a rolling shutter, with --shutter.")] = 0.0
 
 
 @dataclass(frozen=True)
 class BlurOptions:
     """Focus by frame, and the renderer."""
 
+    PANEL = LENS
+
     focus_pull: Annotated[
-        str | None,
-        typer.Option(
-            metavar="KEYS|FILE.csv", help="Focus by frame: FRAME:METRES,FRAME:METRES or metadata of a camera.", rich_help_panel=LENS
-        ),
+        str | None, typer.Option(metavar="KEYS|FILE.csv", help="Focus by frame: FRAME:METRES,FRAME:METRES or metadata of a camera.")
     ] = None
-    renderer: Annotated[
-        str, typer.Option("--renderer", "--method", help="polygon, low-rank, scatter, or a network (.onnx).", rich_help_panel=LENS)
-    ] = DEFAULT
+    renderer: Annotated[str, typer.Option("--renderer", "--method", help="polygon, low-rank, scatter, or a network (.onnx).")] = DEFAULT
 
 
 @dataclass(frozen=True)
 class ResultOptions:
     """Options of the written result."""
 
+    PANEL = RESULT
+
     encoding: Annotated[
         str | None,
         typer.Option(
             help="h264, h264-10bit, h265-10bit, prores4444, prores4444-alpha, prores422, dnxhr-hqx, ffv1 or ffv1-alpha; by default the "
-            "usual one of OUT, with alpha where CLIP has some.",
-            rich_help_panel=RESULT,
+            "usual one of OUT, with alpha where CLIP has some."
         ),
     ] = None
     constant_rate: Annotated[
         str | None,
         typer.Option(
-            metavar="FPS",
-            help="Hold or leave out pictures of a clip of uneven times, so that OUT has this even rate (as MXF needs it).",
-            rich_help_panel=RESULT,
+            metavar="FPS", help="Hold or leave out pictures of a clip of uneven times, so that OUT has this even rate (as MXF needs it)."
         ),
     ] = None
     virtual_only: Annotated[
-        bool,
-        typer.Option("--virtual-only", help="Write the blurred virtual layer with alpha: EXR files, .mov or .mkv.", rich_help_panel=RESULT),
+        bool, typer.Option("--virtual-only", help="Write the blurred virtual layer with alpha: EXR files, .mov or .mkv.")
     ] = False
     overwrite: shared.OverwriteOption = False
 
@@ -139,13 +125,11 @@ class ResultOptions:
 class WorkOptions:
     """Options of the workers. workers: processes here; cluster: a scheduler elsewhere; segment: in seconds."""
 
-    workers: Annotated[int, typer.Option(min=0, help="Processes on this machine; 0 takes one for each core.", rich_help_panel=WORK)] = 0
-    cluster: Annotated[
-        str | None, typer.Option(metavar="tcp://HOST:8786", help="Dask scheduler whose workers see the same files.", rich_help_panel=WORK)
-    ] = None
-    segment: Annotated[
-        float, typer.Option(min=0.01, help="Seconds of a segment, the least that a kill can lose.", rich_help_panel=WORK)
-    ] = SEGMENT_S
+    PANEL = WORK
+
+    workers: Annotated[int, typer.Option(min=0, help="Processes on this machine; 0 takes one for each core.")] = 0
+    cluster: Annotated[str | None, typer.Option(metavar="tcp://HOST:8786", help="Dask scheduler whose workers see the same files.")] = None
+    segment: Annotated[float, typer.Option(min=0.01, help="Seconds of a segment, the least that a kill can lose.")] = SEGMENT_S
 
 
 if TYPE_CHECKING:
