@@ -56,6 +56,7 @@ def test_each_codec_is_encoded_once_while_it_has_viewers() -> None:
         h264, vp8 = stream.watch("H264", ignore), stream.watch("VP8", ignore)
         for i in range(3):
             push(stream, i, "VP8")
+        wait_until(lambda: h264.waiting == vp8.waiting == 3)
         assert stream.encoded == {"H264": 3, "VP8": 3}
         assert sequences(taken(h264)) == sequences(taken(vp8)) == [0, 1, 2]
         stream.leave(vp8)

@@ -1,4 +1,4 @@
-"""Focus solved from the blur of a board, on pictures through a thin lens whose focus is known (tests/thin_lens_board)."""
+"""Focus solved from the blur of a board, on pictures through a thin lens whose focus is known (tests/scenes/thin_lens_board)."""
 
 import time
 from dataclasses import replace
