@@ -26,6 +26,8 @@ from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLoca
 from numba.core.compiler_lock import global_compiler_lock
 from numba.misc.appdirs import AppDirs
 
+from mrbokeh.system.kernel_libraries import link_once
+
 _config: Any = numba.config
 
 KEPT_UNUSED_DAYS = 90
@@ -50,6 +52,8 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def compiled(function: Callable[..., Any]) -> Any:
         kernel = numba.njit(**options)(function)
+        if not _config.DISABLE_JIT:
+            link_once(kernel)
         folder = None if _config.DISABLE_JIT or not kept else _folder(Path(function.__code__.co_filename), function.__module__)
         if folder is not None:
             kernel._cache = _KernelCache(function)

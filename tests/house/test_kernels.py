@@ -127,6 +127,28 @@ def _doubled(x: int) -> int:
     return 2 * x
 
 
+@kernels.njit(nogil=True)
+def fibonacci(n: int) -> int:
+    if n < 2:
+        return n
+    return fibonacci(n - 1) + fibonacci(n - 2)
+
+
+@kernels.njit(nogil=True)
+def next_of_fibonacci(n: int) -> int:
+    if n < 0:
+        raise ValueError("a negative place")
+    return fibonacci(n) + 1
+
+
+def test_what_kernels_call_becomes_machine_code_only_where_python_calls_it() -> None:
+    assert next_of_fibonacci(10) == 56
+    assert not fibonacci.signatures
+    assert fibonacci(10) == 55 and len(fibonacci.signatures) == 1
+    with pytest.raises(ValueError, match="a negative place"):
+        next_of_fibonacci(-1)
+
+
 def test_kernels_unused_for_long_are_removed(tmp_path: Path) -> None:
     for name, days in {"old": kernels.KEPT_UNUSED_DAYS + 1, "new": kernels.KEPT_UNUSED_DAYS - 1}.items():
         (tmp_path / name).mkdir()
