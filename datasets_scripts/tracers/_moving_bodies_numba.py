@@ -107,21 +107,9 @@ def _bilinear(texels: np.ndarray, start: int, height: int, width: int, u: float,
 
 
 @njit(cache=True, nogil=True)
-def radiance_of(
-    table: np.ndarray,
-    kind: np.ndarray,
-    texture: np.ndarray,
-    texels: np.ndarray,
-    light: np.ndarray,
-    i: int,
-    t: float,
-    u: float,
-    v: float,
-    x: float,
-    y: float,
-    since: float,
-) -> tuple[float, float, float]:
+def radiance_of(s: PackedBodies, i: int, t: float, u: float, v: float, x: float, y: float, since: float) -> tuple[float, float, float]:
     """Return the linear RGB of a hit at (x, y, t): Lambert under the sun and a sky, which on spheres fades downwards."""
+    table, kind, texture, texels, light = s.table, s.kind, s.texture, s.texels, s.light
     if i == NOTHING:
         return light[BACKGROUND], light[BACKGROUND + 1], light[BACKGROUND + 2]
     if kind[i] == LAMP:

@@ -65,15 +65,14 @@ def sample_rows(
     mirrored: np.ndarray,
     first_stream: int,
     top: int,
-    xy_px: np.ndarray,
-    lens_uv: np.ndarray,
-    time: np.ndarray,
-    rgb: np.ndarray,
-    depth_m: np.ndarray,
-    motion_px: np.ndarray,
+    filled: tuple,
 ) -> None:
-    """Fill (H, W, spp, ...) arrays from row `top` on: one ray per sample, each with its own film point, lens point and moment."""
-    table, kind, bounds_px, texture, texels, light = s.table, s.kind, s.bounds_px, s.texture, s.texels, s.light
+    """Fill arrays (H, W, spp, ...) from row `top` on: one ray per sample, each with its own film point, lens point and moment.
+
+    filled: xy_px, lens_uv, time, rgb, depth_m, motion_px.
+    """
+    xy_px, lens_uv, time, rgb, depth_m, motion_px = filled
+    table, kind, bounds_px = s.table, s.kind, s.bounds_px
     lens_y, lens_x, lens_light = lens.y, lens.x, lens.light
     members, seeds = np.empty(table.shape[0], np.int64), np.empty(DIMENSIONS, np.uint32)
     for left in range(0, view.width, TILE_PX):
@@ -92,7 +91,7 @@ def sample_rows(
                     dy = (py - 0.5 * view.height) / view.focal - oy * view.inverse_focus
                     i, t, edge_u, edge_v = first_hit(table, kind, members, count, ox, oy, dx, dy, moment - 0.5)
                     x, y = ox + t * dx, oy + t * dy
-                    red, green, blue = radiance_of(table, kind, texture, texels, light, i, t, edge_u, edge_v, x, y, moment - 0.5)
+                    red, green, blue = radiance_of(s, i, t, edge_u, edge_v, x, y, moment - 0.5)
                     mx, my = motion_of(table, i, t, x, y, moment - 0.5, view.focal, view.focal)
                     xy_px[row, column, n, 0], xy_px[row, column, n, 1] = px, py
                     lens_uv[row, column, n, 0], lens_uv[row, column, n, 1] = u, v
@@ -104,7 +103,7 @@ def sample_rows(
 @njit(cache=True, nogil=True)
 def mean_rows(s: PackedBodies, view: Pinhole, lens: LensTable, mirrored: np.ndarray, first_stream: int, top: int, rgb: np.ndarray) -> None:
     """Fill rgb (H, W, 3) from row `top` on with the mean over each pixel's square, the pupil and the shutter; lamps are black."""
-    table, kind, bounds_px, texture, texels, light = s.table, s.kind, s.bounds_px, s.texture, s.texels, s.light
+    table, kind, bounds_px = s.table, s.kind, s.bounds_px
     lens_y, lens_x, lens_light = lens.y, lens.x, lens.light
     members, seeds = np.empty(table.shape[0], np.int64), np.empty(DIMENSIONS, np.uint32)
     samples = mirrored.shape[0]
@@ -126,7 +125,7 @@ def mean_rows(s: PackedBodies, view: Pinhole, lens: LensTable, mirrored: np.ndar
                     i, t, edge_u, edge_v = first_hit(table, kind, members, count, ox, oy, dx, dy, since)
                     if i >= 0 and kind[i] == LAMP:
                         continue
-                    r, g, b = radiance_of(table, kind, texture, texels, light, i, t, edge_u, edge_v, ox + t * dx, oy + t * dy, since)
+                    r, g, b = radiance_of(s, i, t, edge_u, edge_v, ox + t * dx, oy + t * dy, since)
                     red, green, blue = red + r, green + g, blue + b
                 rgb[row, column, 0], rgb[row, column, 1], rgb[row, column, 2] = red / samples, green / samples, blue / samples
 
@@ -146,7 +145,7 @@ def sharp_rows(
 
     Depth and motion are those of the hit nearest to the pixel's centre, or of the lamps' where lamps give over half the light.
     """
-    table, kind, bounds_px, texture, texels, light = s.table, s.kind, s.bounds_px, s.texture, s.texels, s.light
+    table, kind, bounds_px = s.table, s.kind, s.bounds_px
     members, seeds = np.empty(table.shape[0], np.int64), np.empty(DIMENSIONS, np.uint32)
     sums, nearest, found = np.empty(2), np.empty(2), np.empty((2, 3))
     for left in range(0, view.width, TILE_PX):
@@ -163,7 +162,7 @@ def sharp_rows(
                         share = 1.0 / mirrored.shape[0]
                     dx, dy = (px - 0.5 * view.width) / view.focal, (py - 0.5 * view.height) / view.focal
                     i, t, edge_u, edge_v = first_hit(table, kind, members, count, 0.0, 0.0, dx, dy, 0.0)
-                    r, g, b = radiance_of(table, kind, texture, texels, light, i, t, edge_u, edge_v, t * dx, t * dy, 0.0)
+                    r, g, b = radiance_of(s, i, t, edge_u, edge_v, t * dx, t * dy, 0.0)
                     rgba[row, column, 0] += share * r
                     rgba[row, column, 1] += share * g
                     rgba[row, column, 2] += share * b
@@ -216,9 +215,7 @@ def _lamp_point(table: np.ndarray, lamp: int, first: np.uint32, second: np.uint3
 def gather_rows(
     s: PackedBodies,
     view: Pinhole,
-    vertices: np.ndarray,
-    starts: np.ndarray,
-    weights: np.ndarray,
+    outlines: tuple,
     pupil_area: float,
     gathered: np.ndarray,
     mirrored: np.ndarray,
@@ -228,8 +225,10 @@ def gather_rows(
 ) -> None:
     """Add to rgb (H, W, 3) from row `top` on the light of the lamps of which `gathered` (bodies,) is true.
 
+    outlines: vertices, starts and weights of the pupil.
     With p and t fixed, an area on the lamp is one on the pupil over (R (1 - z / d_f))^2.
     """
+    vertices, starts, weights = outlines
     table, kind, bounds_px = s.table, s.kind, s.bounds_px
     members, seeds = np.empty(table.shape[0], np.int64), np.empty(DIMENSIONS, np.uint32)
     for left in range(0, view.width, TILE_PX):

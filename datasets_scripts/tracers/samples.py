@@ -93,7 +93,7 @@ class SampleTracer:
         out = SampleArrays(*(np.empty((*size, *more), np.float32) for more in ((2,), (2,), (), (3,), (), (2,))))
         arrays = (out.xy_px, out.lens_uv, out.time, out.rgb, out.depth_m, out.motion_px)
         packed, table, points = self._packed(), lens_table(self.lens.aperture), mirrored_sobol(spp)
-        self._run(lambda top: sample_rows(packed, self._view, table, points, self._stream(_SAMPLES), top, *arrays), advance)
+        self._run(lambda top: sample_rows(packed, self._view, table, points, self._stream(_SAMPLES), top, arrays), advance)
         return out
 
     def mean(self, spp: int, advance: Advance = _silent) -> Float32[np.ndarray, "height width 3"]:
@@ -140,7 +140,7 @@ class SampleTracer:
         followed = np.flatnonzero((packed.kind == LAMP) & ~gathered)
         points = mirrored_sobol(max(spp // _GATHERED_SHARE, 16))
         if gathered.any():
-            self._run(lambda top: gather_rows(packed, view, *outlines, area, gathered, points, stream, top, rgb))
+            self._run(lambda top: gather_rows(packed, view, outlines, area, gathered, points, stream, top, rgb))
         if len(followed):
             table, points = lens_table(self.lens.aperture), mirrored_sobol(spp * _FOLLOWED_RAYS)
 

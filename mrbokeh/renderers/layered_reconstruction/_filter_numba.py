@@ -46,26 +46,6 @@ def tile_order(xy_px: np.ndarray, width_px: int, height_px: int, tile_px: int, o
         ends[keys[i]] += 1
 
 
-@njit(cache=True, nogil=True)
-def gather(
-    order: np.ndarray, xy_px: np.ndarray, lens_uv: np.ndarray, time: np.ndarray, coc_px: np.ndarray, motion_px: np.ndarray,
-    values: np.ndarray, bucket: np.ndarray, moves: bool,
-    geometry: np.ndarray, slopes: np.ndarray, sorted_values: np.ndarray, sorted_bucket: np.ndarray,
-) -> None:  # fmt: skip
-    """Fill geometry (N, 5), slopes (N, 3), values and buckets in this order; without motion where moves is False."""
-    for k in range(len(order)):
-        i = order[k]
-        geometry[k, 0], geometry[k, 1] = xy_px[i, 0], xy_px[i, 1]
-        geometry[k, 2], geometry[k, 3] = lens_uv[i, 0], lens_uv[i, 1]
-        geometry[k, 4] = time[i] - np.float32(0.5)
-        slopes[k, 0] = np.float32(0.5) * coc_px[i]
-        slopes[k, 1] = motion_px[i, 0] if moves else np.float32(0.0)
-        slopes[k, 2] = motion_px[i, 1] if moves else np.float32(0.0)
-        for c in range(values.shape[1]):
-            sorted_values[k, c] = values[i, c]
-        sorted_bucket[k] = bucket[i]
-
-
 BESIDE_DEPTHS = 16
 """Up to so many depth buckets in front of a partition may belong to the same slanted surface."""
 

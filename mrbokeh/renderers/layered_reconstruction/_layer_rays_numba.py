@@ -1,6 +1,7 @@
 """Compiled rays through pupil and shutter into layers with depth: each meets one pixel of one layer, or nothing."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,6 +10,39 @@ from mrbokeh.system.kernels import njit
 _THICKNESS_PX = 1.0
 _FIXED_POINT_ROUNDS = 3
 _GOLDEN = 1.1673039782614187  # the root of g^6 = g + 1: the steps of an even sequence in five dimensions (Roberts 2018)
+
+
+class Pupil(NamedTuple):
+    """Spans of the pupil before the focus and behind it, from side_starts, with running weights and the heights of their strips."""
+
+    spans: np.ndarray
+    cumulative: np.ndarray
+    side_starts: np.ndarray
+    heights: np.ndarray
+
+
+class Surfaces(NamedTuple):
+    """Layers, front first: radius_px, alpha (L, H, W), motion_px (L, H, W, 2), fastest_px the fastest around each pixel.
+
+    ranges_px (L, 2): the least and largest radius. is_opaque: a ray that meets nothing has passed behind an edge, and what lies behind
+    goes on there.
+    """
+
+    radius_px: np.ndarray
+    alpha: np.ndarray
+    motion_px: np.ndarray
+    fastest_px: np.ndarray
+    ranges_px: np.ndarray
+    is_opaque: bool
+
+
+class Samples(NamedTuple):
+    """What rays give. met: (N, 3) layer, row, column; -1 where a ray meets nothing."""
+
+    xy_px: np.ndarray
+    lens_uv: np.ndarray
+    time: np.ndarray
+    met: np.ndarray
 
 
 @njit(cache=True, nogil=True)
@@ -78,15 +112,16 @@ def pinhole_place(
 @njit(cache=True, nogil=True)
 def meet(
     x: float, y: float, pupils: np.ndarray, tau: float, radius_px: np.ndarray, covered: np.ndarray, motion_px: np.ndarray,
-    fastest_px: np.ndarray, nearest_px: float, farthest_px: float, fill: bool,
+    fastest_px: np.ndarray, range_px: np.ndarray, fill: bool,
 ) -> tuple[int, int, int]:  # fmt: skip
     """Return row, column and side (0 in front of the focus, 1 behind) of the pixel that a ray meets in one layer; -1 where it meets none.
 
     The ray is followed from what is nearest to what is farthest: a point of signed blur radius s on it lies at x - s u.
     It meets the surface where that falls to s; where it already lies a pixel before, the ray passes behind an edge.
     fill: a ray that meets nothing then meets the last pixel that lay behind it, as if that went on behind the edge.
-    pupils: (2, 2) u, v for what is in front of the focus and behind it.
+    pupils: (2, 2) u, v for what is in front of the focus and behind it. range_px: the least and the largest signed radius of the layer.
     """
+    nearest_px, farthest_px = range_px
     longest = max(math.hypot(pupils[0, 0], pupils[0, 1]), math.hypot(pupils[1, 0], pupils[1, 1]), 1e-3)
     steps = max(1, int(math.ceil((farthest_px - nearest_px) * longest * 2.0)))
     step = (farthest_px - nearest_px) / steps
@@ -114,20 +149,11 @@ def meet(
 
 
 @njit(cache=True, nogil=True)
-def trace_rows(
-    top: int, bottom: int, width: int, per_pixel: int, seed: int,
-    spans: np.ndarray, cumulative: np.ndarray, side_starts: np.ndarray, heights: np.ndarray,
-    radius_px: np.ndarray, alpha: np.ndarray, motion_px: np.ndarray, fastest_px: np.ndarray, ranges_px: np.ndarray, is_opaque: bool,
-    xy_px: np.ndarray, lens_uv: np.ndarray, time: np.ndarray, met: np.ndarray,
-) -> None:  # fmt: skip
-    """Fill per_pixel samples of each pixel of rows top to bottom.
-
-    radius_px, alpha: (L, H, W) of the layers, front first; motion_px (L, H, W, 2), fastest_px the fastest around each
-    pixel; ranges_px (L, 2) the least and largest radius.
-    spans of the pupil before the focus and behind it, from side_starts, with running weights and the heights of their strips.
-    is_opaque: a ray that meets nothing has passed behind an edge, and what lies behind goes on there.
-    met: (N, 3) layer, row, column; -1 where a ray meets nothing. A layer of coverage alpha stops that share of the rays.
-    """
+def trace_rows(top: int, bottom: int, width: int, per_pixel: int, seed: int, pupil: Pupil, surfaces: Surfaces, samples: Samples) -> None:
+    """Fill per_pixel samples of each pixel of rows top to bottom. A layer of coverage alpha stops that share of the rays."""
+    spans, cumulative, side_starts, heights = pupil
+    radius_px, alpha, motion_px, fastest_px, ranges_px, is_opaque = surfaces
+    xy_px, lens_uv, time, met = samples
     layers = len(alpha)
     chance, pupils = np.empty(5 + layers), np.empty((2, 2))
     for y in range(top, bottom):
@@ -149,7 +175,7 @@ def trace_rows(
                         row, column, side = meet(
                             place_x, place_y, pupils, at - 0.5, radius_px[layer], alpha[layer], motion_px[layer],
                             fastest_px[layer],
-                            ranges_px[layer, 0], ranges_px[layer, 1], trial == 1,
+                            ranges_px[layer], trial == 1,
                         )  # fmt: skip
                         if row >= 0 and (chance[5 + layer] + n * 0.6180339887498949) % 1.0 < alpha[layer, row, column]:
                             met[i, 0], met[i, 1], met[i, 2] = layer, row, column

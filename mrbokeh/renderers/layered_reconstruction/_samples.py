@@ -7,7 +7,6 @@ near the focus and equal steps of depth everywhere.
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from os import cpu_count
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int32
@@ -98,7 +97,7 @@ class _Rays:
     def __init__(
         self, continued: Float32[np.ndarray, "layers height width _"], lens: Lens, per_pixel: int, seed: int, threads: int
     ) -> None:
-        from mrbokeh.renderers.layered_reconstruction._layer_rays_numba import trace_rows
+        from mrbokeh.renderers.layered_reconstruction._layer_rays_numba import Pupil, Samples, Surfaces, trace_rows
 
         height, width = continued.shape[1:3]
         count = height * width * per_pixel
@@ -108,19 +107,18 @@ class _Rays:
         ranges = np.array([_range(r[a > 0]) for r, a in zip(radius_px, alpha, strict=True)])
         self.is_opaque = bool((alpha == 1.0).all(axis=(1, 2)).any())
         motion_px = np.ascontiguousarray(continued[..., -2:])
-        surfaces: tuple[Any, ...] = (
-            radius_px,
-            alpha,
-            motion_px,
-            np.stack([_fastest_around(each) for each in motion_px]),
-            ranges,
-            self.is_opaque,
+        surfaces = Surfaces(
+            radius_px=radius_px,
+            alpha=alpha,
+            motion_px=motion_px,
+            fastest_px=np.stack([_fastest_around(each) for each in motion_px]),
+            ranges_px=ranges,
+            is_opaque=self.is_opaque,
         )
-        pupil: tuple[Any, ...] = _pupil(lens)
-        results: tuple[Any, ...] = (self.xy_px, self.lens_uv, self.time, self.met)
+        pupil, results = Pupil(*_pupil(lens)), Samples(self.xy_px, self.lens_uv, self.time, self.met)
 
         def run(top: int) -> None:
-            trace_rows(top, min(top + _BAND_ROWS, height), width, per_pixel, seed, *pupil, *surfaces, *results)
+            trace_rows(top, min(top + _BAND_ROWS, height), width, per_pixel, seed, pupil, surfaces, results)
 
         with ThreadPoolExecutor(threads or cpu_count() or 1) as pool:
             list(pool.map(run, range(0, height, _BAND_ROWS)))
@@ -203,7 +201,7 @@ def prepared(
     """Sort samples by tile. values: (N, C) what is reconstructed, the samples' rgb or more. coc_px: their
     circles of confusion.
     """
-    from mrbokeh.renderers.layered_reconstruction._filter_numba import gather, tile_order
+    from mrbokeh.renderers.layered_reconstruction._filter_numba import tile_order
 
     columns, rows = -(-samples.width_px // settings.tile_px), -(-samples.height_px // settings.tile_px)
     order, starts = np.empty(samples.count, np.int64), np.empty(columns * rows * BLOCKS + 1, np.int64)
@@ -211,16 +209,15 @@ def prepared(
     bucket, buckets = bucket_of(coc_px, samples.depth_m, settings)
     cell, across, cells = motion_cells(samples.motion_px, settings)
     bucket = bucket * np.int32(cells) + cell
-    geometry, slopes = np.empty((samples.count, 5), np.float32), np.empty((samples.count, 3), np.float32)
-    sorted_values, sorted_bucket = np.empty(values.shape, np.float32), np.empty(samples.count, np.int32)
-    rays = samples.xy_px, samples.lens_uv, samples.time, coc_px, samples.motion_px
-    gather(order, *rays, values, bucket, settings.motion, geometry, slopes, sorted_values, sorted_bucket)
+    geometry = np.concatenate([samples.xy_px, samples.lens_uv, (samples.time - np.float32(0.5))[:, None]], axis=1)
+    motion_px = samples.motion_px if settings.motion else np.zeros_like(samples.motion_px)
+    slopes = np.concatenate([np.float32(0.5) * coc_px[:, None], motion_px], axis=1)
     reach = float(np.abs(samples.lens_uv).max())
     return Light(
-        geometry=geometry,
-        slopes=slopes,
-        values=sorted_values,
-        bucket=sorted_bucket,
+        geometry=geometry[order],
+        slopes=slopes[order],
+        values=values[order],
+        bucket=bucket[order],
         starts=starts,
         columns=columns,
         tile_px=settings.tile_px,

@@ -209,10 +209,7 @@ def splat_strip(
     out: np.ndarray,
     values: np.ndarray,
     cells: np.ndarray,
-    offsets: np.ndarray,
-    weights: np.ndarray,
-    rows: np.ndarray,
-    apart: np.ndarray,
+    points: tuple,
     gains: np.ndarray,
     origin: tuple[int, int],
     first: int,
@@ -220,11 +217,12 @@ def splat_strip(
 ) -> None:
     """Add the light that falls into rows first:end of out (h, w, LANES), whose first pixel is row and column `origin` of the picture.
 
-    values (H, W, LANES) single precision, cells (H, W) or NONE. offsets (N,) int32 of points from their pixel in the flat array,
-    weights, gains: see `add_points`; rows and apart as from `rows_of`; all points must fall into out. Tile by tile, so that what a
+    values (H, W, LANES) single precision, cells (H, W) or NONE. points: offsets (N,) int32 from their pixel in the flat array, weights
+    (they and gains: see `add_points`), rows and apart as from `rows_of`; all must fall into out. Tile by tile, so that what a
     tile reaches stays in the cache. Every sum is taken in the order of tiles, rows, columns and points, neighbours of one cell together,
     whatever the strip.
     """
+    offsets, weights, rows, apart = points
     height, width = cells.shape
     top, left = origin
     reach_px = rows.shape[1] // 2 - 1

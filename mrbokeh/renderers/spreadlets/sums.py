@@ -199,7 +199,7 @@ class _Splatting(NamedTuple):
 
         into = sums if self.gains is None else sums.view(np.int32)
         gains = np.ones(FOUR, np.float32) if self.gains is None else self.gains
-        splat_strip(into, self.values, self.cells, *self.laid[:4], gains, self.window[:2], first, end)
+        splat_strip(into, self.values, self.cells, self.laid[:4], gains, self.window[:2], first, end)
         if self.gains is not None:
             to_reals(into[first:end], sums[first:end], gains)
 
