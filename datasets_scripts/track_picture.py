@@ -18,6 +18,7 @@ from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.atomic_files import atomic_path, refuse_existing
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.typed_numbers import numbers_in
 from mrbokeh.tracking.camera_track.formats import read_track
 from mrbokeh.tracking.camera_track.track import CameraTrack
 from mrbokeh.video.clip import read_frames
@@ -89,10 +90,7 @@ def main(
 
 
 def _vector(text: str) -> Vector:
-    try:
-        return np.array([float(part) for part in text.split(",")], np.float64).reshape(3)
-    except ValueError:
-        raise InputError(f"expected --at X,Y,Z in metres, such as 0.1,0.05,0, got {text!r}") from None
+    return np.array(numbers_in(text, "expected --at X,Y,Z in metres, such as 0.1,0.05,0", (3,)))
 
 
 if __name__ == "__main__":

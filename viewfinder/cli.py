@@ -8,6 +8,7 @@ import typer
 
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.typed_numbers import numbers_in
 from viewfinder.options import CalibrationOptions, ListeningOptions, PhoneOptions, TrackingOptions, ViewfinderOptions
 
 app = typer.Typer(add_completion=False)
@@ -153,10 +154,7 @@ def board_command(
         raise InputError(f"--out: expected a name that ends in .pdf, got {out}")
     for path in (out, out.with_suffix(".json")):
         refuse_existing(path, overwrite)
-    try:
-        nearest_m, farthest_m = (float(part) for part in distance_m.split(","))
-    except ValueError:
-        raise InputError(f"--distance-m: expected NEAREST,FARTHEST in metres, got {distance_m!r}") from None
+    nearest_m, farthest_m = numbers_in(distance_m, "--distance-m: expected NEAREST,FARTHEST in metres", (2,))
     # Without a lens that of a phone, to which everything on the table is nearly sharp.
     used = read_lens(lens) if lens is not None else Lens(5.0, 2.0, 2.0 / (1.0 / nearest_m + 1.0 / farthest_m), 6.4)
     plan = plan_board(BoardView(used, nearest_m, farthest_m, width_px), paper)

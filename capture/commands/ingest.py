@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.typed_numbers import numbers_in
 
 HELP = "\n\n".join(
     (
@@ -60,10 +61,8 @@ def parse_white_balance(text: str) -> tuple[float, float, float] | None:
     """Parse "camera" to None, "R,G,B" to three multipliers with green at 1."""
     if text.strip().lower() == "camera":
         return None
-    try:
-        red, green, blue = (float(each) for each in text.split(","))
-    except ValueError:
-        raise InputError(f'--white-balance must be "camera" or three multipliers R,G,B such as 2.1,1,1.5, got {text!r}') from None
+    expected = '--white-balance must be "camera" or three multipliers R,G,B such as 2.1,1,1.5'
+    red, green, blue = numbers_in(text, expected, (3,))
     if not min(red, green, blue) > 0 or max(red, green, blue) == float("inf"):
         raise InputError(f"--white-balance needs positive multipliers, got {text!r}")
     return red / green, 1.0, blue / green

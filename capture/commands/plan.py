@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.typed_numbers import numbers_in
 
 if TYPE_CHECKING:
     from capture.tether.focus_plan import FocusPlan, FocusRange
@@ -106,9 +107,6 @@ def rounded_to(plan: "FocusPlan", text: str) -> "FocusPlan":
     from capture.tether.focus_plan import on_scale
     from mrbokeh.optics.lens import lens_distance_m
 
-    try:
-        marks_m = [float(each) for each in text.split(",")]
-    except ValueError:
-        raise InputError(f"--scale must be metres with commas between them, such as 0.5,0.6,0.8,1,2,inf, got {text!r}") from None
+    marks_m = numbers_in(text, "--scale must be metres with commas between them, such as 0.5,0.6,0.8,1,2,inf")
     from_lens = [lens_distance_m(each, plan.lens.focal_length_mm) if each > 0.0 else each for each in marks_m]
     return on_scale(plan, [each for each in from_lens if each is not None])

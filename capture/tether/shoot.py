@@ -29,6 +29,7 @@ from capture.tether.shoot_files import SavedShot, ShootLog, check_return, open_l
 from mrbokeh.optics.lens import film_plane_m
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.typed_numbers import numbers_in
 
 CHECK_FOLDER = ".check"
 _SAME_LENS = 0.03
@@ -271,11 +272,7 @@ def parse_spot(text: str | None) -> Spot | None:
     """Parse "X,Y" in fractions of width and height."""
     if text is None:
         return None
-    try:
-        x, y = (float(each) for each in text.split(","))
-    except ValueError:
-        raise InputError(f"a place in the picture must be X,Y from 0 to 1, such as 0.5,0.5, got {text!r}") from None
-    return Spot(x, y)
+    return Spot(*numbers_in(text, "a place in the picture must be X,Y from 0 to 1, such as 0.5,0.5", (2,)))
 
 
 def parse_target(text: str) -> Target:

@@ -25,6 +25,7 @@ from mrbokeh.stacks.capture_bundle import CaptureBundle
 from mrbokeh.stacks.guessed_metres import GUESSED
 from mrbokeh.system.atomic_files import require_safe_outputs
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.typed_numbers import numbers_in
 from mrbokeh.video.image_sequence import read_numbers
 
 
@@ -301,22 +302,12 @@ def _filmed(description: SceneDescription, rendering: RenderingOptions, seen_by:
 
 
 def _triple(text: str) -> tuple[float, float, float]:
-    x_m, y_m, z_m = _numbers(text, 3, "--at")
+    x_m, y_m, z_m = numbers_in(text, "--at expects 3 numbers with commas between", (3,))
     return x_m, y_m, z_m
 
 
 def _pair(at_pixel: str | None) -> tuple[float, float]:
     if at_pixel is None:
         raise InputError("where does the object stand? Give --at X,Y,Z in metres, or --at-pixel X,Y on a photograph with depth")
-    x_px, y_px = _numbers(at_pixel, 2, "--at-pixel")
+    x_px, y_px = numbers_in(at_pixel, "--at-pixel expects 2 numbers with commas between", (2,))
     return x_px, y_px
-
-
-def _numbers(text: str, count: int, option: str) -> tuple[float, ...]:
-    try:
-        numbers = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        numbers = ()
-    if len(numbers) != count:
-        raise InputError(f"{option} expects {count} numbers with commas between, got {text!r}")
-    return numbers

@@ -42,8 +42,9 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 def _options_of(group: type) -> list[Parameter]:
     hints = get_type_hints(group, include_extras=True)
     for owner in group.__mro__:
-        for name in vars(owner).get("__annotations__", {}) if "PANEL" in vars(owner) else ():
-            _put_on_panel(hints[name], owner.PANEL)
+        own = vars(owner)
+        for name in own.get("__annotations__", {}) if "PANEL" in own else ():
+            _put_on_panel(hints[name], own["PANEL"])
     return [Parameter(each.name, Parameter.KEYWORD_ONLY, default=_default(each), annotation=hints[each.name]) for each in fields(group)]
 
 

@@ -10,6 +10,7 @@ from mrbokeh.images.layer import Layer, flatten
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.typed_numbers import numbers_in
 
 
 @dataclass(frozen=True)
@@ -75,10 +76,8 @@ def focused(lens: Lens, sharp: dict[str, Layer], focus: FocusOptions) -> Lens:
         return lens.focused_at(focus.focus_distance_m)
     if focus.focus_at is None:
         return lens
-    try:
-        x_px, y_px, radius_px = (*map(int, focus.focus_at.split(",")), 0)[:3]
-    except ValueError:
-        raise InputError(f"--focus-at: expected X,Y or X,Y,RADIUS in whole pixels, got {focus.focus_at!r}") from None
+    given = numbers_in(focus.focus_at, "--focus-at: expected X,Y or X,Y,RADIUS in whole pixels", (2, 3), number=int)
+    x_px, y_px, radius_px = (*given, 0)[:3]
     return lens.focused_on(flatten(list(sharp.values())).depth_m, x_px + 0.5, y_px + 0.5, float(radius_px))
 
 

@@ -9,6 +9,7 @@ import typer
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.commands.lens_fit import fit, match
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.typed_numbers import numbers_in
 
 if TYPE_CHECKING:
     from mrbokeh.psf_models.build import ModelOptions
@@ -99,12 +100,10 @@ def psf(
 
 
 def _steps(text: str) -> tuple[int, ...]:
-    try:
-        steps = tuple(int(part) for part in text.split(","))
-    except ValueError:
-        steps = (0,)
+    expected = "expected --counts as whole numbers from 1 up with commas between them, such as 75,75"
+    steps = numbers_in(text, expected, number=int)
     if min(steps) < 1:
-        raise InputError(f"expected --counts as whole numbers from 1 up with commas between them, such as 75,75, got {text!r}")
+        raise InputError(f"{expected}, got {text!r}")
     return steps
 
 
@@ -298,7 +297,7 @@ def show(
 
 
 def _drawn_lens(path: Path, width_px: int) -> Any:
-    from mrbokeh.figures.lens_drawing import draw_lens
+    from mrbokeh.figures.psf_bank_drawing import draw_lens
     from mrbokeh.optics.lens_file import read_lens
 
     return draw_lens(read_lens(path), width_px)

@@ -8,6 +8,7 @@ import typer
 
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.typed_numbers import numbers_in
 
 if TYPE_CHECKING:
     from mrbokeh.lens_measuring.fitting.lens_fit import FitSettings, LensFit
@@ -194,10 +195,7 @@ def _lights(evidence: EvidenceOptions) -> "tuple[list[PointLight], tuple[int, in
 
 
 def _diameters(text: str) -> tuple[float, ...]:
-    try:
-        return tuple(float(part) for part in text.split(",")) if text else ()
-    except ValueError:
-        raise InputError(f"expected --diameters as numbers with commas between them, such as 8,20, got {text!r}") from None
+    return numbers_in(text, "expected --diameters as numbers with commas between them, such as 8,20") if text else ()
 
 
 def _regions(text: str) -> tuple[int, int]:

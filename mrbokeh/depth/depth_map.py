@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.typed_numbers import numbers_in
 
 GIVES = ("inverse", "metric")
 """Outputs of depth networks: numbers that grow with 1 / depth up to scale and offset, or metres."""
@@ -58,32 +59,21 @@ class DepthSettings:
 
 def parse_near_far(text: str) -> tuple[float, float]:
     """Parse NEAR:FAR in metres, such as 0.5:inf."""
-    near, far = _numbers(text, ":", 2, "NEAR:FAR in metres, such as 0.5:8 or 0.5:inf")
+    near, far = numbers_in(text, "expected NEAR:FAR in metres, such as 0.5:8 or 0.5:inf", (2,), separator=":")
     return near, far
 
 
 def parse_stereo(text: str) -> StereoCalibration:
     """Parse FOCAL_PX,BASELINE_M or FOCAL_PX,BASELINE_M,OFFSET_PX."""
-    count = 3 if text.count(",") == 2 else 2
-    return StereoCalibration(*_numbers(text, ",", count, "FOCAL_PX,BASELINE_M or FOCAL_PX,BASELINE_M,OFFSET_PX"))
+    return StereoCalibration(*numbers_in(text, "expected FOCAL_PX,BASELINE_M or FOCAL_PX,BASELINE_M,OFFSET_PX", (2, 3)))
 
 
 def parse_known(text: str) -> KnownDistance:
     """Parse X,Y,METRES."""
-    known = KnownDistance(*_numbers(text, ",", 3, "X,Y,METRES of a pixel whose distance is known"))
+    known = KnownDistance(*numbers_in(text, "expected X,Y,METRES of a pixel whose distance is known", (3,)))
     if not known.depth_m > 0:
         raise InputError(f"expected a known distance above 0 m, got {text!r}")
     return known
-
-
-def _numbers(text: str, separator: str, count: int, expected: str) -> tuple[float, ...]:
-    try:
-        numbers = tuple(float(each) for each in text.split(separator))
-    except ValueError:
-        numbers = ()
-    if len(numbers) != count:
-        raise InputError(f"expected {expected}, got {text!r}")
-    return numbers
 
 
 Plane = Float32[np.ndarray, "height width"]

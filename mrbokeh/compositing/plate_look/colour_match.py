@@ -11,6 +11,7 @@ from jaxtyping import Float32
 
 from mrbokeh.images.layer import Layer
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.typed_numbers import numbers_in
 
 Triple = tuple[float, float, float]
 
@@ -79,12 +80,10 @@ class PixelBox:
     @classmethod
     def parse(cls, text: str, option: str = "--match-grey") -> "PixelBox":
         """ "X,Y" or "X,Y,R" in whole pixels. Raises InputError."""
-        try:
-            numbers = [int(part) for part in text.split(",")]
-        except ValueError:
-            numbers = []
-        if len(numbers) not in (2, 3) or min(numbers) < 0:
-            raise InputError(f"{option}: expected X,Y or X,Y,RADIUS in whole pixels, such as 812,430,12, got {text!r}")
+        expected = f"{option}: expected X,Y or X,Y,RADIUS in whole pixels, such as 812,430,12"
+        numbers = numbers_in(text, expected, (2, 3), number=int)
+        if min(numbers) < 0:
+            raise InputError(f"{expected}, got {text!r}")
         return cls(*numbers)
 
     def of(self, picture: Picture) -> Float32[np.ndarray, "rows columns 3"]:

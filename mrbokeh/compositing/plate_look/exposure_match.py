@@ -16,6 +16,7 @@ from mrbokeh.compositing.plate_look.colour_match import ColourMatch, Triple, tri
 from mrbokeh.images.color import rec709_from_XYZ
 from mrbokeh.lens_measuring.matching.photo_facts import exif_tags, positive_rational
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.typed_numbers import numbers_in
 
 _EXPOSURE_TIME, _F_NUMBER, _ISO = 0x829A, 0x829D, 0x8827
 SATURATION_CONSTANT = 1.2
@@ -44,11 +45,8 @@ class Exposure:
     @classmethod
     def parse(cls, text: str) -> "Exposure":
         """ "SECONDS,ISO,F-NUMBER" as a user types it; seconds may be a fraction. Raises InputError."""
-        try:
-            time_s, iso, f_number = (float(Fraction(part.strip())) for part in text.split(","))
-        except (ValueError, ZeroDivisionError):
-            raise InputError(f"expected an exposure as SECONDS,ISO,F-NUMBER, such as 1/50,400,2.8, got {text!r}") from None
-        return cls(time_s, iso, f_number)
+        expected = "expected an exposure as SECONDS,ISO,F-NUMBER, such as 1/50,400,2.8"
+        return cls(*map(float, numbers_in(text, expected, (3,), number=Fraction)))
 
     @property
     def brightness(self) -> float:

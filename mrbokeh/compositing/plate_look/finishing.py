@@ -31,6 +31,7 @@ from mrbokeh.compositing.plate_look.vignetting import RadialFalloff, Vignetting,
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.pixel_box import Box, lit_box
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.typed_numbers import numbers_in
 
 _SIGMAS = 3
 
@@ -227,13 +228,7 @@ def _grain_of_video(first: Picture, second: Picture, seed: int) -> Grain:
 def _light_wrap(text: str | None) -> LightWrap | None:
     if text is None or text == OFF:
         return None
-    try:
-        numbers = [float(part) for part in text.split(",")]
-    except ValueError:
-        numbers = []
-    if len(numbers) not in (1, 2):
-        raise InputError(f"--light-wrap: expected STRENGTH or STRENGTH,SIGMA in pixels, such as 0.3,8, got {text!r}")
-    return LightWrap(*numbers)
+    return LightWrap(*numbers_in(text, "--light-wrap: expected STRENGTH or STRENGTH,SIGMA in pixels, such as 0.3,8", (1, 2)))
 
 
 def _required(photo: Path | None, option: str) -> Path:

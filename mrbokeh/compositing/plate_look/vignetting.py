@@ -20,6 +20,7 @@ from mrbokeh.layering.pixel_box import Box
 from mrbokeh.lens_measuring.matching.photo_facts import read_facts
 from mrbokeh.optics.camera import field_positions
 from mrbokeh.system.errors import InputError, MissingExtraError
+from mrbokeh.system.typed_numbers import numbers_in
 
 Gain = Float32[np.ndarray, "height width channels"]
 _LEAST_GAIN = 1e-3
@@ -63,12 +64,10 @@ class RadialFalloff:
     @classmethod
     def parse(cls, text: str) -> "RadialFalloff":
         """ "K1,K2,K3", or fewer. Raises InputError."""
-        try:
-            numbers = [float(part) for part in text.split(",")]
-        except ValueError:
-            numbers = []
-        if not 1 <= len(numbers) <= 3 or not np.isfinite(numbers).all():
-            raise InputError(f"--vignetting: expected K1,K2,K3 (such as -0.4,0.1,0), got {text!r}")
+        expected = "--vignetting: expected K1,K2,K3 (such as -0.4,0.1,0)"
+        numbers = numbers_in(text, expected, (1, 2, 3))
+        if not np.isfinite(numbers).all():
+            raise InputError(f"{expected}, got {text!r}")
         return cls(*numbers)
 
     def gain(self, box: Box, frame_px: tuple[int, int]) -> Gain:

@@ -1,0 +1,23 @@
+"""Numbers as a user types them into an option; what is none is answered with what was expected."""
+
+from collections.abc import Callable, Collection
+from typing import TypeVar, overload
+
+from mrbokeh.system.errors import InputError
+
+_Number = TypeVar("_Number")
+
+
+@overload
+def numbers_in(text: str, expected: str, counts: Collection[int] = ..., *, separator: str = ...) -> tuple[float, ...]: ...
+@overload
+def numbers_in(text: str, expected: str, counts: Collection[int] = ..., *, number: Callable[[str], _Number]) -> tuple[_Number, ...]: ...
+def numbers_in(text, expected, counts=(), *, number=float, separator=","):  # type: ignore[no-untyped-def]
+    """Return the numbers in a text, one at least. counts: how many there may be, without it any. Raises InputError if they are others."""
+    try:
+        numbers = tuple(number(part) for part in text.split(separator))
+    except (ValueError, ZeroDivisionError):
+        numbers = ()
+    if not numbers or (counts and len(numbers) not in counts):
+        raise InputError(f"{expected}, got {text!r}")
+    return numbers
