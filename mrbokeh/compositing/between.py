@@ -256,7 +256,9 @@ class Between:
         sharp = flatten([replace(layer, extra={}) for layer in layers])
         depth_m = virtual_depth_m(sharp)
         blurred = renderer.render(layers, plate.lens)
-        known, matte = self._near(plate, depth_m, renderer)
+        known, matte = plate, self._matte(plate, depth_m)
+        if self.refine_edges:
+            known, matte = with_refined_edges(plate, matte, renderer, self.tolerance)
         near_m = self._near_depth_m(known, matte)
         if plate.sharp_rgb is None:
             white = Layer(np.repeat(matte[..., None], 3, axis=2), matte, near_m)
@@ -271,22 +273,21 @@ class Between:
         depth_m = virtual_depth_m(flatten([replace(layer, extra={}) for layer in layers]))
         if plate.sharp_rgb is None:
             raise InputError("to cut the scene in two its all-in-focus picture is needed: give a focal stack")
-        plate, matte = self._near(plate, depth_m, renderer)
+        matte = self._matte(plate, depth_m)
+        if self.refine_edges:
+            plate, matte = with_refined_edges(plate, matte, renderer, self.tolerance)
         return self._cut(plate, matte, self._near_depth_m(plate, matte))
 
-    def _near(self, plate: Plate, depth_m: Plane, renderer: Renderer) -> tuple[Plate, Plane]:
-        """Return the plate with its depth right at rims, and the sharp matte of what is near: the user's matte as it is, else by depth."""
+    def _matte(self, plate: Plate, depth_m: Plane) -> Plane:
+        """Return the sharp matte of what is near: the user's matte, else by depth."""
         if plate.near_alpha is not None:
-            return plate, plate.near_alpha
+            return plate.near_alpha
         if plate.depth_m is None:
             raise InputError(
                 "to put objects between the layers of a photograph it needs depth (a focal stack or --depth) or a matte of what "
                 "is near: give one, or use the mode front"
             )
-        near = nearer_than(plate.depth_m, depth_m, self.tolerance)
-        if self.refine_edges:
-            plate, near = with_refined_edges(plate, near, renderer, self.tolerance)
-        return plate, near.astype(np.float32)
+        return nearer_than(plate.depth_m, depth_m, self.tolerance).astype(np.float32)
 
     def _near_depth_m(self, plate: Plate, matte: Plane) -> Plane:
         """Depth of the near things, continued to all places."""

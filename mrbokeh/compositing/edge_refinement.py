@@ -32,6 +32,7 @@ Plane = Float32[np.ndarray, "height width"]
 Picture = Float32[np.ndarray, "height width 3"]
 Mask = Bool[np.ndarray, "height width"]
 
+_HALF = 0.5
 _AROUND_PX = 4.0
 _LARGE_PX = 2_000_000
 """Above it half as many rows and columns are compared: a pixel is little there, and time is short."""
@@ -106,13 +107,15 @@ _PROPOSED = ((EdgeColours.without_rim, np.float32(0.9)), (EdgeColours.by_colour,
 """One after the other. Each wins where it leaves less than this part of the error."""
 
 
-def with_refined_edges(plate: Plate, near: Mask, renderer: Renderer, tolerance: float) -> tuple[Plate, Mask]:
-    """Return the plate with its depth moved at rims, and what is near then. near: by the depth that it has. tolerance: see `Between`.
+def with_refined_edges(plate: Plate, matte: Plane, renderer: Renderer, tolerance: float) -> tuple[Plate, Plane]:
+    """Return the plate with its depth moved at rims, and the matte of what is near then. matte: by the depth that it has. tolerance: see
+    `Between`.
 
-    The very same where nothing better is found, or where there is no sharp picture and depth to look at.
+    The very same where nothing better is found, for a user's matte, and where there is no sharp picture and depth to look at.
     """
-    if plate.sharp_rgb is None or plate.depth_m is None or not near.any() or near.all():
-        return plate, near
+    near = matte > _HALF
+    if plate.near_alpha is not None or plate.sharp_rgb is None or plate.depth_m is None or not near.any() or near.all():
+        return plate, matte
     at_edge = ~without_edge(plate.depth_m, tolerance)
     best, error = near, None
     for propose, part in _PROPOSED:
@@ -123,7 +126,7 @@ def with_refined_edges(plate: Plate, near: Mask, renderer: Renderer, tolerance: 
         other = _error(plate, near, proposed, renderer, tolerance)
         better = other < part * error
         best, error = np.where(better, proposed, best), np.where(better, other, error)
-    return (plate, near) if best is near else (replace(plate, depth_m=moved(plate.depth_m, near, best)), best)
+    return (plate, matte) if best is near else (replace(plate, depth_m=moved(plate.depth_m, near, best)), best.astype(np.float32))
 
 
 def _error(plate: Plate, near: Mask, proposed: Mask, renderer: Renderer, tolerance: float) -> Plane:

@@ -47,17 +47,13 @@ def light_change(
     catcher: shape of the surface (also one that catches shadows). surface: its approximate material; only light that comes from the
     objects depends on its albedo. A MitsubaTracer counts everything: shadows of lights and of the environment, mirror images, colour
     bleeding, emissive objects; it uses its own number of samples. With any other renderer the surface is matte and only light that is
-    taken away counts: the renderer's shadow mask, and the hidden part of the environment.
+    taken away counts: the renderer's shadow mask, and the hidden part of the environment; samples: its rays per pixel towards the
+    environment where objects may hide it.
     """
     if isinstance(renderer, MitsubaTracer):
         from mrbokeh.scene.mitsuba.traced_light_change import traced_light_change
 
         return traced_light_change(renderer, scene, camera, catcher, surface)
-    return cast_light_change(renderer, scene, camera, catcher, samples)
-
-
-def cast_light_change(renderer: SceneRenderer, scene: Scene, camera: Camera, catcher: Mesh, samples: int = 64) -> LightChange:
-    """Return the light change by the ray caster. samples: rays per pixel towards the environment where objects may hide it."""
     seen = seen_surface(EmbreeRaycaster(), camera, catcher)
     surfaces, centre_m, pixels = _met_surfaces(camera, catcher)
     nothing = np.zeros((len(pixels), 3), np.float32)

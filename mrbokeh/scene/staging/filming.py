@@ -79,7 +79,9 @@ class FilmedLayers:
         plate, wide_at = camera_at(time_s), self._wide(camera_at)
         wide = wide_at(time_s)
         if self._filming.shutter is None:
-            layers = self._still(wide, time_s, sharp_rgb if self._filming.distortion.is_none else None)
+            scene = self._staged.scene_at(time_s)
+            caught = self._caught(scene, wide, sharp_rgb if self._filming.distortion.is_none else None)
+            layers = [self._objects(scene, wide), *caught]
         else:
             shutter = self._filming.shutter.within(wide, plate)
             layers = self._moving(FilmedScene(self._staged.scene_at, wide_at, shutter), time_s)
@@ -96,10 +98,6 @@ class FilmedLayers:
         if shadow is not None and catcher is not None:
             layers.append(moving_shadow_layer(self._renderer, filmed, time_s, ShadowCatcher(catcher, shadow.strength)))
         return layers
-
-    def _still(self, camera: Camera, time_s: float, sharp_rgb: Float32[np.ndarray, "height width 3"] | None) -> list[Layer]:
-        scene = self._staged.scene_at(time_s)
-        return [self._objects(scene, camera), *self._caught(scene, camera, sharp_rgb)]
 
     def _objects(self, scene: Scene, camera: Camera) -> Layer:
         """The objects alone; with light on the ground they also see the ground, where the backend follows light so far."""
