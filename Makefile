@@ -17,7 +17,7 @@ gallery: $(READY)
 # Two workers and many processes start from the same sources: what Python compiles of them is kept, whatever the environment says.
 test: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)
-	$(RUN)/python -m pytest -n 2 --dist worksteal -m "not slow and not browser" --durations 30 --durations-min 1
+	$(RUN)/python -m pytest -n 2 --dist worksteal -m "not slow" --durations 30 --durations-min 1
 
 test-slow: $(READY)
 	$(RUN)/python -m pip install --quiet --constraint constraints.txt --editable ".[all,dev,datasets]"

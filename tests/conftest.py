@@ -69,6 +69,62 @@ def pytest_collection() -> None:
                 importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))
 
 
+LONG_FILES = (
+    "renderers/test_layered_reconstruction.py",
+    "renderers/test_bank_renderers.py",
+    "learning/test_evaluate.py",
+    "compositing/test_composite_command.py",
+    "photographs/test_raw_stack.py",
+    "learning/test_train_one_stack.py",
+    "renderers/test_between_network.py",
+    "live/test_page_browser.py",
+    "compositing/test_compositing_rims.py",
+    "bench/test_spreadlet_benches.py",
+    "house/test_demo.py",
+    "learning/test_network_lens.py",
+    "learning/test_ablation.py",
+    "views/test_depth.py",
+    "house/test_packaging.py",
+    "views/test_scale_scene.py",
+    "learning/test_fast_export.py",
+    "learning/test_export_onnx.py",
+)
+"""Files with tests or fixtures of many seconds, in a fresh clone: they begin, in turn with one worker and the other. The first two compile
+most kernels, and not the same ones, so that no worker waits for a kernel of the other."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Give each worker some of the long files at the beginning: a long one at the end would leave the others without work.
+
+    Workers get consecutive shares of all tests, of equal number (pytest-xdist, worksteal).
+    """
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    if workers == 1:
+        return
+    order = {ROOT / "tests" / name: place for place, name in enumerate(LONG_FILES)}
+    long = sorted((item for item in items if item.path in order), key=lambda item: order[item.path])
+    short = [item for item in items if item.path not in order]
+    arranged: list[pytest.Item] = []
+    for worker in range(workers):
+        arranged += [item for item in long if order[item.path] % workers == worker]
+        room = max(0, len(items) * (worker + 1) // workers - len(arranged))
+        arranged, short = arranged + short[:room], short[room:]
+    items[:] = arranged
+
+
+def pytest_terminal_summary(terminalreporter: Any) -> None:
+    """Print where the time went, beside the slowest tests that --durations lists."""
+    if terminalreporter.config.option.durations is None:
+        return
+    seconds: dict[str, float] = {}
+    for report in (each for reports in terminalreporter.stats.values() for each in reports if hasattr(each, "duration")):
+        folder = "/".join(report.nodeid.partition("::")[0].split("/")[1:-1])
+        seconds[folder] = seconds.get(folder, 0.0) + report.duration
+    terminalreporter.section("seconds by folder, of all workers together")
+    for folder, each in sorted(seconds.items(), key=lambda row: -row[1]):
+        terminalreporter.write_line(f"{each:7.1f}s {folder}")
+
+
 # Tests send Ctrl-C to themselves and to programs they start; what runs in the background of a shell is deaf to it, and so are its children.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
