@@ -19,8 +19,7 @@ import typer
 from jaxtyping import Float
 
 from datasets_scripts.made_sets.set_files import Job
-from datasets_scripts.made_sets.truth_plan import TruthPlan, truth_name, view_document
-from datasets_scripts.made_sets.truth_set import ViewFiles, make_missing, truth_command
+from datasets_scripts.made_sets.truth_set import TruthPlan, ViewFiles, make_missing, truth_command, truth_name, view_document
 from datasets_scripts.scenes.textures import checks, spots
 from datasets_scripts.scenes.truth_scenes import colour, fine, make_scene
 from datasets_scripts.tracers.truth import TruthTracer

@@ -11,8 +11,7 @@ from functools import partial
 
 import typer
 
-from datasets_scripts.made_sets.truth_plan import SHAPE_NAMES
-from datasets_scripts.made_sets.truth_set import View, make_missing, truth_command
+from datasets_scripts.made_sets.truth_set import SHAPE_NAMES, View, make_missing, truth_command
 from datasets_scripts.scenes.truth_scenes import SCENES
 
 render_truth = partial(make_missing, View)

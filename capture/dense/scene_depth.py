@@ -19,9 +19,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
-from capture.dense.dense_depth import DenseSettings, dense_depth
+from capture.dense.dense_depth import DenseDepth, DenseSettings, dense_depth
 from capture.dense.depth_priors import DepthPriors, FocusVote, SparseDepths, focus_vote_of_map, near_highlights
-from capture.dense.finish import DenseDepth
 from capture.dense.sweep_view import FirstPictures, SweepView, nearest_views
 from capture.merging.merged_pictures import write_readable_pictures
 from capture.merging.preferred_side import PREFERRED

@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from capture.photos.focus_metadata import FocusReading, Tags, at_infinity, canon_reading, number, read_focus
-from capture.photos.photo_metadata import PhotoMetadata, parse_time
-from capture.photos.sensor_metadata import SensorReading, read_sensor, sensor_of_model, stated_size_px
+from capture.photos.photo_metadata import PhotoMetadata, SensorReading, parse_time, read_sensor, sensor_of_model, stated_size_px
 from mrbokeh.system.errors import InputError
 
 _TAGS = (

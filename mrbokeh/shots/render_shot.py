@@ -29,8 +29,7 @@ from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.images.exr_io import write_exr
 from mrbokeh.images.image_io import INTEGER_SUFFIXES, write_layer
 from mrbokeh.images.layer import Layer
-from mrbokeh.shots.executors import Executor, Progress
-from mrbokeh.shots.segment_task import SegmentTask
+from mrbokeh.shots.executors import Executor, Progress, SegmentTask
 from mrbokeh.shots.shot import MANIFEST, PartSink, Picture, Rgba, Segment, Shot
 from mrbokeh.system.atomic_files import read_json, refuse_existing, write_json
 from mrbokeh.system.errors import InputError

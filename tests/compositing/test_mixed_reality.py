@@ -8,7 +8,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from datasets_scripts.made_sets.truth_plan import TruthPlan
+from datasets_scripts.made_sets.truth_set import TruthPlan
 from datasets_scripts.mixed_reality import (
     OBJECT_DISTANCES_M,
     main,

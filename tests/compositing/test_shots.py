@@ -18,9 +18,8 @@ import numpy as np
 import pytest
 
 from mrbokeh.images.image_io import read_image, read_layer, write_image
-from mrbokeh.shots.executors import Executor, ProcessExecutor, SerialExecutor
+from mrbokeh.shots.executors import Executor, ProcessExecutor, SegmentTask, SerialExecutor, render_segment
 from mrbokeh.shots.render_shot import PartsFolder, SequenceTarget, VideoTarget, render_shot
-from mrbokeh.shots.segment_task import SegmentTask, render_segment
 from mrbokeh.shots.shot import FrameMaker, MakerRecipe, Shot, Target
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import probe, read_frames

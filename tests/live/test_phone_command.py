@@ -36,9 +36,8 @@ from tests.scenes.phone_on_camera import (
 from tests.scenes.told_parts import ToldCamera, ToldTracker
 from tests.scenes.traced_board_clip import pose_error
 from tests.scenes.waiting import wait_until
-from viewfinder.app.opening import browser_cameras
+from viewfinder.app.opening import browser_cameras, open_tracker
 from viewfinder.app.running import Viewfinder, opened
-from viewfinder.app.trackers import open_tracker
 from viewfinder.cli import calibrate_phone_command
 from viewfinder.frames import CameraFrame, Pose
 from viewfinder.options import ListeningOptions, PhoneOptions, TrackingOptions, ViewfinderOptions

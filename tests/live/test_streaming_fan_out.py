@@ -10,8 +10,7 @@ import pytest
 from tests.scenes.streaming_viewers import bars, ignore, noise, output, streaming, taken
 from tests.scenes.waiting import wait_until
 from viewfinder.streaming import encoded_stream
-from viewfinder.streaming.encoded_stream import EncodedStream
-from viewfinder.streaming.viewer_queue import EncodedFrame
+from viewfinder.streaming.encoded_stream import EncodedFrame, EncodedStream
 
 
 def push(stream: EncodedStream, sequence: int, codec: str = "H264", *, captured_s: float | None = None) -> None:

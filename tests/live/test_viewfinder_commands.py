@@ -111,7 +111,7 @@ REFUSED = {
 _INVOKE = """
 import json, sys
 from typer.testing import CliRunner
-import viewfinder.app.opening as opening, viewfinder.app.trackers as trackers
+import viewfinder.app.opening as opening, viewfinder.app.opening as trackers
 from viewfinder.cli import app
 def opened(*_):
     raise RuntimeError("a camera was opened")

@@ -8,7 +8,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from datasets_scripts.made_sets.truth_plan import SHAPE_NAMES, TruthPlan, lens_shape
+from datasets_scripts.made_sets.truth_set import SHAPE_NAMES, TruthPlan, lens_shape
 from datasets_scripts.render_truth import main, render_truth
 from datasets_scripts.scenes.truth_scenes import SCENES, make_scene
 from datasets_scripts.tracers.pupil import pupil_table, two_disc_overlap

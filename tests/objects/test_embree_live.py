@@ -11,8 +11,7 @@ from mrbokeh.scene import Environment, Light, Material, Mesh, Scene, Texture, ma
 from mrbokeh.scene.embree import embree_raycaster as raycaster_module
 from mrbokeh.scene.embree import prepared_scenes as prepared_scenes_module
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
-from mrbokeh.scene.embree.pixel_edges import edge_pixels
-from mrbokeh.scene.embree.prepared_scenes import PreparedScene
+from mrbokeh.scene.embree.prepared_scenes import PreparedScene, edge_pixels
 from mrbokeh.scene.environment_filter import LightingMaps, _moments, filtered, lighting_maps
 from mrbokeh.scene.light import directions, solid_angles_sr
 from mrbokeh.scene.mesh import rigid_motion

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mrbokeh.commands.lens import app
-from mrbokeh.figures.lens_drawing import draw_lens, kernel_rgb
+from mrbokeh.figures.psf_bank_drawing import draw_lens, kernel_rgb
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import read_lens, write_lens

@@ -18,8 +18,7 @@ from capture.photos.metadata import (
     read_tags_with_exifread,
     read_with_exiftool,
 )
-from capture.photos.photo_metadata import PhotoMetadata
-from capture.photos.sensor_metadata import SensorReading, read_sensor, sensor_of_model
+from capture.photos.photo_metadata import PhotoMetadata, SensorReading, read_sensor, sensor_of_model
 from tests.scenes.made_photographs import make_raw_photo, scene_rgb
 
 # file: (focal length mm, f-number, exposure s, film plane distance m, its interval or None)

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from datasets_scripts.made_sets.truth_plan import lens_shape
+from datasets_scripts.made_sets.truth_set import lens_shape
 from mrbokeh.compositing.between import Between
 from mrbokeh.compositing.near_and_far import continued
 from mrbokeh.compositing.over import OverPhotograph

@@ -14,9 +14,8 @@ from aiohttp import web
 from aiortc import RTCConfiguration, RTCPeerConnection, RTCRtpReceiver, RTCSessionDescription
 
 from viewfinder.frames import FrameStatus, OutputFrame
-from viewfinder.streaming.encoded_stream import EncodedStream
+from viewfinder.streaming.encoded_stream import EncodedFrame, EncodedStream, ViewerQueue
 from viewfinder.streaming.encoders import StreamQuality
-from viewfinder.streaming.viewer_queue import EncodedFrame, ViewerQueue
 from viewfinder.streaming.whep import Whep
 
 WIDTH, HEIGHT = 320, 180

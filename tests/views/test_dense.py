@@ -8,7 +8,18 @@ import numpy as np
 import pytest
 
 from capture.dense._guided_numba import aggregate
-from capture.dense.dense_depth import DenseSettings, dense_depth, halvings, level_sizes
+from capture.dense.dense_depth import (
+    FILLED,
+    FOCUS,
+    SWEEP,
+    DenseDepth,
+    DenseSettings,
+    dense_depth,
+    halvings,
+    level_sizes,
+    sweep_trust,
+    with_consistency,
+)
 from capture.dense.depth_priors import (
     SHARE_OF_FOCUS,
     Consistency,
@@ -22,7 +33,6 @@ from capture.dense.depth_priors import (
     focus_vote_of_map,
     near_highlights,
 )
-from capture.dense.finish import FILLED, FOCUS, SWEEP, DenseDepth, sweep_trust, with_consistency
 from capture.dense.guided_depth import (
     Penalties,
     interpolate,

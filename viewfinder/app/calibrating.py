@@ -14,8 +14,7 @@ from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.system.atomic_files import refuse_existing
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.charuco.board import read_board
-from viewfinder.app.opening import browser_cameras
-from viewfinder.app.trackers import open_phone
+from viewfinder.app.opening import browser_cameras, open_phone
 from viewfinder.options import CalibrationOptions
 from viewfinder.server.access import Access
 from viewfinder.server.endpoint import Endpoint, on_stop, open_endpoint, serving_site

@@ -23,9 +23,8 @@ from aiortc.mediastreams import MediaStreamError, MediaStreamTrack
 from aiortc.sdp import candidate_from_sdp
 
 from mrbokeh.system.errors import InputError
-from viewfinder.streaming.encoded_stream import EncodedStream
+from viewfinder.streaming.encoded_stream import EncodedFrame, EncodedStream, ViewerQueue
 from viewfinder.streaming.session_description import codec_preferences, negotiated_codec, require_offer, with_address
-from viewfinder.streaming.viewer_queue import EncodedFrame, ViewerQueue
 
 # Where aiortc keeps the RTP timestamp of what it sent last; it is a random number plus our ticks.
 _RTP_TIMESTAMP = "_RTCRtpSender__rtp_timestamp"

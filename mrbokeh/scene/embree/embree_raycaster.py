@@ -15,8 +15,15 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 from mrbokeh.images.layer import Layer, clear
 from mrbokeh.layering.pixel_box import NOWHERE, Box
 from mrbokeh.optics.camera import Camera
-from mrbokeh.scene.embree.pixel_edges import SAMPLE_COUNTS, edge_pixels, sample_offsets_px, silhouette_pixels
-from mrbokeh.scene.embree.prepared_scenes import PlacedScene, PreparedScene, PreparedScenes
+from mrbokeh.scene.embree.prepared_scenes import (
+    SAMPLE_COUNTS,
+    PlacedScene,
+    PreparedScene,
+    PreparedScenes,
+    edge_pixels,
+    sample_offsets_px,
+    silhouette_pixels,
+)
 from mrbokeh.scene.embree.shading import RaySamples, lit_share, shaded
 from mrbokeh.scene.light import Light
 from mrbokeh.scene.mesh import Mesh

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.scene.gltf.accessors import GltfFile, open_gltf
-from mrbokeh.scene.gltf.surfaces import materials_of, read_primitive
+from mrbokeh.scene.gltf.surfaces import GltfFile, materials_of, open_gltf, read_primitive
 from mrbokeh.scene.light import Light
 from mrbokeh.scene.material import Material
 from mrbokeh.scene.mesh import Mesh, unit

@@ -26,7 +26,7 @@ _OF_FOUR = np.array([(6, 2), (14, 6), (2, 10), (10, 14)]) / 16
 _SHIFTS = np.array([(2.5, 10.5), (7.5, 12.5), (8.5, 9.5), (13.5, 11.5)]) / 16
 """By how much the picture is shifted from pass to pass, so that the samples of four passes fall into sixteen rows and columns
 of every pixel. Of such shifts these came out of a random search for the least error of coverage over straight edges of all
-directions: 0.035 RMS, where the pattern of pixel_edges.py has 0.034."""
+directions: 0.035 RMS, where the pattern of prepared_scenes.py has 0.034."""
 MARGIN_PX = 1
 """The sample of a shifted picture that a pixel needs may lie one pixel further on."""
 

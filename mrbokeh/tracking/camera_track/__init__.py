@@ -6,7 +6,7 @@
 
 What lies where:
     track               CameraTrack, TrackedFrame: cameras by frame number or by time, and interpolated; TrackOptions of files
-    formats             read_track, write_track and our own JSON; program_files, colmap_file, opentrackio_file the others
+    formats             read_track, write_track; our own JSON, .chan, nerfstudio; colmap_file, opentrackio_file the others
     focus_pull          FocusPull: the focus distance by frame, from keys or from what cine cameras wrote, smoothed
     board_track         the track of a clip in which a printed board is seen; board_calibration finds the camera, board_smoothing
                         keeps the poses from trembling more than the camera did
