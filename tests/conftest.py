@@ -81,7 +81,7 @@ LONG_FILES = (
     "compositing/test_compositing_rims.py",
     "bench/test_spreadlet_benches.py",
     "house/test_demo.py",
-    "learning/test_network_lens.py",
+    "learning/test_network_field.py",
     "learning/test_ablation.py",
     "views/test_depth.py",
     "house/test_packaging.py",
@@ -93,6 +93,7 @@ LONG_FILES = (
 most kernels, and not the same ones, so that no worker waits for a kernel of the other."""
 
 
+@pytest.hookimpl(trylast=True)  # once those that do not run are left out
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Give each worker some of the long files at the beginning: a long one at the end would leave the others without work.
 
