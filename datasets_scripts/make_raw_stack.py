@@ -20,14 +20,14 @@ import typer
 from jaxtyping import Float
 
 from datasets_scripts.made_sets.set_files import Job, claim_folder
-from datasets_scripts.made_sets.simulated_camera import SensorModel, ShotMetadata, film_plane_distance_m, write_dng
+from datasets_scripts.made_sets.simulated_camera import SensorModel, ShotMetadata, write_dng
 from datasets_scripts.scenes.stack_scenes import STACK_SCENES, StackScene
 from datasets_scripts.tracers.thin_lens import trace, trace_pinhole
 from datasets_scripts.tracers.traced_scene import Scene
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.image_io import write_image
 from mrbokeh.optics.camera import Camera, camera_to_json
-from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens import Lens, film_plane_m
 from mrbokeh.optics.lens_file import lens_to_json
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
@@ -191,7 +191,7 @@ def truth_document(plan: StackPlan) -> dict[str, Any]:
         "files": {"slice": "view_{view}/slice_{slice:02d}.dng", "truth": "truth/view_{view}/all_in_focus.exr, truth/view_{view}/depth.exr"},
         "lens": lens_to_json(reference),
         "focus_distances_m": plan.focus_distances_m.tolist(),
-        "film_plane_distances_m": [film_plane_distance_m(plan.lens_at(i)) for i in range(plan.slices)],
+        "film_plane_distances_m": [film_plane_m(plan.lens_at(i)) for i in range(plan.slices)],
         "focal_px": [plan.lens_at(i).focal_px(plan.width_px) for i in range(plan.slices)],
         "distances": "focus_distances_m count from the lens, film_plane_distances_m = d_f + d_s from the sensor (thin lens), "
         "as in EXIF SubjectDistance",

@@ -1,8 +1,7 @@
 """A simulated digital camera: scene-linear Rec.709 in, Bayer mosaic with photon and read noise, DNG files out.
 
 DNG files (Adobe DNG 1.4) are uncompressed mosaics with colour, lens and focus metadata that raw converters open. EXIF SubjectDistance
-counts from the film plane, Lens.focus_distance_m from the lens. For a thin lens (principal planes together) film_plane_m = d_f + d_s
-with 1/f = 1/d_f + 1/d_s; `film_plane_distance_m` is that sum and `focus_distance_from_film_plane_m` solves it for d_f.
+counts from the film plane, Lens.focus_distance_m from the lens (`mrbokeh.optics.lens.film_plane_m`).
 """
 
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8, UInt16
 
 from mrbokeh.images.color import XYZ_from_rec709
-from mrbokeh.optics.lens import MM_PER_M, Lens
+from mrbokeh.optics.lens import Lens, film_plane_m
 from mrbokeh.system.atomic_files import atomic_path
 from mrbokeh.system.errors import InputError
 
@@ -120,21 +119,6 @@ class ShotMetadata:
     lens_model: str = "Thin Lens"
 
 
-def film_plane_distance_m(lens: Lens) -> float:
-    """Return the focus distance as cameras count it: from the sensor."""
-    return lens.focus_distance_m + lens.image_distance_mm / MM_PER_M
-
-
-def focus_distance_from_film_plane_m(film_plane_m: float, focal_length_mm: float) -> float:
-    """Return d_f with d_f + f d_f / (d_f - f) = film_plane_m; of the two solutions the one farther from the lens."""
-    focal_m = focal_length_mm / MM_PER_M
-    if film_plane_m < 4.0 * focal_m:
-        raise InputError(
-            f"a thin lens of {focal_length_mm} mm has its focus at least {4 * focal_m} m from the film plane, got {film_plane_m} m"
-        )
-    return 0.5 * (film_plane_m + float(np.sqrt(film_plane_m * (film_plane_m - 4.0 * focal_m))))
-
-
 def write_dng(path: Path, mosaic: UInt16[np.ndarray, "height width"], sensor: SensorModel, shot: ShotMetadata) -> None:
     """Write a mosaic as DNG, atomically: first under a temporary name, metadata included, then renamed."""
     import pyexiv2
@@ -176,7 +160,7 @@ def _exif(shot: ShotMetadata, width_px: int) -> dict[str, str]:
     """Return the Exif directory; FocalPlaneX/YResolution with a square pixel pitch tell the size of the sensor."""
     lens = shot.lens
     pixels_per_cm = Fraction(width_px * 10) / Fraction(str(lens.sensor_width_mm))
-    distance = "4294967295/1" if np.isinf(lens.focus_distance_m) else _rational_text(film_plane_distance_m(lens), _DISTANCE_DENOMINATOR)
+    distance = "4294967295/1" if np.isinf(lens.focus_distance_m) else _rational_text(film_plane_m(lens), _DISTANCE_DENOMINATOR)
     return {
         "Exif.Photo.ExposureTime": f"{shot.exposure_time_s.numerator}/{shot.exposure_time_s.denominator}",
         "Exif.Photo.FNumber": _rational_text(lens.f_number, 100),

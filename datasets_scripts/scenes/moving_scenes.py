@@ -36,11 +36,6 @@ class Stage:
     lens: Lens
     aspect: float
 
-    @property
-    def farthest_coc(self) -> float:
-        """Return the circle of confusion at infinity."""
-        return self.lens.coc_px_per_dioptre(1) / self.lens.focus_distance_m
-
     def depth_m(self, coc: float) -> float:
         return 1.0 / (1.0 / self.lens.focus_distance_m - coc / self.lens.coc_px_per_dioptre(1))
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.compositing.plate_look.colour_match import ColourMatch, PixelBox, darkest_black, grey_card_match, patch_colour, picked_black
+from mrbokeh.compositing.plate_look.colour_match import ColourMatch, PixelBox, darkest_black, grey_card_match, patch_colour
 from mrbokeh.compositing.plate_look.exposure_match import (
     Exposure,
     exposure_of_metadata,
@@ -54,7 +54,7 @@ def test_a_grey_card_under_a_cast_gives_the_gain_back() -> None:
 def test_with_card_and_hole_the_rendered_scene_becomes_the_photographed_one() -> None:
     scene = reflectances()
     plate = photographed(scene)
-    black = picked_black(plate, PixelBox(24, 20, 8))
+    black = patch_colour(plate, PixelBox(24, 20, 8))
     match = grey_card_match(plate, PixelBox(80, 68, 10), black=black)
     rendered = Layer(scene, np.ones(scene.shape[:2], np.float32), np.ones(scene.shape[:2], np.float32))
     np.testing.assert_allclose(match.applied(rendered).rgb, photographed(scene, noise=0.0), atol=0.01)

@@ -14,8 +14,6 @@ from datasets_scripts.made_sets.simulated_camera import (
     CFA_PATTERNS,
     SensorModel,
     ShotMetadata,
-    film_plane_distance_m,
-    focus_distance_from_film_plane_m,
     write_dng,
 )
 from datasets_scripts.make_raw_stack import StackPlan, _jobs, make_raw_stack, truth_document
@@ -26,7 +24,7 @@ from datasets_scripts.tracers.traced_scene import Scene, emissive_quad
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import read_image
 from mrbokeh.optics.camera import camera_from_json
-from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens import Lens, film_plane_m, lens_distance_m
 from mrbokeh.system.errors import InputError
 
 SHIPPED = Path(__file__).resolve().parents[2] / "mrbokeh" / "demo_data" / "raw_stack"
@@ -121,14 +119,9 @@ def test_metadata_comes_back(tmp_path: Path) -> None:
 @pytest.mark.parametrize("distance_m", [0.1, 0.62, 2.1, 30.0])
 def test_film_plane_distance_is_the_focus_distance_plus_the_image_distance(distance_m: float) -> None:
     lens = LENS.focused_at(distance_m)
-    film_plane_m = film_plane_distance_m(lens)
-    assert film_plane_m == pytest.approx(distance_m + 0.035 * distance_m / (distance_m - 0.035), rel=1e-12)
-    assert focus_distance_from_film_plane_m(film_plane_m, 35.0) == pytest.approx(distance_m, rel=1e-9)
-
-
-def test_a_film_plane_distance_below_four_focal_lengths_is_refused() -> None:
-    with pytest.raises(InputError, match=r"0\.14 m"):
-        focus_distance_from_film_plane_m(0.13, 35.0)
+    from_film_plane_m = film_plane_m(lens)
+    assert from_film_plane_m == pytest.approx(distance_m + 0.035 * distance_m / (distance_m - 0.035), rel=1e-12)
+    assert lens_distance_m(from_film_plane_m, 35.0) == pytest.approx(distance_m, rel=1e-9)
 
 
 def test_noise_has_the_stated_size() -> None:

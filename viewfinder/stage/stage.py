@@ -63,12 +63,11 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """Drawing with what it was drawn from; started_s, finished_s: by `time.monotonic`."""
+    """Drawing with what it was drawn from; started_s: by `time.monotonic`."""
 
     drawing: Drawing
     setup: StageSetup
     started_s: float
-    finished_s: float
 
 
 class DrawingThread:
@@ -156,7 +155,7 @@ class DrawingThread:
             self._resolution.took(request.resolution, finished_s - started_s)
         self._of_drawing = ""
         self._ends_s.append(finished_s)
-        self.newest = Drawn(drawing, setup, started_s, finished_s)
+        self.newest = Drawn(drawing, setup, started_s)
 
     def _reload_if_changed(self) -> None:
         if not self._watch.changed():

@@ -140,11 +140,6 @@ def grey_card_match(
     return ColourMatch(triple_of(light / card / falloff), black)
 
 
-def picked_black(plate_rgb: Picture, box: PixelBox) -> Triple:
-    """The colour of a patch that the user knows to be black (a hole, a lens cap's edge)."""
-    return patch_colour(plate_rgb, box)
-
-
 def darkest_black(plate_rgb: Picture) -> Triple:
     """The level that the darkest blocks of each channel have, not below 0 (dark-object subtraction, Chavez 1988).
 

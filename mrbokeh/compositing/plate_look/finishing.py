@@ -22,7 +22,7 @@ from mrbokeh.compositing.plate_look.colour_match import (
     Triple,
     darkest_black,
     grey_card_match,
-    picked_black,
+    patch_colour,
     triple_of,
 )
 from mrbokeh.compositing.plate_look.exposure_match import Exposure, matched_exposure, stated_exposure, white_balance_gain
@@ -198,7 +198,7 @@ def _plate_exposure(options: LookOptions, photo: Path | None) -> Exposure:
 def _black(text: str | None, plate_rgb: Picture) -> Triple:
     if text is None or text == OFF:
         return NO_BLACK
-    return darkest_black(plate_rgb) if text == AUTO else picked_black(plate_rgb, PixelBox.parse(text, "--match-black"))
+    return darkest_black(plate_rgb) if text == AUTO else patch_colour(plate_rgb, PixelBox.parse(text, "--match-black"))
 
 
 def _vignetting(text: str | None, photo: Path | None) -> Vignetting | None:
