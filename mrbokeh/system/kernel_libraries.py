@@ -38,7 +38,7 @@ def link_once(kernel: Any) -> None:
 
 
 def _reorders(fastmath: bool | set[str]) -> bool:
-    return fastmath is True or (isinstance(fastmath, set) and bool(fastmath & {"reassoc", "fast"}))
+    return fastmath is True or (isinstance(fastmath, set) and not fastmath <= {"contract"})
 
 
 class _LinkedOnce(JITCodeLibrary):  # type: ignore[misc]
