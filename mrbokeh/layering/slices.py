@@ -34,6 +34,8 @@ _MANY_PIXELS = 1 << 22
 _SHARP_PX = np.float32(6.0)  # up to this diameter what is seen is worth more than what may hide: measured on traced scenes
 Plane = Float32[np.ndarray, "height width"]
 Channels = Float32[np.ndarray, "height width _"]
+_Shown = tuple[list[Shares], list[Shares]]
+"""Shares of the pixels of each layer that the pinhole picture shows, and of those hidden behind something across the focus."""
 
 
 @dataclass(frozen=True)
@@ -111,18 +113,24 @@ def composited(layers: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> tu
     frame, channels = slicing.frame, layers[0].values.shape[1]
     colour = np.zeros((frame.height_px, frame.width_px, channels - 1), np.float32)
     taken = np.zeros((frame.height_px, frame.width_px, slicing.psf.coverages), np.float32)
-    for rounds in ahead(slicing.pool, slicing.blur_component, _components_in_turn(layers, slicing, by_depth), slicing.at_once):
+    shown = None
+    if len(layers) > 1:
+        shown = _shown_by_depth(layers, slicing.size) if by_depth else _shown_in_order(layers, slicing)
+    for rounds in ahead(slicing.pool, slicing.blur_component, _components_in_turn(layers, shown, slicing), slicing.at_once):
         for light, (rows, columns) in rounds:
             claim(colour, taken, light, rows.start + frame.top_px, columns.start + frame.left_px)
     return colour, taken
 
 
-def _components_in_turn(layers: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> Iterator[tuple[list[Part], int]]:
-    """Yield components of slices and how far their light travels at most, in the order in which they claim the pupil."""
+def _components_in_turn(layers: Sequence[Pixels], shown: _Shown | None, slicing: Slicing) -> Iterator[tuple[list[Part], int]]:
+    """Yield components of slices and how far their light travels at most, in the order in which they claim the pupil.
+
+    shown: shares of the pixels of several layers.
+    """
     nearest, farthest = _range_px(layers, slicing.size[0] * slicing.size[1])
     step_px = max((farthest - nearest) / slicing.slices, _LEAST_STEP_PX)
     cut = partial(sorted_slices, layers, step_px=step_px, width=slicing.size[1], pool=slicing.pool)
-    for together in _shares_in_turn(layers, slicing, by_depth):
+    for together in _shares_in_turn(layers, shown):
         for k, parts in merge(*map(cut, together), key=itemgetter(0)):
             largest_px = min((abs(k) + _HALF_A_SLICE) * step_px, max(-nearest, farthest))
             reach = slicing.psf.reach_px(parts, largest_px, slicing.frame)
@@ -130,19 +138,19 @@ def _components_in_turn(layers: Sequence[Pixels], slicing: Slicing, by_depth: bo
                 yield component, reach
 
 
-def _shares_in_turn(layers: Sequence[Pixels], slicing: Slicing, by_depth: bool) -> Iterator[list[list[Shares]]]:
+def _shares_in_turn(layers: Sequence[Pixels], shown: _Shown | None) -> Iterator[list[list[Shares]]]:
     """Yield shares of the pixels in the order in which they claim the pupil; those that come together, slice by slice in the order given.
 
     First, front to back, the pixels that the pinhole picture shows; last the hidden ones. But pixels hidden behind something on the other
     side of the focus go right before their slice: kernels are mirrored at the focus, so the pupil that an edge leaves free looks behind
     it.
     """
-    if len(layers) == 1:
-        yield [[np.ones_like(layers[0].coc_px)]]
+    if shown is None:
+        yield [[np.ones_like(layer.coc_px) for layer in layers]]
         return
-    seen, crossing = _shown_by_depth(layers, slicing.size) if by_depth else _shown_in_order(layers, slicing)
+    seen, crossing = shown
     yield [crossing, seen]
-    yield [[1.0 - shown - across for shown, across in zip(seen, crossing, strict=True)]]
+    yield [[1.0 - share - across for share, across in zip(seen, crossing, strict=True)]]
 
 
 def _range_px(layers: Sequence[Pixels], pixels: int) -> tuple[float, float]:
@@ -152,7 +160,7 @@ def _range_px(layers: Sequence[Pixels], pixels: int) -> tuple[float, float]:
     return float(min([*in_focus, *(coc_px.min() for coc_px in used)])), float(max([*in_focus, *(coc_px.max() for coc_px in used)]))
 
 
-def _shown_in_order(layers: Sequence[Pixels], slicing: Slicing) -> tuple[list[Shares], list[Shares]]:
+def _shown_in_order(layers: Sequence[Pixels], slicing: Slicing) -> _Shown:
     """Return how much of each pixel the layers listed before leave uncovered, and how much hides behind one on the other side of the
     focus.
     """
@@ -170,7 +178,7 @@ def _shown_in_order(layers: Sequence[Pixels], slicing: Slicing) -> tuple[list[Sh
     return shown, crossing
 
 
-def _shown_by_depth(layers: Sequence[Pixels], size: tuple[int, int]) -> tuple[list[Shares], list[Shares]]:
+def _shown_by_depth(layers: Sequence[Pixels], size: tuple[int, int]) -> _Shown:
     """Return the same as `_shown_in_order` for nearer layers; of layers at one depth those listed before count as nearer."""
     shown, crossing = ([np.full_like(layer.coc_px, value) for layer in layers] for value in (1.0, 0.0))
     for j, front in enumerate(layers):
