@@ -23,7 +23,7 @@ FENCE = tuple(fence_scene(SIZE_PX))
 MOVING_WAVES = (Plane(waves(20.0), 8.0, motion_px=(6.0, 2.0)),)
 HIDDEN_BY_BARS = (Plane(even(0.35), -14.0, covers=lambda x, _: x % 16.0 < 6.0), Plane(checker(9.0, 0.0, 1.0), -9.0))
 
-known_truth = cache(partial(truth, size_px=SIZE_PX))
+known_truth = cache(partial(truth, size_px=SIZE_PX, per_pixel=512))
 """Of a tuple of planes; it takes longer than all that is compared with it."""
 
 
@@ -96,7 +96,7 @@ def test_a_lamp_that_no_chosen_sample_saw_is_there() -> None:
     """One pixel of light at its own depth, 4 samples among 4096 of a tile: its light is kept."""
     lamp = Plane(even(100.0), -6.0, covers=lambda x, y: (np.abs(x - 30.5) < 0.5) & (np.abs(y - 12.5) < 0.5))
     planes = [lamp, Plane(even(0.0), 0.0)]
-    light = truth(planes, SIZE_PX).sum()
+    light = truth(planes, SIZE_PX, 512).sum()
     for seed in range(3):
         result = LayeredReconstruction(seed=seed).reconstruct(sample_planes(planes, SIZE_PX, 8), LENS).rgb
         assert result.sum() == pytest.approx(light, rel=0.25)
@@ -108,7 +108,7 @@ def test_a_resting_lamp_among_leaves_that_move_at_its_depth_stays_round() -> Non
     lamp = Plane(even(5.0), -8.0, covers=lambda x, y: (np.abs(x - 32.5) < 1.5) & (np.abs(y - 20.5) < 1.5))
     leaf = Plane(even(0.5), -8.0, motion_px=(40.0, 0.0), covers=lambda _, y: y > 26.0)
     planes = [lamp, leaf, Plane(even(0.1), 0.0)]
-    exact, samples = truth(planes, SIZE_PX), sample_planes(planes, SIZE_PX, 8)
+    exact, samples = truth(planes, SIZE_PX, 512), sample_planes(planes, SIZE_PX, 8)
     split = LayeredReconstruction().reconstruct(samples, LENS).rgb
     whole = LayeredReconstruction(Settings(motion_step_px=np.inf)).reconstruct(samples, LENS).rgb
     beside = np.s_[8:24]
@@ -163,7 +163,7 @@ def test_what_a_bar_hides_depends_on_the_time() -> None:
     drawn out by the motion, knows nothing of that."""
     bars = Plane(even(0.35), -0.4, motion_px=(12.0, 0.0), covers=lambda x, _: x % 16.0 < 8.0)
     planes = [bars, Plane(lambda x, _: np.repeat(((x % 16.0) < 11.0)[:, None], 3, 1), 0.0, motion_px=(12.0, 0.0))]
-    exact, samples = truth(planes, SIZE_PX), sample_planes(planes, SIZE_PX, 16)
+    exact, samples = truth(planes, SIZE_PX, 512), sample_planes(planes, SIZE_PX, 16)
     settings = [replace(Settings(), merge=False, pupil_parts=1, shutter_parts=times) for times in (1, 4)]
     paper, in_parts = (LayeredReconstruction(each).reconstruct(samples, LENS).rgb for each in settings)
     assert psnr(in_parts, exact) > psnr(paper, exact) + 7.0
