@@ -105,9 +105,16 @@ class TestEdges:
         assert both.sum() > 1000
         assert np.array_equal(fine.depth_m[both], live.depth_m[both])
 
-    @pytest.mark.parametrize("quality", [(3, 1), (64, 1), (4, 0)])
-    def test_other_qualities_are_refused(self, quality: tuple[int, int]) -> None:
-        with pytest.raises(InputError, match="4 or 16 rays"):
+    @pytest.mark.parametrize(
+        ("quality", "told"),
+        [
+            ((3, 1), "expected 4 or 16 as edge_samples, got 3: take one"),
+            ((64, 1), "4 or 16 as edge_samples, got 64"),
+            ((4, 0), "from 1 on as shadow_step_px, got 0: take 1"),
+        ],
+    )
+    def test_other_qualities_are_refused(self, quality: tuple[int, int], told: str) -> None:
+        with pytest.raises(InputError, match=told):
             EmbreeRaycaster(edge_samples=quality[0], shadow_step_px=quality[1])
 
 
