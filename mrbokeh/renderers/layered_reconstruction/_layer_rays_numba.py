@@ -37,7 +37,7 @@ class Surfaces(NamedTuple):
 
 
 class Samples(NamedTuple):
-    """What rays give. met: (N, 3) layer, row, column; -1 where a ray meets nothing."""
+    """Rays and hits. met: (N, 3) layer, row, column; -1 where a ray meets nothing."""
 
     xy_px: np.ndarray
     lens_uv: np.ndarray
