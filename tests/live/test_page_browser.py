@@ -103,7 +103,8 @@ async def test_the_readout_tells_age_rate_way_and_stages(tmp_path: Path) -> None
     async with made_viewfinder() as made, chromium_page(made.url, tmp_path / "profile") as page:
         await page.comes_true("document.getElementById('age')?.textContent > 0")
         # Captured, encoded, sent, decoded and drawn on one machine: the age is positive and far below a second.
-        assert 0 < await page.value("viewfinder.age") < 1000
+        # Offsets of clocks are measured by round trips, and may be some milliseconds off for a moment while the machine is busy.
+        await page.comes_true("0 < viewfinder.age && viewfinder.age < 1000")
         assert float(await page.value("document.getElementById('fps').textContent")) > 5
         assert await page.value("document.getElementById('way').textContent") == "pictures"
         assert await page.value("document.getElementById('tracking').textContent") == "tracking 90 %"
