@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 
 from capture.merging.merge import merge_stack
+from capture.merging.registration.alignment import register_stack
 from capture.merging.registration.plane_transforms import about_centre, inverse
 from capture.merging.registration.registered_slices import SmallSlice, tint_gains, with_gain
+from capture.merging.registration.registration_file import write_registration
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
+from mrbokeh.system.errors import InputError
 
 SIZE = (240, 360)
 SCALES = (1.03, 1.02, 1.01, 1.0)
@@ -105,7 +108,14 @@ def test_merged_slices_have_the_light_of_the_reference_also_after_an_interruptio
 
 
 def test_flat_slices_merge_without_a_number_that_is_none(tmp_path: Path) -> None:
-    merge_stack(made_stack(tmp_path, [np.full((*SIZE, 3), 0.3, np.float32)] * 3))
+    """Only where somebody says how they lie: by themselves they are refused, and nothing is written."""
+    stack = made_stack(tmp_path, [np.full((*SIZE, 3), 0.3, np.float32)] * 3)
+    with pytest.raises(InputError, match="no two neighbours of 3 show the same detail"):
+        merge_stack(stack)
+    assert not read_focal_stack(tmp_path).merged and not (tmp_path / "all_in_focus.exr").exists()
+    given = tmp_path / "given.json"
+    write_registration(given, register_stack(lambda _: np.full((*SIZE, 3), 0.3, np.float32), 3, [50.0] * 3))
+    merge_stack(stack, registration=given)
     assert "NaN" not in (tmp_path / "stack.json").read_text()
 
 
