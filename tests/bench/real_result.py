@@ -40,7 +40,7 @@ class Shown:
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """Medians over slices of a stack, MOST_LEFT_OUT at most and not the outermost, in dB; nearest: of the neighbouring slice. said: why there are none."""
+    """Medians in dB over MOST_LEFT_OUT inner slices of a stack; nearest: of the neighbouring slice. said: why there are none."""
 
     rendered_db: float | None = None
     with_residuals_db: float | None = None
