@@ -33,6 +33,8 @@ from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 
 FEWEST_SLICES = 2
+_IN_COMMON = 0.2
+"""Neighbours that correlate less show nothing in common: two sheets of white reach 0, hand-held slices with people walking 0.93."""
 HIGHLIGHTS = "highlights"
 """Key in a stack's metadata: how many lights were drawn anew, and the largest value that their measured flux supports."""
 
@@ -131,7 +133,13 @@ def _registered(stack: FocalStack, ingested: IngestedSlices, sources: Sequence[P
     prior = [stack.lens_of(i).image_distance_mm for i in range(len(stack))] if knows_lens else None
     read = lru_cache(maxsize=1)(lambda index: ingested.read(sources[index]))
     unknown = np.flatnonzero(stated_by_sentinel(stack)).tolist()
-    return register_stack(lambda index: read(index)[0], len(stack), prior, lambda index: read(index)[1] == 0, unknown)
+    found = register_stack(lambda index: read(index)[0], len(stack), prior, lambda index: read(index)[1] == 0, unknown)
+    if prior is None and all(each is None for each in found.residuals_px) and max(found.correlations) < _IN_COMMON:
+        raise InputError(
+            f"{stack.folder}: expected photographs of one scene with detail to focus on, but no two neighbours of {len(stack)} show the "
+            f"same (correlation at most {max(found.correlations):.2f}): leave them out, or say how they lie (`--registration FILE`)"
+        )
+    return found
 
 
 def _with_registration(stack: FocalStack, slices: RegisteredSlices) -> FocalStack:

@@ -329,13 +329,14 @@ PICTURE_RULES = (SHARP, SEAMS, LIGHT)
 def by_use(gates: Sequence[Gate]) -> dict[str, list[Gate]]:
     """Return the gates of the all-in-focus pictures, and the others: a picture can be flawless though its depth is no good for training."""
     names = [rule.name for rule in (*PICTURE_RULES, PLACES)]
-    return {
+    uses = {
         "all-in-focus pictures": [each for each in gates if each.name in names],
         "depth and blur, for refocusing and training": [each for each in gates if each.name not in names],
     }
+    return {use: of_use for use, of_use in uses.items() if of_use}
 
 
 def verdict_line(use: str, gates: Sequence[Gate]) -> str:
-    """Return one line: which gates failed, which were not judged, and which or how many passed."""
+    """Return one line: which gates passed, which failed and which were not judged."""
     names = {verdict: list(dict.fromkeys(each.name for each in gates if each.verdict is verdict)) for verdict in Verdict}
     return f"{use}: " + "; ".join(f"{verdict}: {', '.join(which)}" for verdict, which in names.items() if which)

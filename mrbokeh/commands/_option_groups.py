@@ -14,7 +14,7 @@ def video(clip: ClipArgument, near: NearOptions) -> None: ...      # mrbokeh vid
 from collections.abc import Callable
 from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import wraps
-from inspect import Parameter, Signature, signature
+from inspect import Parameter, Signature, get_annotations, signature
 from typing import Any, get_args, get_type_hints
 
 from typer.models import OptionInfo
@@ -42,9 +42,9 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 def _options_of(group: type) -> list[Parameter]:
     hints = get_type_hints(group, include_extras=True)
     for owner in group.__mro__:
-        own = vars(owner)
-        for name in own.get("__annotations__", {}) if "PANEL" in own else ():
-            _put_on_panel(hints[name], own["PANEL"])
+        panel: str = vars(owner).get("PANEL", "")
+        for name in get_annotations(owner) if panel else ():
+            _put_on_panel(hints[name], panel)
     return [Parameter(each.name, Parameter.KEYWORD_ONLY, default=_default(each), annotation=hints[each.name]) for each in fields(group)]
 
 

@@ -77,7 +77,7 @@ def fingerprint(file: Path, module: str) -> str | None:
 
 
 def forget_unused(folder: Path) -> None:
-    """Remove the folders of kernels in `folder` that have not been loaded for KEPT_UNUSED_DAYS, and the oldest beyond MOST_BYTES in all."""
+    """Remove the folders of kernels in `folder` that have not been loaded for KEPT_UNUSED_DAYS, and the oldest beyond MOST_BYTES."""
     total_bytes = 0
     for each in sorted((each for each in folder.iterdir() if each.is_dir()), key=_used_s, reverse=True):
         total_bytes += sum(file.stat().st_size for file in each.iterdir())
@@ -167,7 +167,10 @@ def _writable_base() -> Path | None:
     temporary = Path(tempfile.gettempdir()) / f"mrbokeh_kernels_{os.getuid() if hasattr(os, 'getuid') else 'user'}"
     kept = temporary if _can_be_written(temporary) else None
     told = f"they are kept in {kept}" if kept else "they are compiled anew each time"
-    print(f"NUMBA_CACHE_DIR: compiled kernels cannot be written to {named}, {told}; name a folder that can be written", file=sys.stderr)
+    print(
+        f"NUMBA_CACHE_DIR: compiled kernels cannot be written to {named}, or it is another user's: {told}; name one that can be written",
+        file=sys.stderr,
+    )
     return kept
 
 

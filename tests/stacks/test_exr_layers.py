@@ -208,7 +208,7 @@ def test_numbers_may_outgrow_their_digits_and_be_negative(tmp_path: Path) -> Non
 
 
 def test_gaps_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"of the frames 1 to 6 2 are missing \(3, 4\)"):
+    with pytest.raises(InputError, match=r"2 of the frames 1 to 6 are missing \(3, 4\)"):
         ExrSequence.of(sequence(tmp_path / "s", [1, 2, 5, 6]))
 
 

@@ -11,7 +11,7 @@ import pytest
 
 from capture.commands.report import report_command
 from capture.poses.sparse_model import SparseModel, SparseView, write_sparse_model
-from capture.report.exclusion import REASONS, board_mask, exclusion_masks
+from capture.report.exclusion import REASONS, Disagreement, board_mask, exclusion_masks, moving
 from capture.report.findings import SliceFindings, StackFindings, focus_curve, focus_spacing
 from capture.report.picture_sharpness import PictureFindings
 from capture.report.registration_check import drift_of
@@ -179,6 +179,20 @@ def test_registration_is_read_as_movement() -> None:
     np.testing.assert_allclose(drift.magnification, [1, 1, 1.01])
     assert drift.largest_jump_px == pytest.approx(np.hypot(3, 1))
     assert drift.least_correlation == 0.7 and drift.width_px == 160
+
+
+def test_movement_is_not_judged_from_three_slices(scene: Path) -> None:
+    """People walked through a stack of three slices, and the report said that nothing moved."""
+    nothing = np.zeros((20, 30), np.float16)
+    quiet = Disagreement(residual=nothing, level=nothing, per_px=nothing, counted=np.ones((20, 30), bool))
+    still = moving([quiet] * 4, np.zeros((20, 30), np.float32))
+    assert moving([quiet] * 3, np.zeros((20, 30), np.float32)) is None and still is not None and not still.any()
+    curve = focus_curve(np.zeros((4, 4), np.float32), np.ones((4, 4), np.float32), 3)
+    found = tuple(SliceFindings(index, 1.0, 0.0, 1.0) for index in range(3))
+    picture = PictureFindings(None, None, 1.0, 1.0, (160, 107))
+    of_stack = StackFindings(read_focal_stack(scene / "view_0"), (160, 107), (160, 107), found, curve, 0.01, None, picture, ())
+    gate = next(each for each in stack_gates(of_stack) if each.name == "nothing moved")
+    assert (gate.verdict, gate.measured) == ("absent", "movement shows from 4 slices on, and here are 3: look at the picture yourself")
 
 
 def test_a_jump_or_a_pair_that_does_not_match_fails_registration(scene: Path, tmp_path: Path) -> None:

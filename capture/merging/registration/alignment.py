@@ -41,8 +41,6 @@ LEAST_MOVEMENT_PX = 0.25
 # Slices are moved if that brings corners nearer by this factor, or if it moves them by more than this share of half the diagonal.
 CLEARLY_BETTER = 1.7
 LARGEST_SEEMING_SHARE = 0.0075
-# Where no pair of neighbours reaches this there is nothing to merge: sheets of white, pictures of different things.
-LEAST_CORRELATION = 0.2
 # Besides neighbours, slices this far apart are matched: a longer lever stops drift, and more blur costs little yet.
 _LONG_STRIDE = 3
 
@@ -61,20 +59,13 @@ def register_stack(
 
     read_rgb: gives slice i; one picture is held at a time.
     prior_scales: expected magnification of each slice (image distances of the thin lens), where the lens is known.
-    read_valid: where slice i has data that is not saturated; None is everywhere. Raises InputError if sizes differ, or if no two
-    neighbours show the same detail and no lens says how they lie.
+    read_valid: where slice i has data that is not saturated; None is everywhere. Raises InputError if sizes differ.
     unknown_scales: slices whose prior is a guess (infinity by a sentinel), which pictures override.
     """
     matches, size_px = _matched(read_rgb, count, prior_scales, read_valid)
     scales = {pair: scale_of(match.target_from_source, middle_of(size_px)) for pair, match in matches.items() if match.tracks is not None}
     breathing = breathing_of(count, scales, prior_scales, unknown_scales)
     held = {pair: tracks for pair, match in matches.items() if (tracks := match.tracks) and breathing.allows(pair, scales[pair])}
-    correlations = tuple(matches[i, i + 1].correlation for i in range(count - 1))
-    if correlations and not held and prior_scales is None and max(correlations) < LEAST_CORRELATION:
-        raise InputError(
-            f"expected photographs of one scene with detail to focus on, but no two neighbours of {count} show the same detail "
-            f"(correlation at most {max(correlations):.2f}): leave this folder out"
-        )
     linked = with_links(count, held, matches, breathing, size_px)
     first_from_slice = joint_transforms(count, linked, size_px)
     settled, camera_moved = _settled(first_from_slice, breathing, held, size_px)
@@ -82,6 +73,7 @@ def register_stack(
         turned = joint_transforms(count, linked, size_px, perspective=True)
         settled = turned if _is_clearly_nearer(turned, settled, held) else settled
     reference, transforms = _to_narrowest(settled, size_px)
+    correlations = tuple(matches[i, i + 1].correlation for i in range(count - 1))
     residuals_px = _residuals_px(transforms, {pair: matches[pair] for pair in held}, size_px)
     return Registration(
         reference=reference,

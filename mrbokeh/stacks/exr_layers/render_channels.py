@@ -106,7 +106,7 @@ class RenderChannels:
             raise InputError(
                 f"{self.path}: R, G and B could be any of the layers {', '.join(found)}: write the picture without a layer's name"
             )
-        raise InputError(f"{self.path}: expected R, G and B, but it has {', '.join(self.stored)}: write the picture without a layer's name")
+        raise InputError(f"{self.path}: expected R, G and B, but it has {', '.join(self.stored)}: render with colour")
 
     def depth_name(self, colour_layer: str) -> str:
         """Return the channel that holds depth: beside the colour layer, else anywhere at the top. Raises InputError if there is none."""

@@ -115,4 +115,4 @@ def _require_all(where: Path | str, found: Mapping[int, Path], frames: range) ->
     missing = [number for number in frames if number not in found]
     if missing:
         named = ", ".join(str(number) for number in missing[:_NAMED_GAPS]) + (" and more" if len(missing) > _NAMED_GAPS else "")
-        raise InputError(f"{where}: of the frames {frames[0]} to {frames[-1]} {len(missing)} are missing ({named}): render them")
+        raise InputError(f"{where}: {len(missing)} of the frames {frames[0]} to {frames[-1]} are missing ({named}): render them")
