@@ -2,7 +2,8 @@
 
 numba makes machine code of every function that a kernel calls, with a wrapper each for Python and for C, and optimises it again in each
 kernel that calls it, however indirectly: two thirds of the time of a kernel's first call. Here what a kernel calls stays a plain module,
-which is linked where it is needed; all is optimised together, once. No option of the compiler changes, so the numbers stay the same.
+which is linked where it is needed; all is optimised together, once. No option of the compiler changes; the
+pictures of all methods kept their bits.
 """
 
 import gc

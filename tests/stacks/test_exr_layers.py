@@ -1,5 +1,6 @@
 """Renders of other programs as layers: known names, parts, eyes, numbered files and their gaps."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.image_io import read_layer, write_layer
 from mrbokeh.images.layer import Layer
+from mrbokeh.optics.camera import camera_from_json
 from mrbokeh.stacks.exr_layers.cryptomatte import ObjectSplit
 from mrbokeh.stacks.exr_layers.render_channels import FlatRender, LayerReader, RenderChannels
 from mrbokeh.stacks.exr_layers.sequence import ExrSequence
@@ -149,6 +151,15 @@ def test_it_reads_what_we_write(tmp_path: Path) -> None:
     for read in (FlatRender().layers(tmp_path / "a.exr")[0], read_layer(tmp_path / "a.exr")):
         for name in ("rgb", "alpha", "depth_m"):
             np.testing.assert_array_equal(getattr(read, name), getattr(layer, name))
+
+
+def test_depth_of_blender_lies_where_its_camera_sees_the_cube() -> None:
+    """Blender 4.2: the face towards the camera, y = -0.2 there, is at z = -0.2 in our axes; Z is that of one ray within the pixel."""
+    (layer,) = FlatRender().layers(BLENDER / "render.0002.exr")
+    camera = camera_from_json(json.loads((BLENDER / "camera_track.json").read_text())["frames"][1]["camera"])
+    cube = (layer.rgb[..., 0] > 0.7) & (layer.alpha == 1)
+    seen = camera.unproject(camera.pixel_centres_px(), np.where(cube, layer.depth_m, 1.0).astype(np.float64))
+    assert (cube & (np.abs(seen[..., 2] + 0.2) < 3e-3)).sum() > 120
 
 
 def test_blender_5_writes_a_part_for_each_layer() -> None:
