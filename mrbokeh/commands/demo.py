@@ -11,7 +11,7 @@ app = typer.Typer(add_completion=False)
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for everything it makes.")] = Path("demo_out"),
-    minutes: Annotated[float, typer.Option(min=0.05, help="Training time of the first network; the second takes a third of it.")] = 2.3,
+    minutes: Annotated[float, typer.Option(min=0.05, help="Training time of the first network; the second takes a third of it.")] = 2.8,
 ) -> None:
     """Run the whole path from RAW photographs to virtual objects with the blur of their lens: capture, train, composite, report.
 
