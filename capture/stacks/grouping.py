@@ -152,7 +152,9 @@ def why_aside(group: PhotoGroup) -> list[SkippedFile]:
     skipped = []
     for photo in group.aside:
         other = f"was taken with {photo.metadata.camera_model}" if photo.metadata.camera_model else "names no camera"
-        skipped.append(SkippedFile(photo.path, f"it {other}, most of its stack with {usual} (--group none takes it all the same)"))
+        skipped.append(
+            SkippedFile(photo.path, f"it {other}, most of its stack with {usual} (`mrbokeh capture ingest --group none` takes it)")
+        )
     return skipped
 
 

@@ -16,7 +16,7 @@ _TIMES_AS_BRIGHT = 30.0
 _SAME_FOCUS = 1e-3
 _ASKED_OF_EACH = 6
 _MOST_SCENES = 12
-ALL_THE_SAME = "--group none takes all"
+ALL_THE_SAME = "`mrbokeh capture ingest --group none` takes all"
 
 Odd = dict[int, str]
 """The slices to leave out, by their index, and why."""
