@@ -1,6 +1,6 @@
 """`mrbokeh viewfinder` and `mrbokeh viewfinder board` as their user meets them: refusals, starting, ending, and what they leave behind."""
 
-import json
+import inspect
 import os
 import re
 import shlex
@@ -22,6 +22,7 @@ import aiohttp
 import numpy as np
 import pytest
 from typer.main import get_command
+from typer.testing import CliRunner
 
 from mrbokeh.cli import SUB_COMMANDS
 from mrbokeh.images.image_io import write_layer
@@ -32,12 +33,12 @@ from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, read_board, write_board
-from tests.scenes.command_line import printed_by
-from tests.scenes.layer_viewfinder import watching
+from tests.scenes.command_line import mrbokeh, printed_by
+from tests.scenes.layer_viewfinder import control, watching
 from tests.scenes.phone_on_camera import PHONE
 from tests.scenes.thin_lens_board import Shot, camera_over, display_bgr, photograph
 from viewfinder.app.running import opened
-from viewfinder.cli import board_command
+from viewfinder.cli import app, board_command
 from viewfinder.frames import CameraFrame
 from viewfinder.options import TrackingOptions, ViewfinderOptions
 from viewfinder.server.access import Access
@@ -62,106 +63,81 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+GIVEN = "--layer layer.exr --lens lens.json"
 # What the command line says (after --source test) and what the refusal must say. The camera must not be opened before.
 REFUSED = {
-    "": "either --scene SCENE.toml or --layer",
-    "--layer layer.exr --scene bad.toml --lens lens.json": "either --scene SCENE.toml or --layer",
-    "--layer layer.exr": "expected a lens, got none",
-    "--layer layer.exr --lens none.json": "none.json",
-    "--layer layer.exr --lens bad.json": "bad.json",
-    "--layer none.exr --lens lens.json": "none.exr",
+    "": "either --scene SCENE.toml or --layer", f"{GIVEN} --scene bad.toml": "either --scene SCENE.toml or --layer",
+    "--layer layer.exr": "expected a lens, got none", "--layer layer.exr --lens none.json": "none.json",
+    "--layer layer.exr --lens bad.json": "bad.json", "--layer none.exr --lens lens.json": "none.exr",
     "--scene bad.toml --lens lens.json": "none.glb",
-    "--layer layer.exr --lens lens.json --backend vulkan": "--backend: expected one of auto, wgpu, embree",
-    "--layer layer.exr --lens lens.json --backend embree": "leave --backend out",
-    "--layer layer.exr --lens lens.json --fps -1": "--fps: expected a positive number",
-    "--layer layer.exr --lens lens.json --renderer magic": "--renderer: expected one of polygon",
-    "--layer layer.exr --lens lens.json --renderer polygon --renderer none.onnx": "no such file",
-    "--layer layer.exr --lens lens.json --renderer lrdm --psf bank.exr": "leave --psf out",
-    "--layer layer.exr --lens lens.json --board bad.json": "bad.json",
-    "--layer layer.exr --lens lens.json --pose bad.json": "expected width_px",
-    "--layer layer.exr --lens lens.json --camera none.json": "none.json",
-    "--layer layer.exr --lens lens.json --board board.json --pose pose.json": "got --board and --pose: give one",
-    "--layer layer.exr --lens lens.json --opentrackio 5000 --freed 5001": "got --opentrackio and --freed: give one",
-    "--layer layer.exr --lens lens.json --lens-table a.csv": "--lens-table is for the encoders of --freed",
-    "--layer layer.exr --lens lens.json --lens-table a.csv --opentrackio 5000": "--lens-table is for the encoders of --freed",
-    "--layer layer.exr --lens lens.json --metres-per-unit 2": "--metres-per-unit is the scale of a --map",
-    "--layer layer.exr --lens lens.json --map here --metres-per-unit -2": "--metres-per-unit: expected a number above 0",
-    "--layer layer.exr --lens lens.json --rig rig.json": "--rig is for --phone",
-    "--layer layer.exr --lens lens.json --phone-camera pose.json": "--phone-camera is for --phone",
-    "--layer layer.exr --lens lens.json --phone 0 --phone-camera pose.json": "--phone needs --rig RIG.json",
-    "--layer layer.exr --lens lens.json --phone 0 --rig rig.json": "--phone needs --phone-camera CAMERA.json",
-    "--layer layer.exr --lens lens.json --phone 0 --rig rig.json --phone-camera pose.json": "--phone needs --board",
-    "--layer layer.exr --lens lens.json --phone 0 --rig rig.json --phone-camera pose.json --board board.json": "not a phone rig",
-    "--layer layer.exr --lens lens.json --phone test --rig rig.json --phone-camera pose.json --board board.json": "are both test",
-    "--layer layer.exr --lens lens.json --phone 0 --rig rig.json --phone-camera pose.json --freed 5000": "--freed and --phone",
-    "--layer layer.exr --lens lens.json --delay-ms 20": "--delay-ms is for poses that come from elsewhere",
-    "--layer layer.exr --lens lens.json --board board.json --delay-ms 20": "--delay-ms is for poses that come from elsewhere",
-    "--layer layer.exr --lens lens.json --smoothing": "--smoothing needs a track",
-    "--layer layer.exr --lens lens.json --smoothing --pose pose.json": "--smoothing needs a track",
-    "--layer layer.exr --lens lens.json --focus-from luck": "--focus-from: expected one of hand, tracking, source, board",
-    "--layer layer.exr --lens lens.json --focus-from board": "--focus-from board needs --board",
-    "--layer layer.exr --lens lens.json --focus-from tracking": "--focus-from tracking needs a tracking system",
-    "--layer layer.exr --lens lens.json --focus-from tracking --freed 5000": "needs --lens-table",
-    "--layer layer.exr --lens lens.json --interface eth0": "--interface eth0 is for --lan",
-    "--layer layer.exr --lens lens.json --tls-key key.pem": "--tls-key is for --tls",
-    "--layer layer.exr --lens lens.json --tls none.pem": "there is no certificate file none.pem",
-    "--layer layer.exr --lens lens.json --lan --interface nowhere0": "there is no interface 'nowhere0'",
-}
-
-_INVOKE = """
-import json, sys
-from typer.testing import CliRunner
-import viewfinder.app.opening as opening, viewfinder.app.opening as trackers
-from viewfinder.cli import app
-def opened(*_):
-    raise RuntimeError("a camera was opened")
-opening.open_source = trackers.open_source = opened
-done = [CliRunner().invoke(app, ["--source", "test", *words]) for words in json.loads(sys.argv[1])]
-print(json.dumps([[type(each.exception).__name__, str(each.exception)] for each in done]))
-"""
+}  # fmt: skip
+REFUSED |= {f"{GIVEN} {more}": sentence for more, sentence in {
+    "--backend vulkan": "--backend: expected one of auto, wgpu, embree", "--backend embree": "leave --backend out",
+    "--fps -1": "--fps: expected a positive number", "--renderer magic": "--renderer: expected one of polygon",
+    "--renderer polygon --renderer none.onnx": "no such file", "--renderer lrdm --psf bank.exr": "leave --psf out",
+    "--board bad.json": "bad.json", "--pose bad.json": "expected width_px", "--camera none.json": "none.json",
+    "--board board.json --pose pose.json": "got --board and --pose: give one",
+    "--opentrackio 5000 --freed 5001": "got --opentrackio and --freed: give one",
+    "--lens-table a.csv": "--lens-table is for the encoders of --freed",
+    "--lens-table a.csv --opentrackio 5000": "--lens-table is for the encoders of --freed",
+    "--metres-per-unit 2": "--metres-per-unit is the scale of a --map",
+    "--map here --metres-per-unit -2": "--metres-per-unit: expected a number above 0", "--rig rig.json": "--rig is for --phone",
+    "--phone-camera pose.json": "--phone-camera is for --phone", "--phone 0 --phone-camera pose.json": "--phone needs --rig RIG.json",
+    "--phone 0 --rig rig.json": "--phone needs --phone-camera CAMERA.json",
+    "--phone 0 --rig rig.json --phone-camera pose.json": "--phone needs --board",
+    "--phone 0 --rig rig.json --phone-camera pose.json --board board.json": "not a phone rig",
+    "--phone test --rig rig.json --phone-camera pose.json --board board.json": "are both test",
+    "--phone 0 --rig rig.json --phone-camera pose.json --freed 5000": "--freed and --phone",
+    "--delay-ms 20": "--delay-ms is for poses that come from elsewhere",
+    "--board board.json --delay-ms 20": "--delay-ms is for poses that come from elsewhere", "--smoothing": "--smoothing needs a track",
+    "--smoothing --pose pose.json": "--smoothing needs a track",
+    "--focus-from luck": "--focus-from: expected one of hand, tracking, source, board",
+    "--focus-from board": "--focus-from board needs --board", "--focus-from tracking": "--focus-from tracking needs a tracking system",
+    "--focus-from tracking --freed 5000": "needs --lens-table", "--interface eth0": "--interface eth0 is for --lan",
+    "--tls-key key.pem": "--tls-key is for --tls", "--tls none.pem": "there is no certificate file none.pem",
+    "--lan --interface nowhere0": "there is no interface 'nowhere0'",
+}.items()}  # fmt: skip
 
 
-def test_what_cannot_be_is_refused_before_a_camera_is_opened(folder: Path) -> None:
-    """All in one process of their own, as the hooks of the tests do not know typer's Context. The last one is in order."""
-    good = "--layer layer.exr --lens lens.json --board board.json --focus-from board --smoothing"
-    lines = json.dumps([shlex.split(line) for line in (*REFUSED, good)])
-    environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run([sys.executable, "-c", _INVOKE, lines], cwd=folder, capture_output=True, text=True, env=environment)
-    assert done.returncode == 0, done.stderr
-    results = json.loads(done.stdout.splitlines()[-1])
-    for line, (kind, sentence) in zip(REFUSED, results, strict=False):
-        assert kind == "InputError" and REFUSED[line] in sentence, (line, kind, sentence)
-        assert "\n" not in sentence, line
-    assert results[-1] == ["RuntimeError", "a camera was opened"]
+@pytest.fixture
+def in_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The command runs there in this process; the checks of the tests do not know typer's Context."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(app.registered_callback, "callback", inspect.unwrap(app.registered_callback.callback))  # type: ignore[union-attr]
 
 
-def test_a_refusal_is_one_sentence_and_code_2(folder: Path) -> None:
+@pytest.mark.usefixtures("in_folder")
+def test_what_cannot_be_is_refused_before_a_camera_is_opened(monkeypatch: pytest.MonkeyPatch) -> None:
+    def opens(*_: object) -> None:
+        raise RuntimeError("a camera was opened")
+
+    monkeypatch.setattr("viewfinder.app.opening.open_source", opens)
+    for line, sentence in REFUSED.items():
+        refused = CliRunner().invoke(app, ["--source", "test", *shlex.split(line)]).exception
+        assert isinstance(refused, InputError) and sentence in str(refused) and "\n" not in str(refused), (line, refused)
+    with pytest.raises(RuntimeError, match="a camera was opened"):
+        printed_by(app, "--source", "test", *shlex.split(f"{GIVEN} --board board.json --focus-from board --smoothing"))
+
+
+@pytest.mark.usefixtures("in_folder")
+def test_a_refusal_is_one_sentence_and_code_2() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
-        for words, sentence in (
-            (("--renderer", "magic"), "--renderer: expected one of polygon"),
-            (("--port", str(taken.getsockname()[1])), "choose another one with --port"),
-        ):
-            with command(folder, *words) as process:
-                output, errors = process.communicate(timeout=60)
-            assert (process.returncode, output) == (2, "")
-            assert errors.startswith("error: ") and sentence in errors and "Traceback" not in errors
+        port = taken.getsockname()[1]
+        for more, sentence in (("--renderer magic", "--renderer: expected one of polygon"), (f"--port {port}", "another one with --port")):
+            done = mrbokeh("viewfinder", "--source", "test", *shlex.split(f"{GIVEN} {more}"))
+            assert (done.returncode, done.stdout) == (2, "")
+            assert done.stderr.startswith("error: ") and sentence in done.stderr and "Traceback" not in done.stderr
 
 
 @contextmanager
 def command(folder: Path, *words: str, before: str = "") -> Iterator["subprocess.Popen[str]"]:
     """`mrbokeh viewfinder` with the layer and the lens of the folder, run in it; before: Python that runs first."""
-    arguments = ["viewfinder", "--source", "test", "--layer", "layer.exr", "--lens", "lens.json", "--port", "0", *words]
+    arguments = ["viewfinder", "--source", "test", *shlex.split(GIVEN), "--port", "0", *words]
     program = f"import sys; sys.argv = ['mrbokeh', *{arguments!r}]\n{before}\nfrom mrbokeh.cli import main; main()"
-    with subprocess.Popen(
-        [sys.executable, "-u", "-c", program],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": str(ROOT)},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
+    environment, streams = os.environ | {"PYTHONPATH": str(ROOT)}, {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen([sys.executable, "-u", "-c", program], cwd=folder, env=environment, text=True, **streams) as process:
         try:
             yield process
         finally:
@@ -188,45 +164,27 @@ def test_ctrl_c_while_it_starts_ends_it_cleanly(folder: Path) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGTERM for another process")
-async def test_all_that_is_written_goes_to_the_captures(folder: Path) -> None:
+async def test_the_command_serves_until_it_is_stopped_and_writes_to_the_captures_only(folder: Path) -> None:
     """A capture and a recording, and nothing else is new in the folder where it ran."""
     before = {path.name for path in folder.iterdir()}
     with command(folder, "--captures", "shots/today") as process:
-        url = url_of(process)
-        async with aiohttp.ClientSession() as session, session.ws_connect(url + "stream") as stream:
-            await stream.receive(timeout=20)
-            for message in ({"record": True}, {"capture": {}}, {"record": False}):
-                async with session.post(url + "control", json=message) as answer:
-                    assert answer.status == 200, await answer.text()
-        process.send_signal(signal.SIGTERM)
-        output, errors = process.communicate(timeout=30)
-    assert (process.returncode, output, errors) == (0, "viewfinder stopped\n", "")
-    assert {path.name for path in folder.iterdir()} == before | {"shots"}
-    assert [path.name for path in (folder / "shots").iterdir()] == ["today"]
-    kept = sorted(path.suffix for path in (folder / "shots" / "today").iterdir())
-    assert "" in kept, "the bundle is a folder"
-
-
-@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for another process")
-async def test_the_command_serves_until_ctrl_c(folder: Path) -> None:
-    with command(folder) as process:
-        url = url_of(process)
+        url = next(word for word in process.stdout.readline().split() if word.startswith("http://"))
         assert url.startswith("http://127.0.0.1:")
         async with watching(url) as viewer, aiohttp.ClientSession() as session:
             assert (await viewer.frame()).bgr.shape == (HEIGHT_PX, WIDTH_PX, 3)
             async with session.get(url) as page:
                 assert "viewport" in await page.text()
-            process.send_signal(signal.SIGINT)
+            for message in ({"record": True}, {"capture": {}}, {"record": False}):
+                assert (await control(url, message))[0] == 200
+            process.send_signal(signal.SIGTERM)
             while (await viewer.stream.receive(timeout=5)).type is aiohttp.WSMsgType.BINARY:
                 pass
             assert viewer.stream.close_code == aiohttp.WSCloseCode.GOING_AWAY
-        output, errors = process.communicate(timeout=10)
+        output, errors = process.communicate(timeout=30)
     assert (process.returncode, output, errors) == (0, "viewfinder stopped\n", "")
-
-
-def url_of(process: "subprocess.Popen[str]") -> str:
-    """The address that the command prints."""
-    return next(word for word in process.stdout.readline().split() if word.startswith("http://"))
+    assert {path.name for path in folder.iterdir()} == before | {"shots"}
+    assert [path.name for path in (folder / "shots").iterdir()] == ["today"]
+    assert "" in {path.suffix for path in (folder / "shots" / "today").iterdir()}, "the bundle is a folder"
 
 
 def test_a_part_that_fails_closes_those_before_it(folder: Path) -> None:
@@ -256,11 +214,9 @@ def test_a_browser_camera_behind_a_layer_can_be_sent(folder: Path) -> None:
 def test_a_board_to_print(tmp_path: Path) -> None:
     """The markers span six blurs: at f/2.8 and half a dioptre from the focus the blur of this lens is 17 px of 1280."""
     write_lens(tmp_path / "lens.json", LENS)
-    out = tmp_path / "board.pdf"
-    words = ["--lens", tmp_path / "lens.json", "--distance-m", "0.8,1.2", "--out", out]
+    words = ["--lens", tmp_path / "lens.json", "--distance-m", "0.8,1.2", "--out", tmp_path / "board.pdf"]
     told = printed_by(board_command, *words)
-    assert "print it at 100 %" in told and "blurs" in told
-    assert out.read_bytes().startswith(b"%PDF")
+    assert "print it at 100 %" in told and "blurs" in told and (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
     marker_px = LENS.focused_at(1.2).focal_px(1280) * read_board(tmp_path / "board.json").grids[0].marker_mm / 1000 / 0.8
     assert marker_px >= 6.0 * abs(float(LENS.coc_px(0.8, 1280)))
     with pytest.raises(InputError, match="--overwrite"):
@@ -271,18 +227,16 @@ def test_a_board_to_print(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        (["--out", "board.png"], "ends in .pdf"),
-        (["--out", "board.pdf", "--distance-m", "near"], "--distance-m: expected NEAREST,FARTHEST"),
-        (["--out", "board.pdf", "--distance-m", "2,1"], "2"),
-        (["--out", "board.pdf", "--paper", "napkin"], "napkin"),
-        (["--out", "board.pdf", "--lens", "lens.json", "--distance-m", "0.2,30"], "no paper holds a board"),
+        ("--out board.png", "ends in .pdf"), ("--out board.pdf --distance-m near", "--distance-m: expected NEAREST,FARTHEST"),
+        ("--out board.pdf --distance-m 2,1", "2"), ("--out board.pdf --paper napkin", "napkin"),
+        ("--out board.pdf --lens lens.json --distance-m 0.2,30", "no paper holds a board"),
     ],
-)
-def test_boards_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], sentence: str) -> None:
+)  # fmt: skip
+def test_boards_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, sentence: str) -> None:
     monkeypatch.chdir(tmp_path)
     write_lens(tmp_path / "lens.json", replace(LENS, f_number=1.0))
     with pytest.raises(InputError, match=re.escape(sentence)):
-        printed_by(board_command, *words)
+        printed_by(board_command, *words.split())
     assert [path.name for path in tmp_path.iterdir()] == ["lens.json"]
 
 
@@ -303,25 +257,18 @@ def test_focus_from_the_blur_of_the_board_follows_the_page(folder: Path) -> None
     Told wrongly, half the blur would mean half the way: about 1.85 in place of 1.5 dioptres. (What is left is 0.01 at f/2.8 and 0.09
     at f/5.6, for these pictures are sharper than the camera that the solver expects.) The lens's files have the focus, as it breathes.
     """
-    write_lens(folder / "lens.json", LENS.focused_at(FOCUS_M))
-    write_lens(folder / "stopped.json", replace(LENS.focused_at(FOCUS_M), f_number=5.6))
-    options = ViewfinderOptions(
-        "test",
-        layer=folder / "layer.exr",
-        lenses=(folder / "lens.json", folder / "stopped.json"),
-        tracking=TrackingOptions(board=folder / "board.json"),
-        focus_from=("board",),
-        captures=folder,
-    )
-    with opened(options, Access()) as running:
+    lenses = {2.8: folder / "lens.json", 5.6: folder / "stopped.json"}
+    for f_number, path in lenses.items():
+        write_lens(path, replace(LENS.focused_at(FOCUS_M), f_number=f_number))
+    tracking = TrackingOptions(board=folder / "board.json")
+    files = {"layer": folder / "layer.exr", "lenses": tuple(lenses.values()), "captures": folder}
+    with opened(ViewfinderOptions("test", tracking=tracking, focus_from=("board",), **files), Access()) as running:
         controls = running.site.controls
         assert controls.state()["focus_from"] is None, "before the first picture"
         steps: list[tuple[float, Callable[[], None]]] = [
-            (2.8, lambda: None),
-            (5.6, lambda: controls.set_f_number(5.6)),
-            (2.8, lambda: controls.set_f_number(2.8)),
+            (2.8, lambda: None), (5.6, lambda: controls.set_f_number(5.6)), (2.8, lambda: controls.set_f_number(2.8)),
             (5.6, lambda: controls.set_lens("stopped")),
-        ]
+        ]  # fmt: skip
         for f_number, tell in steps:
             tell()
             state = solved(running, board_picture(f_number))
@@ -348,22 +295,11 @@ def solved(running: Any, bgr: np.ndarray) -> dict[str, Any]:
     return running.site.controls.state()
 
 
-def shell_lines() -> Iterator[str]:
-    """The commands of the guide, those that go on over several lines joined."""
-    inside, joined = False, ""
-    for line in DOC.read_text(encoding="utf-8").splitlines():
-        if line.startswith("```"):
-            inside = line == "```sh"
-        elif inside:
-            joined += line.removesuffix("\\")
-            if not line.endswith("\\") and joined.split("#")[0].strip():
-                yield joined.split(" # ")[0].strip()
-            joined = joined if line.endswith("\\") else ""
-
-
 def test_every_command_of_the_guide_is_one() -> None:
     """Parsed as the command line would be: unknown options, missing ones and values of a wrong kind are refused. Nothing is run."""
-    lines = [line for line in shell_lines() if line.startswith("mrbokeh ")]
+    blocks = re.findall(r"^```sh\n(.*?)^```", DOC.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)
+    joined = [line.split(" # ")[0].strip() for block in blocks for line in block.replace("\\\n", "").splitlines()]
+    lines = [line for line in joined if line.startswith("mrbokeh ")]
     assert len(lines) >= 15
     for line in lines:
         words = shlex.split(line)[1:]
@@ -377,7 +313,7 @@ def test_every_command_of_the_guide_is_one() -> None:
 
 def test_the_guide_names_every_option_and_only_files_that_exist() -> None:
     text = DOC.read_text(encoding="utf-8")
-    group = get_command(import_module("viewfinder.cli").app)
+    group = get_command(app)
     options = {option for parameter in group.params for option in parameter.opts if option.startswith("--")}
     missing = {option for option in options - {"--help", "--method"} if option not in text}
     assert not missing, missing
