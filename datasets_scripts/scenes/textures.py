@@ -99,12 +99,14 @@ def spots(
     red, green, blue = ground
     dark, light = (0.8 * red, 0.8 * green, 0.8 * blue), (1.2 * red, 1.2 * green, 1.2 * blue)
     picture = mottled(size, rng, dark, light).astype(float)
-    y, x = np.mgrid[:size, :size] + 0.5
     for index in range(count):
         (cy, cx), r = rng.uniform(0, size, 2), rng.uniform(*radius)
+        rows, columns = (np.unique(np.arange(int(c - r) - 3, int(c + r) + 5) % size) for c in (cy, cx))
+        y, x = rows[:, None] + 0.5, columns + 0.5
         away = np.hypot((y - cy + size / 2) % size - size / 2, (x - cx + size / 2) % size - size / 2)
         cover = np.clip((r - away) / 4.0 + 0.5, 0.0, 1.0)[..., None]
-        picture = picture * (1 - cover) + cover * np.asarray(colours[index % len(colours)]) * rng.uniform(0.8, 1.15)
+        ground = picture[np.ix_(rows, columns)]
+        picture[np.ix_(rows, columns)] = ground * (1 - cover) + cover * np.asarray(colours[index % len(colours)]) * rng.uniform(0.8, 1.15)
     rough = 1.0 + 0.12 * fractal_noise(size, size, rng, 4.0, size / 4.0, 0.3)
     return np.clip(picture * rough[..., None], 0.01, 0.95).astype(np.float32)
 

@@ -81,16 +81,13 @@ def blur_samples(points: np.ndarray, growth: np.ndarray, noise_px: float = 0.1, 
 POINTS = np.random.default_rng(7).uniform(0.5, 1.6, 300)
 
 
-def test_quantised_focus_distances_are_mended() -> None:
+def test_focus_is_found_from_blur_stated_or_not() -> None:
     """Nikon's 8-bit code: stated up to 0.04 dioptres off, found within 0.003, and the growth of blur, nominally 7 % off, within 1 %."""
     stated = 1.0 / (0.01 * 10 ** (np.round(40 * np.log10(100.0 / FOCUS)) / 40))
     assert np.abs(stated - FOCUS).max() > 0.02
     fit = calibrate_focus(blur_samples(POINTS, 0.93 * GROWTH), POINTS, FocusStart(stated, GROWTH))
     np.testing.assert_allclose(fit.dioptres, FOCUS, atol=0.003)
     np.testing.assert_allclose(fit.px_per_dioptre, 0.93 * GROWTH, rtol=0.01)
-
-
-def test_unknown_focus_and_lens_are_found_with_wrong_points_among_them() -> None:
     rough = FOCUS + np.random.default_rng(0).normal(0, 0.04, len(FOCUS))
     fit = calibrate_focus(blur_samples(POINTS, GROWTH, wrong=0.15), POINTS, FocusStart(rough, np.ones(len(FOCUS)), 0.5))
     np.testing.assert_allclose(fit.dioptres, FOCUS, atol=0.01)
@@ -113,16 +110,19 @@ def test_a_focus_that_was_called_infinity_is_looked_for() -> None:
     assert fit.dioptres[9] == pytest.approx(1e-3, abs=1e-6) and fit.sigma_dioptre[9] == pytest.approx(0.5, rel=0.05)
 
 
-def test_a_slice_of_which_nothing_is_known_stays_as_stated() -> None:
+def test_what_nothing_is_known_of_stays_as_stated() -> None:
     blur = blur_samples(POINTS, GROWTH)
     others = blur.slices != 4
     lacking = BlurSamples(blur.slices[others], blur.points[others], blur.diameter_px[others])
     fit = calibrate_focus(lacking, POINTS, FocusStart(FOCUS + 0.013, GROWTH))
     assert fit.samples[4] == 0 and fit.dioptres[4] == pytest.approx(FOCUS[4] + 0.013, abs=1e-6)
     assert fit.sigma_dioptre[4] == pytest.approx(0.05, rel=0.05)
+    blur = BlurSamples(np.zeros(5, np.int64), np.arange(5), np.full(5, 4.0))
+    with pytest.raises(InputError, match="5 times, but 60 are needed"):
+        calibrate_focus(blur, POINTS, FocusStart(FOCUS, GROWTH))
 
 
-def test_the_jacobian_is_that_of_the_residuals() -> None:
+def test_the_jacobian_is_that_of_the_residuals_and_points_are_spread() -> None:
     blur = blur_samples(POINTS[:40], GROWTH)
     fit = _Fit(blur.slices, POINTS[blur.points], blur.diameter_px, FocusStart(FOCUS, GROWTH))
     values = fit.first_values() + np.random.default_rng(0).normal(0, 0.01, 1 + 2 * len(FOCUS))
@@ -130,19 +130,7 @@ def test_the_jacobian_is_that_of_the_residuals() -> None:
     steps = 1e-6 * np.eye(len(values))
     numeric = [(fit.residuals(values + step, within) - fit.residuals(values - step, within)) / 2e-6 for step in steps]
     np.testing.assert_allclose(fit.jacobian(values, within), np.array(numeric).T, atol=2e-3, rtol=1e-4)
-
-
-def test_too_little_blur_is_an_error() -> None:
-    blur = BlurSamples(np.zeros(5, np.int64), np.arange(5), np.full(5, 4.0))
-    with pytest.raises(InputError, match="5 times, but 60 are needed"):
-        calibrate_focus(blur, POINTS, FocusStart(FOCUS, GROWTH))
-
-
-def test_points_that_share_a_window_count_once() -> None:
     assert len(spread_points(np.array([[3.0, 3.0], [10.0, 12.0], [25.0, 3.0]]))) == 2
-
-
-def test_pictures_are_reduced_by_means() -> None:
     np.testing.assert_allclose(reduced(np.arange(20, dtype=np.float32).reshape(4, 5), 2), [[3.0, 5.0], [13.0, 15.0]])
 
 
@@ -172,7 +160,7 @@ def test_a_calibration_translates_stated_distances(tmp_path: Path) -> None:
     assert twice.focus_distances_m == stack.focus_distances_m, "what was stated is translated, never what was calibrated"
 
 
-def test_a_calibration_is_for_its_lens_only(tmp_path: Path) -> None:
+def test_calibrations_are_for_their_lens_and_survive_the_disk(tmp_path: Path) -> None:
     for lens in (replace(LENS, focal_length_mm=50.0), replace(LENS, f_number=4.0)):
         with pytest.raises(InputError, match="calibrate that lens"):
             apply_lens_calibration(stack_at(tmp_path, (1.0,), lens), CALIBRATION)
@@ -183,9 +171,6 @@ def test_a_calibration_is_for_its_lens_only(tmp_path: Path) -> None:
     silent = replace(CALIBRATION, rows=(replace(ROWS[0], stated_dioptre=None),))
     with pytest.raises(InputError, match="serves no other stack"):
         apply_lens_calibration(stack_at(tmp_path, (1.0,)), silent)
-
-
-def test_calibrations_survive_the_disk(tmp_path: Path) -> None:
     path = tmp_path / "lens_calibration.json"
     write_lens_calibration(path, CALIBRATION)
     assert read_lens_calibration(path) == CALIBRATION
@@ -200,13 +185,8 @@ def test_stacks_of_a_lens_share_rows_of_the_same_stated_focus(tmp_path: Path) ->
     found = {}
     for name, dioptre, sigma in (("a", 1.00, 0.002), ("b", 1.05, 0.001)):
         fit = calibrate_focus(blur_samples(POINTS, GROWTH), POINTS, FocusStart(FOCUS, GROWTH))
-        fit = replace(
-            fit,
-            dioptres=np.array([1.4, dioptre]),
-            px_per_dioptre=np.array([24.0, 24.0]),
-            sigma_dioptre=np.array([sigma] * 2),
-            samples=np.array([9, 9]),
-        )
+        dioptres, growth, sigmas, samples = (np.array(each) for each in ([1.4, dioptre], [24.0, 24.0], [sigma] * 2, [9, 9]))
+        fit = replace(fit, dioptres=dioptres, px_per_dioptre=growth, sigma_dioptre=sigmas, samples=samples)
         found[name] = StackFocus(stack, fit, 1920)
     other_lens = replace(stack, lens=replace(LENS, f_number=4.0))
     found["c"] = replace(found["a"], stack=other_lens)
@@ -216,8 +196,14 @@ def test_stacks_of_a_lens_share_rows_of_the_same_stated_focus(tmp_path: Path) ->
     assert first.rows[0].dioptre == pytest.approx(1.04) and first.rows[0].stacks == 2
 
 
-def test_a_scene_is_calibrated_with_its_depth(tmp_path: Path) -> None:
+def test_the_command_calibrates_a_scene_with_its_depth(tmp_path: Path) -> None:
     """Half way between slices at 1 m (calibrated 1 / 0.96 + 0.02 dioptres) and 2 m (1 / 1.96)."""
+    scene, path = tmp_path / "scene", tmp_path / "lens_calibration.json"
+    write_focal_stack(stack_at(scene / "a", (1.0, 2.0)))
+    write_lens_calibration(path, CALIBRATION)
+    assert "calibrated by" in printed_by(scale_command, scene, "--lens-calibration", path), "without poses"
+    assert read_focal_stack(scene / "a").focus_distances_m[1] == pytest.approx(1.96)
+    tmp_path = tmp_path / "merged"
     stack = replace(stack_at(tmp_path, (1.0, 2.0)), merged=True)
     for each in stack.slices:
         write_camera_rgb(tmp_path / each.path, np.zeros((6, 8, 3), np.float32), None)
@@ -230,11 +216,3 @@ def test_a_scene_is_calibrated_with_its_depth(tmp_path: Path) -> None:
     np.testing.assert_allclose(1.0 / read.depth_m(), expected, rtol=1e-5)
     assert stated_distances_m(read) == (1.0, 2.0)
     assert (tmp_path / "depth.png").is_file() and (tmp_path / "merge.png").is_file(), "pictures show the depth as it is now"
-
-
-def test_the_command_applies_a_calibration_without_poses(tmp_path: Path) -> None:
-    scene, path = tmp_path / "scene", tmp_path / "lens_calibration.json"
-    write_focal_stack(stack_at(scene / "a", (1.0, 2.0)))
-    write_lens_calibration(path, CALIBRATION)
-    assert "calibrated by" in printed_by(scale_command, scene, "--lens-calibration", path)
-    assert read_focal_stack(scene / "a").focus_distances_m[1] == pytest.approx(1.96)

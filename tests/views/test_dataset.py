@@ -61,7 +61,7 @@ def contents(folder: Path) -> dict[str, tuple[int, bytes]]:
     return {str(path.relative_to(folder)): (path.stat().st_ino, path.read_bytes()) for path in files}
 
 
-def test_the_manifest_describes_the_files(scenes: list[Path], tmp_path: Path) -> None:
+def test_the_manifest_describes_the_files_and_gives_stacks_by_part(scenes: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "out"
     written = write_dataset(scenes, out, PLAN)
     dataset = read_focal_stack_dataset(out)
@@ -76,31 +76,24 @@ def test_the_manifest_describes_the_files(scenes: list[Path], tmp_path: Path) ->
             data = (out / record.name / path).read_bytes()
             assert (hashlib.sha256(data).hexdigest(), len(data)) == (each.sha256, each.bytes)
     assert not (out / "unfinished.json").exists()
-
-
-def test_a_reader_gets_stacks_by_part(scenes: list[Path], tmp_path: Path) -> None:
-    dataset = write_dataset(scenes, tmp_path / "out", PLAN)
     train, test = dataset.focal_stacks("train"), dataset.focal_stacks("test")
     assert (len(train), len(test)) == (4, 1), "80 to 20"
     assert not {each.folder for each in train} & {each.folder for each in test}
     assert train[0].slice_rgb(0).shape == (*SIZE, 3) and train[0].exclusions()["moving"].any()
 
 
-def test_largest_blur_counts_what_is_not_excluded(tmp_path: Path) -> None:
+def test_largest_blur_and_radiance_scale_count_what_is_not_excluded(tmp_path: Path, scenes: list[Path]) -> None:
     """Columns 0 to 7 are excluded, so depth begins at column 8: 0.7 + 8 * 1.3 / 31 = 1.0355 m, ends at 2 m.
 
     The largest diameter is that of 2 m in the slice focused at 0.8 m: k (1 / 0.8 - 1 / 2) with k of the lens; N = ceil((c - 1) / 2).
     """
-    small_stack(tmp_path / "a" / "view_0")
-    record = write_dataset([tmp_path / "a"], tmp_path / "out", replace(PLAN, test_share=0.0)).stacks[0]
+    small_stack(tmp_path / "c" / "view_0")
+    record = write_dataset([tmp_path / "c"], tmp_path / "one", replace(PLAN, test_share=0.0)).stacks[0]
     nearest = LENS.focused_at(0.8)
     expected_px = nearest.coc_px_per_dioptre(SIZE[1]) * (1 / 0.8 - 1 / 2.0)
     assert record.largest_coc_px == pytest.approx(expected_px, rel=1e-5)
     assert record.excluded_shares["any"] == 8 / 32 and record.excluded_shares["moving"] == 4 / 32 and record.excluded_shares["board"] == 0.0
-
-
-def test_the_radiance_scale_is_one_number_for_all(scenes: list[Path], tmp_path: Path) -> None:
-    """The brightest pixel of all, 2.5 in every stack but 7 in one; half precision keeps both. With it, 7 maps to 2 * 7 / 7 - 1 = 1."""
+    # The brightest pixel of all, 2.5 in every stack but 7 in one; half precision keeps both. With it, 7 maps to 2 * 7 / 7 - 1 = 1.
     small_stack(tmp_path / "b" / "view_3", 3, brightest=7.0)
     assert write_dataset(scenes, tmp_path / "out", PLAN).radiance_scale == 7.0
     share = write_dataset(scenes, tmp_path / "half", replace(PLAN, radiance_scale="0.5")).radiance_scale
@@ -138,7 +131,9 @@ def test_the_split_is_by_viewpoint_and_repeatable() -> None:
         split_by_viewpoint(["s/a"], ("a",))
 
 
-def test_an_interrupted_run_goes_on(scenes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_run_goes_on_and_a_changed_source_is_written_again(
+    scenes: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """It breaks in the third stack; the next run keeps the two that are whole, file by file."""
     from capture.dataset import writer
 
@@ -160,19 +155,17 @@ def test_an_interrupted_run_goes_on(scenes: list[Path], tmp_path: Path, monkeypa
     dataset = write_dataset(scenes, out, PLAN)
     assert contents(out / "a" / "view_0") == before
     assert len(dataset.stacks) == 5 and not verify(dataset)
-
-
-def test_a_changed_source_is_written_again(scenes: list[Path], tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    write_dataset(scenes, out, PLAN)
     small_stack(scenes[0] / "view_1", seed=77)
-    before = contents(out / "a" / "view_0")
     with pytest.raises(InputError, match="exists already"):
         write_dataset(scenes, out, PLAN)
     dataset = write_dataset(scenes, out, PLAN, overwrite=True)
     assert contents(out / "a" / "view_0") == before
     assert (out / "a/view_1/registered/00.exr").read_bytes() == (scenes[0] / "view_1/registered/00.exr").read_bytes()
     assert not verify(dataset)
+    _spoil(out)
+    troubles = verify(dataset)
+    assert len(troubles) == 3
+    assert "a/view_0/depth.exr has another content" in troubles[0] and "b/view_4/registered/01.exr is missing" in troubles[2]
 
 
 def test_files_are_links_or_copies(scenes: list[Path], tmp_path: Path) -> None:
@@ -185,17 +178,14 @@ def test_files_are_links_or_copies(scenes: list[Path], tmp_path: Path) -> None:
     assert not verify(read_focal_stack_dataset(tmp_path / "linked")), "merging again replaces files, it does not change them"
 
 
-def test_verify_finds_what_changed(scenes: list[Path], tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    dataset = write_dataset(scenes, out, replace(PLAN, writing=StackWriting(copy=True)))
+def _spoil(out: Path) -> None:
     data = bytearray((out / "a/view_0/depth.exr").read_bytes())
     data[-5] ^= 1
+    (out / "a/view_0/depth.exr").unlink()
     (out / "a/view_0/depth.exr").write_bytes(data)
     (out / "b/view_4/registered/01.exr").unlink()
+    (out / "b/view_3/stack.json").unlink()
     (out / "b/view_3/stack.json").write_text("{}")
-    troubles = verify(dataset)
-    assert len(troubles) == 3
-    assert "a/view_0/depth.exr has another content" in troubles[0] and "b/view_4/registered/01.exr is missing" in troubles[2]
 
 
 def test_coc_maps_are_signed_and_half(tmp_path: Path) -> None:
@@ -262,18 +252,13 @@ def test_memory_does_not_grow_with_slices(tmp_path: Path) -> None:
 def large_stack(folder: Path, slices: int, size: tuple[int, int]) -> FocalStack:
     """One noisy picture for all slices: what is measured is memory."""
     rgb = np.random.default_rng(0).random((*size, 3)).astype(np.float32)
-    for index in range(slices):
-        write_camera_rgb(folder / f"registered/{index:02d}.exr", rgb, None)
+    focus_m = 1.0 / np.linspace(1.3, 0.5, slices)
+    listed = tuple(Slice(f"registered/{index:02d}.exr", float(focus)) for index, focus in enumerate(focus_m))
+    for each in listed:
+        write_camera_rgb(folder / each.path, rgb, None)
     depth_m = np.tile(np.linspace(0.7, 2.0, size[1], dtype=np.float32), (size[0], 1))
     write_merged(folder, rgb, np.ones(size, np.float32), np.ones(size, np.float32), depth_m)
-    focus_m = 1.0 / np.linspace(1.3, 0.5, slices)
-    stack = FocalStack(
-        folder,
-        tuple(Slice(f"registered/{index:02d}.exr", float(focus)) for index, focus in enumerate(focus_m)),
-        LENS,
-        registered=True,
-        merged=True,
-    )
+    stack = FocalStack(folder, listed, LENS, registered=True, merged=True)
     write_focal_stack(stack)
     write_exclusions(stack, {name: np.zeros(size, bool) for name in ("moving", "saturated", "border", "low_confidence", "board")})
     return stack

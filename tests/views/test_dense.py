@@ -77,27 +77,37 @@ def test_semi_global_costs_are_those_of_the_open_loops() -> None:
     assert np.abs(fast - aggregate_reference(costs, guide, rules).astype(int)).max() <= 8
 
 
-def test_labels_jump_where_the_guide_does() -> None:
+def test_planes_are_labelled_where_the_guide_and_costs_speak() -> None:
     """Costs tell the plane only at the far left and right; between them nothing but the picture says where one ends."""
     costs = np.full((12, 40, 9), 200, np.uint8)
     costs[:, :2, 2], costs[:, -2:, 6] = 0, 0
     guide = np.where(np.arange(40) < 27, 0.2, 0.7).astype(np.float32) * np.ones((12, 1), np.float32)
     labels = label_planes(costs, guide)
     np.testing.assert_array_equal(np.round(labels.index), np.where(np.arange(40) < 27, 2, 6) * np.ones((12, 1)))
-
-
-def test_margin_is_wide_where_costs_speak_and_nothing_where_they_do_not() -> None:
     costs = np.full((10, 10, 9), 255, np.uint8)
     assert label_planes(costs, np.zeros((10, 10), np.float32)).margin.max() == 0.0
     costs[..., 4] = 0
     assert label_planes(costs, np.zeros((10, 10), np.float32)).margin.min() >= 255.0
 
 
-def test_smoothing_is_that_of_full_matrices() -> None:
+def test_smoothing_is_that_of_full_matrices_and_stops_at_edges() -> None:
     values = RNG.uniform(0, 2, (13, 17, 2)).astype(np.float32)
     guide = (RNG.integers(0, 256, (13, 17, 3)) / 255).astype(np.float32)
     guide[0, 0] = 1.0
     np.testing.assert_allclose(smooth(values, guide, 50.0, 0.3), smooth_plainly(values, guide, 50.0, 0.3), atol=1e-5)
+    # The graph Laplacian has columns that sum to 0, so sums stay; an edge of 20 contrasts lets exp(-20) through.
+    values = RNG.uniform(0, 1, (24, 30, 1)).astype(np.float32)
+    guide = np.where(np.arange(30) < 15, 0.0, 1.0).astype(np.float32)[None, :, None] * np.ones((24, 1, 1), np.float32)
+    result = smooth(values, guide, 400.0, 0.05)
+    for side in (np.s_[:, :15], np.s_[:, 15:]):
+        assert result[side].mean() == pytest.approx(values[side].mean(), abs=1e-4)
+        assert result[side].std() < 0.2 * values[side].std()
+    guide = np.where(np.arange(40) < 20, 0.0, 1.0).astype(np.float32)[None, :, None] * np.ones((20, 1, 1), np.float32)
+    weights = np.zeros((20, 40), np.float32)
+    weights[:, 2], weights[:, 37] = 1.0, 1.0
+    values = np.where(np.arange(40) < 20, 1.0, 2.0).astype(np.float32) * np.ones((20, 1), np.float32)
+    filled = interpolate(np.where(weights > 0, values, 9.0).astype(np.float32), weights, guide, 400.0, 0.05)
+    np.testing.assert_allclose(filled, values, atol=1e-3)
 
 
 def smooth_plainly(values: np.ndarray, guide: np.ndarray, smoothness: float, contrast: float) -> np.ndarray:
@@ -118,40 +128,18 @@ def line_matrix(links: np.ndarray, strength: float) -> np.ndarray:
     return np.eye(len(links) + 1) + strength * differences.T @ (links[:, None] * differences)
 
 
-def test_smoothing_keeps_the_mean_and_stops_at_edges() -> None:
-    """The graph Laplacian has columns that sum to 0, so sums stay; an edge of 20 contrasts lets exp(-20) through."""
-    values = RNG.uniform(0, 1, (24, 30, 1)).astype(np.float32)
-    guide = np.where(np.arange(30) < 15, 0.0, 1.0).astype(np.float32)[None, :, None] * np.ones((24, 1, 1), np.float32)
-    result = smooth(values, guide, 400.0, 0.05)
-    for side in (np.s_[:, :15], np.s_[:, 15:]):
-        assert result[side].mean() == pytest.approx(values[side].mean(), abs=1e-4)
-        assert result[side].std() < 0.2 * values[side].std()
-
-
-def test_gaps_are_filled_from_their_own_side_of_an_edge() -> None:
-    guide = np.where(np.arange(40) < 20, 0.0, 1.0).astype(np.float32)[None, :, None] * np.ones((20, 1, 1), np.float32)
-    weights = np.zeros((20, 40), np.float32)
-    weights[:, 2], weights[:, 37] = 1.0, 1.0
-    values = np.where(np.arange(40) < 20, 1.0, 2.0).astype(np.float32) * np.ones((20, 1), np.float32)
-    filled = interpolate(np.where(weights > 0, values, 9.0).astype(np.float32), weights, guide, 400.0, 0.05)
-    np.testing.assert_allclose(filled, values, atol=1e-3)
-
-
-def test_weighted_medians_are_those_of_the_open_loops() -> None:
+def test_weighted_medians_are_those_of_the_open_loops_and_mend_a_fattened_edge() -> None:
     values, weights = (RNG.uniform(0.1, 2, (14, 15)).astype(np.float32) for _ in range(2))
     guide, where = RNG.uniform(0, 0.3, (14, 15, 3)).astype(np.float32), RNG.uniform(0, 1, (14, 15)) > 0.4
     fast = weighted_medians(values, weights, guide, where, 3, 0.1)
     np.testing.assert_array_equal(fast, weighted_medians_reference(values, weights, guide, where, 3, 0.1))
-
-
-def test_a_fattened_edge_goes_back_to_the_edge_of_the_picture() -> None:
     guide = np.where(np.arange(40) < 20, 0.1, 0.6).astype(np.float32)[None, :, None] * np.ones((20, 1, 3), np.float32)
     fat = np.where(np.arange(40) < 23, 1.5, 0.7).astype(np.float32) * np.ones((20, 1), np.float32)
     moved = weighted_medians(fat, np.ones_like(fat), guide, near_steps(fat, 5, 0.05), 6, 0.07)
     np.testing.assert_array_equal(moved, np.where(np.arange(40) < 20, 1.5, 0.7).astype(np.float32) * np.ones((20, 1), np.float32))
 
 
-def test_levels_bound_memory_and_end_at_the_full_picture() -> None:
+def test_levels_bound_memory_and_points_the_range() -> None:
     assert level_sizes(960, 640, 100, 1 << 27) == [(960, 640)]
     sizes = level_sizes(6000, 4000, 112, 1 << 27)
     assert sizes[-1] == (6000, 4000)
@@ -159,9 +147,12 @@ def test_levels_bound_memory_and_end_at_the_full_picture() -> None:
     assert all(abs(width / height - 1.5) < 0.01 for width, height in sizes)
     assert halvings(0.4, 0.1) == [0.2, 0.1] and halvings(0.1, 0.3) == [0.05]
     assert all(finer[0] <= 2.01 * coarser[0] for coarser, finer in pairwise(sizes))
+    depths = 1.0 / np.linspace(0.5, 1.5, 201)
+    farthest, nearest = SparseDepths(np.zeros((201, 2)), depths).dioptre_range(0.1)
+    assert (farthest, nearest) == pytest.approx((0.51 - 0.098, 1.49 + 0.098))
 
 
-def test_other_views_support_hide_or_contradict() -> None:
+def test_other_views_support_hide_or_contradict_and_change_trust() -> None:
     """A card at 0.8 m before a wall at 1.6 m: a wall that the reference sees in place of the card is contradicted by nobody (the
     neighbour has the card in the way), a card in place of the wall by all who see the wall."""
     scene = traced((wall(1.6), card(0.8, -0.08, 0.1)))
@@ -177,9 +168,6 @@ def test_other_views_support_hide_or_contradict() -> None:
     before = consistency(scene.views[0], np.full_like(scene.dioptre, 1 / 0.8), others, 0.02)
     far_from_card = np.s_[20:-20, 30:40]
     assert np.median(before.contradictions[far_from_card]) >= 3
-
-
-def test_consistency_raises_and_lowers_trust() -> None:
     trust = np.full((1, 3), 0.4, np.float32)
     seen = Consistency(np.array([[2, 0, 0]]), np.array([[0, 0, 3]]))
     np.testing.assert_allclose(with_consistency(trust, seen), [[0.7, 0.4, 0.08]], atol=1e-6)
@@ -188,7 +176,7 @@ def test_consistency_raises_and_lowers_trust() -> None:
     assert sure > 0.85 and unclear < 0.15 and unlike == 0.0
 
 
-def test_a_desk_comes_out_in_metres() -> None:
+def test_a_desk_comes_out_in_metres_and_confidence_tells_right_from_wrong() -> None:
     """0.1 px of parallax in the widest neighbour (170 px * 0.06 m) is 0.0098 dioptre. The plain card is off in part."""
     scene, found = desk(), desk_depth()
     grey = np.abs(scene.rgb[0] - [0.2, 0.25, 0.5]).max(axis=2) < 0.06
@@ -196,10 +184,6 @@ def test_a_desk_comes_out_in_metres() -> None:
     assert wrong(found, scene)[~grey].mean() < 0.05
     assert np.isfinite(found.depth_m).all() and found.depth_m.min() > 0
     assert found.confidence.min() >= 0.0 and found.confidence.max() <= 1.0
-
-
-def test_confidence_tells_right_from_wrong() -> None:
-    scene, found = desk(), desk_depth()
     on_edge = near_steps(scene.dioptre, 1, 0.05)  # where a pixel holds two depths, neither is wrong
     off, sure, unsure = wrong(found, scene), (found.confidence > 0.5) & ~on_edge, (found.confidence < 0.2) & ~on_edge
     assert off[sure].mean() < 0.01
@@ -229,12 +213,6 @@ def test_sparse_points_settle_what_has_no_texture() -> None:
     assert found.confidence.max() < 0.2, "a guess from five points is no measurement"
 
 
-def test_range_of_sparse_points() -> None:
-    depths = 1.0 / np.linspace(0.5, 1.5, 201)
-    farthest, nearest = SparseDepths(np.zeros((201, 2)), depths).dioptre_range(0.1)
-    assert (farthest, nearest) == pytest.approx((0.51 - 0.098, 1.49 + 0.098))
-
-
 def test_focus_finds_what_no_neighbour_sees() -> None:
     """Neighbours that look elsewhere: only focus knows; its depth is taken and named as the source."""
     scene = traced((wall(1.25),))
@@ -247,12 +225,7 @@ def test_focus_finds_what_no_neighbour_sees() -> None:
     assert 0.1 < np.median(found.confidence) <= 0.6
 
 
-def test_patch_match_says_why_it_cannot_run() -> None:
-    obstacle = patch_match_obstacle()
-    assert obstacle is None or "pycolmap" in obstacle or "GPU" in obstacle
-
-
-def test_undistorted_depth_is_seen_at_the_pixels_of_the_real_picture() -> None:
+def test_patch_match_is_seen_at_the_pixels_of_the_real_picture() -> None:
     """A ramp over the undistorted ray: the real picture must have it at its own, undistorted rays."""
     camera, k1 = Camera(WIDTH_PX, HEIGHT_PX, (FOCAL_PX, FOCAL_PX), (80.0, 56.0)), 0.1
     undistorted = Camera(200, 140, (FOCAL_PX, FOCAL_PX), (100.0, 70.0))
@@ -265,6 +238,8 @@ def test_undistorted_depth_is_seen_at_the_pixels_of_the_real_picture() -> None:
     assert np.isnan(depth[56, 5])
     prior = patch_match_prior(depth)
     assert len(prior.depth_m) == np.isfinite(depth).sum()
+    obstacle = patch_match_obstacle()
+    assert obstacle is None or "pycolmap" in obstacle or "GPU" in obstacle
 
 
 def test_a_range_that_reaches_infinity_gives_depths_before_it() -> None:
@@ -294,7 +269,7 @@ def test_lights_reach_as_far_as_half_the_largest_blur() -> None:
     assert not row[: 20 - 8].any() and not row[20 + 9 :].any()
 
 
-def test_focus_decides_where_views_do_not_and_yields_where_they_do() -> None:
+def test_focus_decides_where_views_do_not_and_costs_keep_their_range() -> None:
     vote = vote_for(6.0)  # 1.0 dioptre
     costs = np.full((*SHAPE, len(PLANES)), 255, np.uint8)
     sure = np.abs(PLANES - 0.7).argmin()
@@ -303,10 +278,7 @@ def test_focus_decides_where_views_do_not_and_yields_where_they_do() -> None:
     best = PLANES[costs.argmin(axis=-1)]
     assert abs(best[4, 4] - 1.0) < 0.026 and abs(best[2, 2] - 0.7) < 0.026
     assert np.ptp(costs[0]) == 0, "an untrusted pixel stays undecided"
-
-
-def test_blended_costs_keep_their_range() -> None:
-    """Full cost of both is full cost of the sum: shares add up to 1."""
+    # Full cost of both is full cost of the sum: shares add up to 1.
     vote = FocusVote(np.full(SHAPE, 1.0, np.float32), np.ones(SHAPE, np.float32), np.full(SHAPE, 2.0, np.float32), 0.1)
     costs = np.full((*SHAPE, len(PLANES)), 255, np.uint8)
     add_focus_votes(costs, PLANES, vote)
@@ -315,22 +287,16 @@ def test_blended_costs_keep_their_range() -> None:
     assert costs.min() == pytest.approx(255 * (1 - SHARE_OF_FOCUS), abs=1)
 
 
-def test_focus_vouches_only_for_what_it_found() -> None:
+def test_votes_of_focus_hold_for_what_it_found_and_keep_depths_when_smaller() -> None:
     vote = dataclasses.replace(vote_for(6.0), curvature=np.full(SHAPE, 2.0, np.float32))
     here, half_a_step, far = (agreement(vote, np.full(SHAPE, d, np.float32))[3, 3] for d in (1.0, 0.95, 0.7))
     assert here > half_a_step > far
     assert far < 1e-3
-
-
-def test_a_finished_focus_map_votes_with_its_confidence() -> None:
     index = np.array([[0.2, 4.5, 10.9]], np.float32)
     vote = focus_vote_of_map(index, np.full((1, 3), 0.8, np.float32), SLICE_DIOPTRES)
     np.testing.assert_allclose(vote.trust, [[0.0, 0.8, 0.0]])
     assert vote.dioptre[0, 1] == pytest.approx(1.15)
-
-
-def test_a_smaller_vote_keeps_depths_of_single_pixels() -> None:
-    """Averaging would invent a depth between two surfaces."""
+    # Averaging would invent a depth between two surfaces.
     dioptre = np.where(np.arange(8) < 4, 0.5, 1.5).astype(np.float32) * np.ones((6, 1), np.float32)
     vote = FocusVote(dioptre, np.ones(SHAPE, np.float32), np.ones(SHAPE, np.float32), 0.1)
     small = vote.resized(4, 3)

@@ -22,19 +22,12 @@ from capture.dense.sweep_view import BRIGHTEST, SweepView, structure_of
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 from tests.scenes.dense_references import scores_of_surface
-from tests.scenes.plane_sweep_scenes import FOCAL_PX, TracedViews, card, traced, wall
+from tests.scenes.plane_sweep_scenes import FOCAL_PX, card, traced, wall
 
 INNER = np.s_[8:-8, 12:-12]
 
 
-@cache
-def tilted_wall() -> TracedViews:
-    return traced((wall(1.0, tilt=0.6),))
-
-
-@cache
-def card_before_wall() -> TracedViews:
-    return traced((wall(1.6), card(0.8, -0.08, 0.1)))
+tilted_wall = cache(lambda: traced((wall(1.0, tilt=0.6),)))
 
 
 def turned_view(seed: int, distortion: tuple[float, float], turn_rad: float, size: tuple[int, int] = (28, 36)) -> SweepView:
@@ -47,7 +40,7 @@ def turned_view(seed: int, distortion: tuple[float, float], turn_rad: float, siz
     return SweepView(structure, Camera(size[1], size[0], (40.0, 41.0), (18.3, 13.6), pose), distortion)
 
 
-def test_compiled_scores_are_those_of_the_open_loops() -> None:
+def test_compiled_scores_are_those_of_the_open_loops_in_bands_of_rows_as_well() -> None:
     """Turned, distorted cameras of two sizes around an uneven surface; part of it is outside of every neighbour."""
     reference = turned_view(0, (0.05, -0.02), 0.1)
     neighbours = [turned_view(1, (0.03, 0.01), 0.1), turned_view(2, (0.0, 0.0), 0.2), turned_view(3, (-0.1, 0.0), 0.1, (24, 30))]
@@ -60,9 +53,6 @@ def test_compiled_scores_are_those_of_the_open_loops() -> None:
     assert 0.5 < seen.mean() < 1.0, "the test needs pixels that nobody sees"
     np.testing.assert_array_equal(seen, np.isfinite(plain))
     np.testing.assert_allclose(fast[seen], plain[seen], atol=2e-4)
-
-
-def test_scores_do_not_depend_on_the_band_of_rows() -> None:
     reference, neighbours = turned_view(0, (0.0, 0.0), 0.1), [turned_view(1, (0.0, 0.0), 0.1)]
     sweep = PlaneScores(reference, neighbours, Matching(radius_px=3), np.ones((28, 36), np.float32))
     whole = sweep.of_rows(0, 28, 0.0)
@@ -81,7 +71,7 @@ def test_planes_step_by_so_many_pixels_in_the_widest_neighbour() -> None:
     assert len(dioptre_planes(scene.views[0], scene.views[1:], (0.4, 2.0), 0.5, most=9)) == 9
 
 
-def test_neighbours_of_little_parallax_come_first_but_not_those_of_none() -> None:
+def test_neighbours_of_little_parallax_come_first_and_those_of_none_are_refused() -> None:
     """Over 1 dioptre a view moved by 0.06 m travels 10.2 px, one by 0.2 m 34 px, one by 0.001 m 0.2 px."""
     view = tilted_wall().views[0]
 
@@ -92,10 +82,6 @@ def test_neighbours_of_little_parallax_come_first_but_not_those_of_none() -> Non
 
     others = [moved(0.2), moved(0.001), moved(0.06)]
     assert by_parallax(view, others, (0.5, 1.5)) == [others[2], others[0], others[1]]
-
-
-def test_views_from_one_place_are_refused() -> None:
-    view = tilted_wall().views[0]
     with pytest.raises(InputError, match="parallax"):
         dioptre_planes(view, [view], (0.4, 2.0))
     with pytest.raises(InputError, match="neighbouring view"):
@@ -125,7 +111,7 @@ def test_refinement_follows_a_slant_that_planes_cut_in_steps() -> None:
 
 def test_a_point_hidden_from_half_of_the_views_is_found_by_the_others() -> None:
     """Left of the card a band of 0.06 m * 170 px * (1/0.8 - 1/1.6) = 6 px is hidden from the view on the right."""
-    scene = card_before_wall()
+    scene = traced((wall(1.6), card(0.8, -0.08, 0.1)))
     left_edge = int(np.argmax(scene.depth_m[0][56] < 1.0))
     planes = np.linspace(0.4, 1.5, 23)
     band = np.s_[20:-20, left_edge - 5 : left_edge - 2]

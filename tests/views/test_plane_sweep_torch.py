@@ -38,14 +38,9 @@ def assert_same_costs(device: str, reference: SweepView, neighbours: list[SweepV
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_turned_and_distorted_views(device: str) -> None:
+def test_turned_and_distorted_views_and_a_shell_around_a_surface(device: str) -> None:
     neighbours = [turned_view(1, (0.03, 0.01), 0.1), turned_view(2, (0.0, 0.0), 0.2), turned_view(3, (-0.1, 0.0), 0.1, (24, 30))]
-    planes = np.linspace(0.4, 2.0, 7)
-    assert_same_costs(device, turned_view(0, (0.05, -0.02), 0.1), neighbours, planes, matching=Matching(2, 2, 0.01))
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_a_shell_around_a_surface(device: str) -> None:
+    assert_same_costs(device, turned_view(0, (0.05, -0.02), 0.1), neighbours, np.linspace(0.4, 2.0, 7), matching=Matching(2, 2, 0.01))
     scene = traced((wall(1.6, tilt=0.3), card(0.8, -0.1, 0.06)), noise=0.01)
     assert_same_costs(device, scene.views[0], scene.views[1:], np.array([-0.02, 0.0, 0.02]), base_dioptre=scene.dioptre)
 

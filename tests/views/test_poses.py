@@ -46,7 +46,7 @@ def stack_in(folder: Path, grey: float = 0.1, focus_m: float | None = 0.6) -> Fo
     return stack
 
 
-def test_views_of_one_reference_focus_share_a_camera(tmp_path: Path) -> None:
+def test_views_of_one_reference_focus_share_a_camera_calibrated_or_not(tmp_path: Path) -> None:
     """Their focal length in pixels is the same; another focus has another, f d / (d - f)."""
     stacks = [stack_in(tmp_path / name, focus_m=focus) for name, focus in (("a", 0.6), ("b", 0.8), ("c", 0.6))]
     numbers, priors = stack_cameras(stacks, "auto")
@@ -56,10 +56,7 @@ def test_views_of_one_reference_focus_share_a_camera(tmp_path: Path) -> None:
     assert stack_cameras(stacks, "shared")[0] == [0, 0, 0]
     unknown = [stack_in(tmp_path / name, focus_m=None) for name in ("d", "e")]
     assert stack_cameras(unknown, "auto") == ([0, 0], [None])
-
-
-def test_a_calibrated_focus_does_not_part_cameras(tmp_path: Path) -> None:
-    """Calibration moves the focus of each stack a little; what was stated decides."""
+    # Calibration moves the focus of each stack a little; what was stated decides.
     stacks = []
     for name, found_m in (("a", 0.612), ("b", 0.618)):
         stack = stack_in(tmp_path / name, focus_m=0.6)
@@ -68,7 +65,7 @@ def test_a_calibrated_focus_does_not_part_cameras(tmp_path: Path) -> None:
     assert stack_cameras(stacks, "auto")[0] == [0, 0]
 
 
-def test_pictures_of_one_size_share_a_camera(tmp_path: Path) -> None:
+def test_pictures_of_one_size_share_a_camera_and_five_of_them_a_second_term(tmp_path: Path) -> None:
     for name, width in (("a", 40), ("b", 40), ("c", 50)):
         cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros((30, width, 3), np.uint8))
     files = pictures_in(tmp_path)
@@ -76,9 +73,6 @@ def test_pictures_of_one_size_share_a_camera(tmp_path: Path) -> None:
     assert picture_cameras(files, "auto")[0] == [0, 1, 2]
     with pytest.raises(InputError, match="pictures of one size"):
         picture_cameras(files, "shared")
-
-
-def test_two_terms_of_distortion_need_five_pictures_of_a_camera() -> None:
     assert camera_model_for([0] * 5, "auto") == "RADIAL"
     assert camera_model_for([0] * 5 + [1], "auto") == "SIMPLE_RADIAL"
     assert camera_model_for([0], "RADIAL") == "RADIAL"
@@ -127,14 +121,11 @@ def seen_from(positions_m: list[tuple[float, float, float]], points: np.ndarray,
     return SparseModel(tuple(views), points, np.zeros(len(points)), observations, np.zeros((len(observations), 2)), None, left_out)
 
 
-def test_parallax_is_the_widest_angle_at_a_point() -> None:
+def test_parallax_and_left_out_pictures_decide_over_a_model() -> None:
     """From 1 to the left and 1 to the right, at a distance of 10, a point is seen under 2 atan 0.1."""
     model = seen_from([(-1.0, 0.0, 0.0), (0.2, 0.0, 0.0), (1.0, 0.0, 0.0)], np.array([[0.0, 0.0, 10.0]] * 3))
     assert median_parallax_deg(model) == pytest.approx(np.degrees(2.0 * np.arctan(0.1)))
     assert weak_model_message(model) is None
-
-
-def test_weak_models_are_refused_in_words() -> None:
     points = np.array([[0.0, 0.0, 100.0]])
     narrow = seen_from([(0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.0, 0.0, 9.0)], points)
     assert "farther sideways" in str(weak_model_message(narrow))
@@ -165,33 +156,22 @@ def test_the_death_of_colmap_is_one_sentence(tmp_path: Path) -> None:
         run_colmap(tmp_path, 1)
 
 
-def test_an_abort_is_named_by_its_signal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_death_of_colmap_and_its_lack_are_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "dying_worker.py").write_text('import os\nprint(\'{"stage": "matches", "done": 1, "total": 3}\', flush=True)\nos.abort()\n')
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(colmap, "_WORKER", "dying_worker")
     monkeypatch.setattr(colmap, "find_spec", lambda name: name)
     with pytest.raises(InputError, match="COLMAP stopped with SIGABRT while matching"):
         run_colmap(tmp_path, 3)
-
-
-def test_without_pycolmap_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(colmap, "find_spec", {}.get)
     with pytest.raises(MissingExtraError, match=r"mrbokeh\[capture\]"):
         run_colmap(tmp_path, 3)
 
 
-def test_finished_poses_are_kept(tmp_path: Path) -> None:
-    """Nothing else is in the folder, so anything but reading would fail."""
-    write_sparse_model(tmp_path / "reconstruction", seen_from([(0.0, 0.0, 0.0)], np.array([[0.0, 0.0, 1.0]])))
-    assert find_scene_poses(tmp_path).views[0].name == "v0"
-    with pytest.raises(InputError, match="capture ingest"):
-        find_scene_poses(tmp_path, PoseSettings(overwrite=True))
-
-
-def test_mistakes_are_named(tmp_path: Path) -> None:
-    stack_in(tmp_path / "a")
+def test_mistakes_are_named_and_finished_poses_kept(tmp_path: Path) -> None:
+    stack_in(tmp_path / "scene" / "a")
     with pytest.raises(InputError, match="one stack: camera poses need at least 2"):
-        find_scene_poses(tmp_path)
+        find_scene_poses(tmp_path / "scene")
     with pytest.raises(InputError, match="found 0"):
         find_picture_poses(tmp_path, tmp_path / "out")
     with pytest.raises(InputError, match="there is none"):
@@ -200,6 +180,12 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
         PoseSettings(mapper="sequential")
     with pytest.raises(InputError, match="either a SCENE"):
         printed_by(poses.poses_command, tmp_path, "--images", tmp_path)
+    # Nothing else is in the folder, so anything but reading would fail.
+    kept = tmp_path / "kept"
+    write_sparse_model(kept / "reconstruction", seen_from([(0.0, 0.0, 0.0)], np.array([[0.0, 0.0, 1.0]])))
+    assert find_scene_poses(kept).views[0].name == "v0"
+    with pytest.raises(InputError, match="capture ingest"):
+        find_scene_poses(kept, PoseSettings(overwrite=True))
 
 
 @needs_colmap
@@ -255,15 +241,12 @@ def small_model() -> SparseModel:
     return SparseModel(views, points, np.array([0.1, 0.2, 0.3]), observations, xy_px, None, ("c",))
 
 
-def test_depths_of_the_points_that_a_view_observes() -> None:
+def test_depths_and_scale_of_what_a_view_observes() -> None:
     model = small_model()
     xy_px, depth = model.depths_in("b")
     np.testing.assert_allclose(depth, [5.5, 6.5], err_msg="z + 0.5 of points 2 and 1")
     np.testing.assert_allclose(xy_px, model.view("b").project(model.points[[2, 1]])[0])
     np.testing.assert_allclose(model.views[1].centre, [1.0, 0.0, -0.5])
-
-
-def test_a_scaled_model_looks_the_same() -> None:
     model = replace(small_model(), metres_per_unit=0.25)
     metric = model.scaled()
     np.testing.assert_allclose(metric.depths_in("b")[1], [1.375, 1.625])
@@ -272,16 +255,13 @@ def test_a_scaled_model_looks_the_same() -> None:
     assert metric.scaled().metres_per_unit == 1.0
     with pytest.raises(InputError, match="capture scale"):
         small_model().scaled()
-
-
-def test_unknown_and_left_out_views_are_told_apart() -> None:
     with pytest.raises(InputError, match=r"left out.*choose one of a, b"):
         small_model().view("c")
     with pytest.raises(InputError, match="got 'd':"):
         small_model().view("d")
 
 
-def test_sparse_models_survive_the_disk(tmp_path: Path) -> None:
+def test_sparse_models_and_their_scale_survive_the_disk(tmp_path: Path) -> None:
     model = small_model()
     write_sparse_model(tmp_path, model)
     read = read_sparse_model(tmp_path)
@@ -291,10 +271,6 @@ def test_sparse_models_survive_the_disk(tmp_path: Path) -> None:
     for before, after in zip(model.views, read.views, strict=True):
         assert after.name == before.name and after.distortion == before.distortion
         np.testing.assert_array_equal(after.camera.camera_from_world, before.camera.camera_from_world)
-
-
-def test_the_scale_is_read_with_the_model_and_goes_with_it(tmp_path: Path) -> None:
-    write_sparse_model(tmp_path, small_model())
     (tmp_path / "scale.json").write_text(json.dumps({"metres_per_unit": 0.5}))
     assert read_sparse_model(tmp_path).metres_per_unit == 0.5
     write_sparse_model(tmp_path, small_model())

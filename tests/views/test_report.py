@@ -6,6 +6,7 @@ from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -86,17 +87,11 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def reported(report: SceneReport) -> Path:
-    """The scene's folder, after its report was written."""
-    return report.scene
-
-
-@pytest.fixture(scope="module")
 def report(scene: Path) -> SceneReport:
     return report_scene(scene, REBLUR)
 
 
-def test_the_page_is_one_file_that_needs_nothing_else(report: SceneReport) -> None:
+def test_the_page_is_one_file_that_needs_nothing_else_and_its_numbers_are_json(report: SceneReport) -> None:
     reported = report.scene
     page = Page((reported / "report.html").read_text(encoding="utf-8"))
     assert not [tag for tag in page.open if tag not in ("html", "body")], "all tags are closed"
@@ -106,9 +101,6 @@ def test_the_page_is_one_file_that_needs_nothing_else(report: SceneReport) -> No
     assert page.tags.count("img") - places in (14, 17)
     assert page.tags.count("canvas") == 1
     assert "viewport" in (reported / "report.html").read_text(encoding="utf-8")
-
-
-def test_the_numbers_beside_the_page_are_json(reported: Path) -> None:
     document = json.loads((reported / "report.json").read_text(), parse_constant=lambda name: pytest.fail(f"{name} is no JSON"))
     assert document["format"] == "mrbokeh-capture-report"
     assert len(document["stacks"]["view_0"]["slices"]) == len(FOCUS_M)
@@ -116,20 +108,14 @@ def test_the_numbers_beside_the_page_are_json(reported: Path) -> None:
     assert document["scales_metres_per_unit"] == {"board": 1.0, "focus": 1.03}
     for gate in document["gates"]:
         assert gate["verdict"] in ("passed", "failed", "absent") and gate["why"] and gate["advice"] and gate["limit"]
-
-
-def test_verdicts_of_a_partial_scene(report: SceneReport) -> None:
-    """What fails is what was made wrong: a stack that is not merged, and scales 3 % apart. Absent, not failed: no registration was kept,
-    and 160 x 107 pixels have too few flat blocks."""
-    assert {each.name for each in report.failures} == {"all stacks merged", "scales agree"}
-    absent = {each.name for each in report.gates if each.verdict == "absent"}
-    assert absent == {"registration held", "no seams"}
-
-
-def test_the_report_leaves_exclusion_masks_with_the_stack(reported: Path) -> None:
     masks = read_focal_stack(reported / "view_0").exclusions()
     assert set(masks) == set(REASONS)
     assert all(mask.shape == (107, 160) for mask in masks.values())
+    # What fails is what was made wrong: a stack that is not merged, and scales 3 % apart. Absent, not failed: no registration was kept,
+    # and 160 x 107 pixels have too few flat blocks.
+    assert {each.name for each in report.failures} == {"all stacks merged", "scales agree"}
+    absent = {each.name for each in report.gates if each.verdict == "absent"}
+    assert absent == {"registration held", "no seams"}
 
 
 def test_strict_is_told_by_the_exit_code(tmp_path: Path) -> None:
@@ -153,7 +139,7 @@ def test_a_stack_without_lens_is_judged_by_what_is_there(tmp_path: Path) -> None
     assert gates["no slice missing"].verdict == "absent"
 
 
-def test_gaps_order_and_doubles() -> None:
+def test_registration_and_spacing_are_read() -> None:
     """Dioptres 2.0, 1.8 ... in equal steps; then without one, with two exchanged, with one twice."""
     even = [1.0 / d for d in (2.0, 1.8, 1.6, 1.4, 1.2, 1.0)]
     assert focus_spacing(even).is_even
@@ -163,10 +149,7 @@ def test_gaps_order_and_doubles() -> None:
     assert focus_spacing(even[:3] + even[2:]).doubled == (3,)
     assert focus_spacing([1.0 / d for d in (2.0, 1.5, 1.13, 0.84, 0.63)]).is_even, "steps that shrink by a quarter each"
     assert focus_spacing([0.5, 1.0, float("inf")]).is_even, "0 dioptres are a focus"
-
-
-def test_registration_is_read_as_movement() -> None:
-    """A turn of 2 mrad about the middle, a shift of (3, -1) px and 1 % of enlargement about the middle, from their matrices."""
+    # A turn of 2 mrad about the middle, a shift of (3, -1) px and 1 % of enlargement about the middle, from their matrices.
     middle = np.array([80.0, 50.0])
     turn = np.array([[np.cos(2e-3), -np.sin(2e-3)], [np.sin(2e-3), np.cos(2e-3)]])
     matrices = [
@@ -219,9 +202,8 @@ def test_a_jump_or_a_pair_that_does_not_match_fails_registration(scene: Path, tm
     assert verdict([0.0, 0.0, 0.0], (0.99, 0.7)) == "failed"
 
 
-def test_low_frequency_gain_sees_through_blur() -> None:
+def test_gain_and_focus_curve() -> None:
     """Light moved about by a wide blur and 3 % more of it; a saturated corner does not count."""
-    import cv2
 
     sharp = np.random.default_rng(0).random((120, 160, 3)).astype(np.float32)
     blurred = np.float32(1.03) * cv2.GaussianBlur(sharp, (0, 0), 3.0)
@@ -229,10 +211,7 @@ def test_low_frequency_gain_sees_through_blur() -> None:
     blurred[:30, :30], counted[:30, :30] = 9.0, False
     assert low_frequency_gain(blurred, sharp, counted) == pytest.approx(1.03, abs=0.005)
     assert np.isnan(low_frequency_gain(blurred, sharp, np.zeros_like(counted)))
-
-
-def test_the_focus_curve_counts_trusted_pixels() -> None:
-    """A quarter of the pixels at the first slice, half at slice 2, a quarter that nobody trusts."""
+    # A quarter of the pixels at the first slice, half at slice 2, a quarter that nobody trusts.
     index = np.repeat(np.array([[0.0, 2.1, 1.9, 3.0]], np.float32), 4, axis=0)
     confidence = np.repeat(np.array([[1.0, 1.0, 1.0, 0.0]], np.float32), 4, axis=0)
     curve = focus_curve(index, confidence, 4)
@@ -276,7 +255,7 @@ def test_gates_of_a_reconstruction() -> None:
     assert scales_in({"metres_per_unit": 2.0, "method": "board"}) == {"board": 2.0}
 
 
-def test_the_3d_view_holds_cameras_and_points() -> None:
+def test_drawings_hold_cameras_points_and_what_is_finite() -> None:
     """Camera b stands 0.1 right of a; a's picture, 0.8 x 0.535 of its distance wide and high, is seen upright: y grows downwards."""
     model = sparse_model(("a", "b</script>"))
     data = scene_of(model)
@@ -287,9 +266,6 @@ def test_the_3d_view_holds_cameras_and_points() -> None:
     assert corners[3, 1] > corners[0, 1] and len(data["points"]) == 3 * 8 and data["unit"] == "units"
     html = poses_view(model)
     assert html.count("</script>") == 2, "a name cannot end the script"
-
-
-def test_charts_draw_what_is_finite() -> None:
     drawn = chart(Axes("dB", "slice", "dB", (30.0, 45.0)), [0.0, 1.0, 2.0], {"a<b": [40.0, float("nan"), 42.0], "b": [1.0, 2.0, 3.0]})
     assert drawn.count("<circle") == 5 and "a&lt;b" in drawn
     assert not re.search("nan|inf", drawn)

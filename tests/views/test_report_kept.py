@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from capture.commands.report import report_command
 from capture.report import report_cache, stack_view
 from capture.report.examination import examine
 from capture.report.findings import FocusCurve, SliceFindings, StackFindings, findings_document, findings_from
@@ -75,7 +76,7 @@ def reported(scene: Path) -> Path:
     return scene
 
 
-def test_an_examination_reads_each_slice_once(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_examination_reads_each_slice_once_and_is_read_back_exactly(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is clipped in any slice is known when all have been seen, and is not read for."""
     opened: list[str] = []
     read = stack_view.read_slice
@@ -83,41 +84,34 @@ def test_an_examination_reads_each_slice_once(scene: Path, monkeypatch: pytest.M
     stack = read_focal_stack(scene / "view_0")
     examine(stack_view.StackView(stack, 160), Reblur(Counting(), "none"))
     assert opened == [Path(each.path).name for each in stack.slices]
+    # Also what is not finite, for which JSON has no number.
+    stack: FocalStack = read_focal_stack(scene / "view_0")
+    fit = SliceFit(*(Change(0.1 * k, float("inf") if k == 3 else 1.0 / (3.0 + k)) for k in range(7)))
+    slices = (SliceFindings(0, 1.0 / 3.0, 0.0, 0.5, 7.25, float("inf"), 20.1, fit), SliceFindings(1, 1.5, 0.0, 1.0))
+    curve = FocusCurve(np.array([1 / 3, 2 / 3]), 0.7, 0.1, 0.2)
+    pairs = (NeighbourDisplacement(0, 0.1 / 3.0, 0.02, (3, 4)), NeighbourDisplacement(1, None, float("inf"), (160, 107)))
+    picture = PictureFindings(1.0 / 300.0, None, float("inf"), 1.0 / 3.0, (320, 214))
+    findings = StackFindings(stack, (160, 107), (320, 214), slices, curve, 0.01, None, picture, pairs)
+    write_json(scene / "there.json", findings_document(findings))
+    text = (scene / "there.json").read_text(encoding="utf-8")
+    assert "Infinity" not in text and "NaN" not in text
+    back = findings_from(read_json(scene / "there.json", "findings"), stack)
+    np.testing.assert_array_equal(back.curve.shares, findings.curve.shares)
+    assert replace(back, curve=findings.curve) == findings
 
 
-def test_an_interrupted_report_goes_on(reported: Path, tmp_path: Path) -> None:
+def test_an_interrupted_report_goes_on_and_a_finished_one_costs_nothing(reported: Path, tmp_path: Path) -> None:
     """Stopped in the second stack: the first is not rendered again, and the pages are those of a report that was not stopped."""
-    stopped = scene_in(tmp_path / "other")
+    before, stopped = pages(reported), scene_in(tmp_path / "other")
     with pytest.raises(KeyboardInterrupt):
         report_scene(stopped, Reblur(Counting(stop_before=OF_STACK + 4), "none"), 160)
     assert not (stopped / "report.html").exists()
     assert report(stopped) == OF_STACK
-    assert pages(stopped) == pages(reported)
-
-
-def test_a_finished_report_costs_nothing_and_is_the_same(reported: Path) -> None:
-    before = pages(reported)
-    assert report(reported) == 0
-    assert pages(reported) == before
-    assert not list(reported.rglob("*.part*"))
-
-
-def test_overwrite_examines_everything_again(reported: Path) -> None:
-    before = pages(reported)
-    assert report(reported, overwrite=True) == 2 * OF_STACK
-    assert pages(reported) == before
-
-
-def test_a_stack_that_was_merged_again_is_examined_again(reported: Path) -> None:
-    """An all-in-focus picture a tenth darker: the slices of that stack are 1/0.9 as bright against it, those of the other as they were."""
-    stack = read_focal_stack(reported / "view_1")
-    write_camera_rgb(stack.all_in_focus_path, np.float32(0.9) * stack.all_in_focus_camera_rgb(), None, half=False)
-    before = read_json(reported / "report.json", "the report")["stacks"]
-    assert report(reported) == OF_STACK
-    after = read_json(reported / "report.json", "the report")["stacks"]
-    assert after["view_0"] == before["view_0"]
-    for old, new in zip(before["view_1"]["slices"], after["view_1"]["slices"], strict=True):
-        assert new["gain"] == pytest.approx(old["gain"] / 0.9, rel=1e-3)
+    assert pages(stopped) == before
+    for overwrite, renderings in ((False, 0), (True, 2 * OF_STACK)):
+        assert report(stopped, overwrite=overwrite) == renderings
+        assert pages(stopped) == before
+    assert not list(stopped.rglob("*.part*"))
 
 
 def touch(name: str) -> Callable[[Path], None]:
@@ -142,25 +136,17 @@ def spoiled(stack: Path) -> None:
     (stack / "report" / "found.json").write_text('{"signature": ', encoding="utf-8")
 
 
-@pytest.mark.parametrize(
-    "change",
-    [touch("stack.json"), touch("depth.exr"), touch("registered/03.exr"), registered_otherwise, picture_lost, spoiled],
-    ids=["stack.json", "depth", "slice", "registration", "picture lost", "spoiled"],
-)
-def test_whatever_findings_depend_on_is_looked_at(change: Callable[[Path], None], reported: Path) -> None:
-    change(reported / "view_0")
-    assert report(reported) == OF_STACK
-    assert report(reported) == 0
-
-
-def test_another_width_renderer_or_version_finds_anew(reported: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_whatever_findings_depend_on_is_looked_at(reported: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for change in (touch("stack.json"), touch("depth.exr"), touch("registered/03.exr"), registered_otherwise, picture_lost, spoiled):
+        change(reported / "view_0")
+        assert [report(reported) for _ in range(2)] == [OF_STACK, 0], change
     assert report(reported, width=80) == 2 * OF_STACK
     assert report(reported, width=80, name="other") == 2 * OF_STACK
     monkeypatch.setattr(report_cache, "VERSION", report_cache.VERSION + 1)
     assert report(reported, width=80, name="other") == 2 * OF_STACK
 
 
-def test_masks_are_made_again_without_a_rendering(reported: Path) -> None:
+def test_only_a_stack_that_changed_is_examined_again_and_masks_without_a_rendering(reported: Path) -> None:
     """A board that was found later: in exclusion.exr, beside what moved, which is known already."""
     stack = read_focal_stack(reported / "view_0")
     before = stack.exclusions()
@@ -174,23 +160,15 @@ def test_masks_are_made_again_without_a_rendering(reported: Path) -> None:
     after = stack.exclusions()
     assert after["board"][20:40, 20:50].all()
     np.testing.assert_array_equal(after["moving"], before["moving"])
-
-
-def test_findings_are_read_back_exactly(scene: Path) -> None:
-    """Also what is not finite, for which JSON has no number."""
-    stack: FocalStack = read_focal_stack(scene / "view_0")
-    fit = SliceFit(*(Change(0.1 * k, float("inf") if k == 3 else 1.0 / (3.0 + k)) for k in range(7)))
-    slices = (SliceFindings(0, 1.0 / 3.0, 0.0, 0.5, 7.25, float("inf"), 20.1, fit), SliceFindings(1, 1.5, 0.0, 1.0))
-    curve = FocusCurve(np.array([1 / 3, 2 / 3]), 0.7, 0.1, 0.2)
-    pairs = (NeighbourDisplacement(0, 0.1 / 3.0, 0.02, (3, 4)), NeighbourDisplacement(1, None, float("inf"), (160, 107)))
-    picture = PictureFindings(1.0 / 300.0, None, float("inf"), 1.0 / 3.0, (320, 214))
-    findings = StackFindings(stack, (160, 107), (320, 214), slices, curve, 0.01, None, picture, pairs)
-    write_json(scene / "there.json", findings_document(findings))
-    text = (scene / "there.json").read_text(encoding="utf-8")
-    assert "Infinity" not in text and "NaN" not in text
-    back = findings_from(read_json(scene / "there.json", "findings"), stack)
-    np.testing.assert_array_equal(back.curve.shares, findings.curve.shares)
-    assert replace(back, curve=findings.curve) == findings
+    # An all-in-focus picture a tenth darker: the slices of that stack are 1/0.9 as bright against it, those of the other as they were.
+    stack = read_focal_stack(reported / "view_1")
+    write_camera_rgb(stack.all_in_focus_path, np.float32(0.9) * stack.all_in_focus_camera_rgb(), None, half=False)
+    before = read_json(reported / "report.json", "the report")["stacks"]
+    assert report(reported) == OF_STACK
+    after = read_json(reported / "report.json", "the report")["stacks"]
+    assert after["view_0"] == before["view_0"]
+    for old, new in zip(before["view_1"]["slices"], after["view_1"]["slices"], strict=True):
+        assert new["gain"] == pytest.approx(old["gain"] / 0.9, rel=1e-3)
 
 
 def held_bytes() -> int:
@@ -216,8 +194,6 @@ def test_finished_stacks_hold_neither_pictures_nor_maps(reported: Path) -> None:
 
 def test_the_command_tells_what_was_kept(tmp_path: Path) -> None:
     """Examined, kept, examined again. Without a lens nothing is rendered."""
-    from capture.commands.report import report_command
-
     write_focal_stack(replace(write_stack(tmp_path / "view_0", traced()), lens=None))
     told = [printed_by(report_command, tmp_path, *more) for more in ([], [], ["--overwrite"])]
     assert ["1 of 1 stacks were examined before" in each for each in told] == [False, True, False]

@@ -176,19 +176,16 @@ def test_each_fault_fails_its_gate_and_is_shown(
     assert f"x {x}, y {y}" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-def test_crops_are_at_100_percent_beside_the_slices(tmp_path: Path) -> None:
+def test_crops_are_at_100_percent_beside_the_slices_on_both_sides_of_a_seam(tmp_path: Path) -> None:
     """Of the lost disc: 160 px of the picture around the block, and of the slice that is sharpest there, which is slice 0."""
-    report = report_of(tmp_path, lost_disc())
+    report = report_of(tmp_path / "disc", lost_disc())
     shown = places(report, SHARP.name)[0]
     assert [each.caption for each in shown.pictures] == ["all in focus", "slice 0, the sharpest here"]
     crops = [read_image(each.path) for each in shown.pictures]
     assert all(each.shape == (160, 160, 3) for each in crops)
     inside = np.s_[69:91, 69:91]  # The block lies in the middle of a crop that does not touch the border.
     assert crops[0][inside].std() < 0.6 * crops[1][inside].std()
-
-
-def test_both_sides_of_a_seam_are_shown(tmp_path: Path) -> None:
-    """A jigsaw on the border between slices 1 and 2, at column 300."""
+    # A jigsaw on the border between slices 1 and 2, at column 300.
     captions = [each.caption for each in places(report_of(tmp_path, jigsaw()), SEAMS.name)[0].pictures]
     assert [each.split(", contrast")[0] for each in captions] == ["all in focus", "slice 1, merged here", "slice 2, merged here"]
     assert len({each.split(", contrast")[1] for each in captions}) == 1, "seen with one contrast"
@@ -201,7 +198,7 @@ def test_measured_flux_supports_what_no_slice_shows(tmp_path: Path) -> None:
         assert gate(report_of(tmp_path / name, made, {"drawn": 1, "largest_supported": largest}), LIGHT.name).verdict == verdict
 
 
-def test_a_shift_is_measured() -> None:
+def test_shifts_and_turns_are_measured_where_there_is_data() -> None:
     """2 px to the right between slices 1 and 2, and back again; 0 between the others, to a tenth of a pixel."""
     evidence = DisplacementEvidence()
     for rgb in shifted_slice()[0]:
@@ -211,10 +208,7 @@ def test_a_shift_is_measured() -> None:
     assert second.off_px == pytest.approx(2.0, abs=0.15) and second.exceeds(1.0)
     assert third.off_px == pytest.approx(2.0, abs=0.15)
     assert evidence.places(3.0)[1].off_px == pytest.approx(3.0 * (second.off_px or 0.0)), "in pixels of the stored pictures"
-
-
-def test_a_turn_is_measured_as_what_it_moves() -> None:
-    """6 mrad about the middle move a pixel at distance r by 0.006 r: the root mean square over the textured rows lies near 1 px."""
+    # 6 mrad about the middle move a pixel at distance r by 0.006 r: the root mean square over the textured rows lies near 1 px.
     middle = np.array([WIDTH_PX / 2 - 0.5, HEIGHT_PX / 2 - 0.5])
     turn = cv2.getRotationMatrix2D(tuple(middle), float(np.rad2deg(0.006)), 1.0)
     turned = cv2.warpAffine(surface(), turn, (WIDTH_PX, HEIGHT_PX), flags=cv2.INTER_CUBIC, borderMode=cv2.BORDER_REFLECT)
@@ -224,10 +218,7 @@ def test_a_turn_is_measured_as_what_it_moves() -> None:
     y, x = np.mgrid[32:FLAT_FROM_ROW, 32 : WIDTH_PX - 32]
     expected_px = 0.006 * np.sqrt(np.mean((x - middle[0]) ** 2 + (y - middle[1]) ** 2))
     assert evidence.places()[0].off_px == pytest.approx(expected_px, rel=0.1)
-
-
-def test_what_has_no_data_is_not_compared() -> None:
-    """Where the second slice lacks data it shows the first moved by 5 px: not looked at."""
+    # Where the second slice lacks data it shows the first moved by 5 px: not looked at.
     other, usable = surface().copy(), np.ones((HEIGHT_PX, WIDTH_PX), bool)
     other[:, :300], usable[:, :300] = np.roll(surface(), 5, axis=1)[:, :300], False
     evidence = DisplacementEvidence()
@@ -256,26 +247,15 @@ UNKNOWN = float("inf")
 @pytest.mark.parametrize(
     ("residuals_px", "pairs", "verdict"),
     [
-        ([0.3, 0.3, 0.2], ((0.2, 0.1), (1.4, 0.3)), "failed"),
-        ([0.3, 0.3, 0.2], ((0.2, 0.1), (1.4, 0.6)), "passed"),
-        ([0.3, 4.0, 4.0], ((0.2, 0.1), (5.8, 2.5)), "failed"),
-        ([None, None, None], ((5.8, 2.5), (5.8, 2.5)), "absent"),
-        ([9.0, 9.0, 9.0], ((0.2, 0.1), (0.3, 0.1)), "passed"),
-        ([0.3, 4.0, 4.0], ((0.2, 0.1), (None, UNKNOWN)), "failed"),
-        ([4.0, 4.0, 0.5], ((0.2, 0.1), (None, UNKNOWN)), "passed"),
-        ([None, None, None], ((None, UNKNOWN), (None, UNKNOWN)), "absent"),
-        ([0.3, 0.3, None], ((0.2, 0.1), (None, UNKNOWN)), "passed"),
-    ],
-    ids=[
-        "apart",
-        "by chance",
-        "not told by patches",
-        "told by nothing",
-        "measured wins",
-        "pairs disagree",
-        "another pair is wrong",
-        "by the model alone",
-        "one by the model",
+        pytest.param([0.3, 0.3, 0.2], ((0.2, 0.1), (1.4, 0.3)), "failed", id="apart"),
+        pytest.param([0.3, 0.3, 0.2], ((0.2, 0.1), (1.4, 0.6)), "passed", id="by chance"),
+        pytest.param([0.3, 4.0, 4.0], ((0.2, 0.1), (5.8, 2.5)), "failed", id="not told by patches"),
+        pytest.param([None, None, None], ((5.8, 2.5), (5.8, 2.5)), "absent", id="told by nothing"),
+        pytest.param([9.0, 9.0, 9.0], ((0.2, 0.1), (0.3, 0.1)), "passed", id="measured wins"),
+        pytest.param([0.3, 4.0, 4.0], ((0.2, 0.1), (None, UNKNOWN)), "failed", id="pairs disagree"),
+        pytest.param([4.0, 4.0, 0.5], ((0.2, 0.1), (None, UNKNOWN)), "passed", id="another pair is wrong"),
+        pytest.param([None, None, None], ((None, UNKNOWN), (None, UNKNOWN)), "absent", id="by the model alone"),
+        pytest.param([0.3, 0.3, None], ((0.2, 0.1), (None, UNKNOWN)), "passed", id="one by the model"),
     ],
 )
 def test_the_residual_of_the_registration_stands_in_where_nothing_is_sharp_in_both(
@@ -301,7 +281,7 @@ def test_a_picture_too_small_to_be_judged_never_passes(tmp_path: Path) -> None:
     assert "Not passed: not all gates of the all-in-focus pictures could be judged." in page and "nobody looked" not in page
 
 
-def test_strict_asks_for_every_gate(tmp_path: Path) -> None:
+def test_strict_asks_for_every_gate_and_fails_on_a_fault_whatever_is_allowed(tmp_path: Path) -> None:
     """A right stack without lens: 1 for the gates that could not be judged, 0 where each of them was allowed, 1 where one was not."""
     write_made(tmp_path / "view_0", right())
     plain = printed_by(report_command, tmp_path)
@@ -313,10 +293,8 @@ def test_strict_asks_for_every_gate(tmp_path: Path) -> None:
     allowed = [option for name in absences for option in ("--allow-absent", name.upper())]
     for options, exit_code in (((), 1), (allowed, 0), (allowed[2:], 1)):
         printed_by(report_command, tmp_path, "--strict", *options, exit_code=exit_code)
-
-
-def test_strict_fails_on_a_fault_whatever_is_allowed(tmp_path: Path) -> None:
     write_made(tmp_path / "view_0", lost_disc())
+    assert len(set(GATE_NAMES)) == len(GATE_NAMES) == 20, "names of gates are told apart"
     allowed = [option for name in GATE_NAMES for option in ("--allow-absent", name)]
     failed = printed_by(report_command, tmp_path, "--strict", *allowed, exit_code=1)
     *lines, last = printed_by(report_command, tmp_path).splitlines()
@@ -334,7 +312,3 @@ def test_a_gate_that_nobody_knows_is_refused_before_the_work(command: Callable[.
     with pytest.raises(InputError, match="--strict"):
         printed_by(command, *arguments, "--allow-absent", "no seams")
     assert not (tmp_path / "report.html").exists() and not (tmp_path / "scene").exists()
-
-
-def test_names_of_gates_are_told_apart() -> None:
-    assert len(set(GATE_NAMES)) == len(GATE_NAMES) == 20

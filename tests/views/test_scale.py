@@ -66,22 +66,23 @@ def detections(noise_px: float, wrong: int = 0) -> BoardDetections:
     return BoardDetections(views, corners, xy_px)
 
 
-def test_umeyama_finds_a_known_similarity() -> None:
+def test_similarities_and_rays_are_solved_exactly() -> None:
     points = np.random.default_rng(0).normal(size=(9, 3))
     turn = Rotation.from_rotvec([0.3, -1.0, 0.4]).as_matrix()
     found = umeyama(points, 3.5 * points @ turn.T + [1.0, -2.0, 0.5])
     assert found.scale == pytest.approx(3.5, rel=1e-12)
     np.testing.assert_allclose(found.rotation, turn, atol=1e-12)
     np.testing.assert_allclose(found(points), 3.5 * points @ turn.T + [1.0, -2.0, 0.5], atol=1e-12)
-
-
-def test_rays_meet_at_the_point() -> None:
     point = np.array([0.3, -0.2, 0.4])
     seen = np.array([view.project(point)[0] for view in MODEL.views])
     np.testing.assert_allclose(triangulate(MODEL.views, seen), point, atol=1e-9)
+    values = np.array([-2.0, 0.0, 0.5, 3.0])
+    np.testing.assert_allclose(np.log1p(squared_under_cauchy(values) ** 2), values**2)
+    numeric = (squared_under_cauchy(values + 1e-6) - squared_under_cauchy(values - 1e-6)) / 2e-6
+    np.testing.assert_allclose(squared_under_cauchy_slope(values), numeric, rtol=1e-5)
 
 
-def test_a_perfect_board_gives_the_exact_scale() -> None:
+def test_a_board_gives_the_scale_and_how_sure_it_is() -> None:
     answer = scale_of_detections(MODEL, BOARD, detections(0.0))
     assert answer.metres_per_unit == pytest.approx(METRES_PER_UNIT, rel=1e-7)
     assert answer.facts["residual_mm"] < 1e-6 and answer.facts["detections"] == 175
@@ -90,10 +91,7 @@ def test_a_perfect_board_gives_the_exact_scale() -> None:
     for view, inner in corner_seen.items():
         outline = np.array(answer.outlines_px[MODEL.views[view].name], np.float32)
         assert cv2.pointPolygonTest(outline, tuple(map(float, inner)), measureDist=True) > 0.0, "an inner corner lies within"
-
-
-def test_the_uncertainty_of_a_board_is_that_of_its_corners() -> None:
-    """0.2 px on 900 px at 1 m are 0.22 mm; 175 sightings of a board 0.1 m about its middle leave some 0.02 %."""
+    # 0.2 px on 900 px at 1 m are 0.22 mm; 175 sightings of a board 0.1 m about its middle leave some 0.02 %.
     answer = scale_of_detections(MODEL, BOARD, detections(0.2))
     error = abs(answer.metres_per_unit / METRES_PER_UNIT - 1.0)
     sigma = answer.facts["uncertainty_of_corners"]
@@ -102,21 +100,11 @@ def test_the_uncertainty_of_a_board_is_that_of_its_corners() -> None:
     assert answer.facts["residual_px"] == pytest.approx(0.2 * np.sqrt(2), rel=0.15)
 
 
-def test_wrong_corners_do_not_pull_the_board() -> None:
+def test_wrong_and_half_covered_corners_do_not_pull_the_board() -> None:
     answer = scale_of_detections(MODEL, BOARD, detections(0.1, wrong=6))
     assert answer.metres_per_unit == pytest.approx(METRES_PER_UNIT, rel=5e-4)
     assert answer.facts["detections"] == 169
-
-
-def test_poses_are_trusted_more_where_the_lens_has_no_distortion() -> None:
-    straight = model_of(tuple(replace(view, distortion=(0.0, 0.0)) for view in MODEL.views))
-    xy_px = np.concatenate([view.project(board_points())[0] for view in straight.views])
-    answer = scale_of_detections(straight, BOARD, replace(detections(0.0), xy_px=xy_px))
-    assert answer.uncertainty == pytest.approx(POSES_SIGMA) and answer.metres_per_unit == pytest.approx(METRES_PER_UNIT, rel=1e-7)
-
-
-def test_corners_that_something_half_covers_are_left_out() -> None:
-    """One corner a pixel off in every view, as where a card lies over it, beside corners known to 0.05 px."""
+    # One corner a pixel off in every view, as where a card lies over it, beside corners known to 0.05 px.
     seen = detections(0.05)
     seen.xy_px[seen.corners == 31] += (0.6, -0.8)
     answer = scale_of_detections(MODEL, BOARD, seen)
@@ -124,12 +112,10 @@ def test_corners_that_something_half_covers_are_left_out() -> None:
     assert answer.facts["residual_px"] == pytest.approx(0.05 * np.sqrt(2), rel=0.15)
     clean = scale_of_detections(MODEL, BOARD, detections(0.05))
     assert answer.metres_per_unit == pytest.approx(clean.metres_per_unit, rel=3e-5)
-
-
-def test_a_board_that_is_not_there_says_what_was_looked_for() -> None:
-    empty = np.zeros((60, 80, 3), np.uint8)
-    with pytest.raises(InputError, match=r"8x6 squares \(DICT_4X4_50\) in 5 views and found 0 corners"):
-        scale_of_detections(MODEL, BOARD, detect_board(BOARD, iter([empty] * 5)))
+    straight = model_of(tuple(replace(view, distortion=(0.0, 0.0)) for view in MODEL.views))
+    xy_px = np.concatenate([view.project(board_points())[0] for view in straight.views])
+    answer = scale_of_detections(straight, BOARD, replace(detections(0.0), xy_px=xy_px))
+    assert answer.uncertainty == pytest.approx(POSES_SIGMA) and answer.metres_per_unit == pytest.approx(METRES_PER_UNIT, rel=1e-7)
 
 
 @pytest.mark.parametrize("legacy", [False, True])
@@ -143,11 +129,14 @@ def test_corners_are_found_where_they_are_printed(legacy: bool) -> None:
     np.testing.assert_allclose(found.xy_px, 40.0 + 32.0 * BOARD.corners_m[found.ids, :2] / 0.03, atol=0.03)
 
 
-def test_boards_come_from_options_and_files(tmp_path: Path) -> None:
+def test_boards_come_from_options_and_files_and_intervals_from_slices(tmp_path: Path) -> None:
     path = tmp_path / "board.toml"
     path.write_text('squares = [8, 6]\nsquare_mm = 30.0\nmarker_mm = 22.0\ndictionary = "DICT_5X5_100"\n')
     assert read_board(path) == board_from_options(str(path), None, None, "DICT_4X4_50")
     assert board_from_options("8x6", 30.0, 22.0, "DICT_4X4_50") == BOARD
+    told = Slice("0.exr", 1.0, metadata={"focus": {"lens_interval_dioptre": [0.97, 1.03]}})
+    stack = FocalStack(tmp_path, (told, Slice("1.exr", 2.0), Slice("2.exr", 3.0, metadata={"focus": None})))
+    np.testing.assert_allclose(stated_sigma_dioptre(stack), [0.06 / np.sqrt(12.0), 0.0, 0.0])
 
 
 @pytest.mark.parametrize(
@@ -163,6 +152,11 @@ def test_boards_come_from_options_and_files(tmp_path: Path) -> None:
         (lambda: distance_scale(MODEL, "view_0", "view_9", 1.0), "view_9"),
         (lambda: distance_scale(MODEL, "view_0", "view_0", 1.0), "two different"),
         (lambda: distance_scale(MODEL, "view_0", "view_1", -1.0), "positive"),
+        (lambda: focus_scale([sample(np.full(12, np.nan))]), "found 0 in 1 stacks"),
+        (
+            lambda: scale_of_detections(MODEL, BOARD, detect_board(BOARD, iter([np.zeros((60, 80, 3), np.uint8)] * 5))),
+            r"8x6 squares \(DICT_4X4_50\) in 5 views and found 0 corners",
+        ),
     ],
 )
 def test_mistakes_are_named(make: Callable[[], object], message: str) -> None:
@@ -192,21 +186,15 @@ def sample(stated: np.ndarray, noise: float = 0.05, wrong: float = 0.0, sigma: n
     return FocusSample("view_0", peaks, np.zeros((len(peaks.points), 2)), depth, stated, np.zeros(12) if sigma is None else sigma)
 
 
-def test_peaks_of_parabolas_are_their_vertices() -> None:
+def test_sharpness_peaks_at_the_focus_of_a_point() -> None:
     true = np.array([0.9, 1.2312])
     curves = np.exp(5.0 - 20.0 * (FOCUS_DIOPTRES[:, None] - true) ** 2)
     np.testing.assert_allclose(sharpness_peaks(curves).dioptres(FOCUS_DIOPTRES), true, atol=1e-9)
-
-
-def test_points_without_a_peak_inside_the_stack_do_not_count() -> None:
     nearer_than_all = np.exp(-20.0 * (FOCUS_DIOPTRES - 2.0) ** 2)
     without_texture = np.full(12, 0.3)
     peaks = sharpness_peaks(np.stack([nearer_than_all, without_texture, np.exp(-20.0 * (FOCUS_DIOPTRES - 1.0) ** 2)], axis=1))
     np.testing.assert_array_equal(peaks.points, [2])
-
-
-def test_sharpness_is_taken_where_the_point_is() -> None:
-    """Texture on the left is sharp in the first slice only, on the right in the second only."""
+    # Texture on the left is sharp in the first slice only, on the right in the second only.
     rng = np.random.default_rng(0)
     slices = np.full((2, 40, 80, 3), 0.5, np.float32)
     slices[0, :, :30] += rng.normal(0, 0.1, (40, 30, 1)).astype(np.float32)
@@ -215,18 +203,12 @@ def test_sharpness_is_taken_where_the_point_is() -> None:
     np.testing.assert_array_equal(np.argmax(curves, axis=0), [0, 1])
 
 
-def test_focus_distances_give_the_scale() -> None:
+def test_focus_distances_give_the_scale_with_wrong_points_and_an_offset() -> None:
     answer = focus_scale([sample(FOCUS_DIOPTRES)])
     assert answer.metres_per_unit == pytest.approx(METRES_PER_UNIT, rel=1e-3)
     assert answer.facts["offset_m"] == 0.0, "an offset that is not told apart from 0 is 0"
-
-
-def test_a_third_of_wrong_points_does_not_pull_the_focus() -> None:
     assert focus_scale([sample(FOCUS_DIOPTRES, wrong=0.33)]).metres_per_unit == pytest.approx(METRES_PER_UNIT, rel=3e-3)
-
-
-def test_distances_from_the_film_plane_are_found_out() -> None:
-    """What is stated 45 mm too long, for it counts from the film plane: 4.5 % at 1 m, were it not for the offset."""
+    # What is stated 45 mm too long, for it counts from the film plane: 4.5 % at 1 m, were it not for the offset.
     stated = 1.0 / (1.0 / FOCUS_DIOPTRES + 0.045)
     answer = focus_scale([sample(stated)])
     assert answer.facts["offset_m"] == pytest.approx(0.045, abs=0.004)
@@ -245,25 +227,7 @@ def test_coarse_distances_are_known_to_be_coarse(phase: float) -> None:
     assert answer.uncertainty > 3.0 * fine.uncertainty
 
 
-def test_intervals_of_stated_distances_are_read(tmp_path: Path) -> None:
-    told = Slice("0.exr", 1.0, metadata={"focus": {"lens_interval_dioptre": [0.97, 1.03]}})
-    stack = FocalStack(tmp_path, (told, Slice("1.exr", 2.0), Slice("2.exr", 3.0, metadata={"focus": None})))
-    np.testing.assert_allclose(stated_sigma_dioptre(stack), [0.06 / np.sqrt(12.0), 0.0, 0.0])
-
-
-def test_unknown_focus_distances_are_no_answer() -> None:
-    with pytest.raises(InputError, match="found 0 in 1 stacks"):
-        focus_scale([sample(np.full(12, np.nan))])
-
-
-def test_a_prior_stays_quadratic_under_cauchy() -> None:
-    values = np.array([-2.0, 0.0, 0.5, 3.0])
-    np.testing.assert_allclose(np.log1p(squared_under_cauchy(values) ** 2), values**2)
-    numeric = (squared_under_cauchy(values + 1e-6) - squared_under_cauchy(values - 1e-6)) / 2e-6
-    np.testing.assert_allclose(squared_under_cauchy_slope(values), numeric, rtol=1e-5)
-
-
-def test_the_board_counts_most_and_the_others_are_kept(tmp_path: Path) -> None:
+def test_the_board_counts_most_and_the_others_are_told(tmp_path: Path) -> None:
     write_sparse_model(tmp_path, MODEL)
     answers = [ScaleAnswer("focus", 0.21, 0.005), ScaleAnswer("board", 0.2, 0.0003)]
     result = ScaleResult.of(answers, {"distance": "none was given"})
@@ -275,8 +239,5 @@ def test_the_board_counts_most_and_the_others_are_kept(tmp_path: Path) -> None:
     assert read.contradictions == ("focus",), "5 % are more than 2 % and ten deviations"
     unsure = ScaleResult.of([replace(answers[0], uncertainty=0.03), answers[1]], {})
     assert unsure.contradictions == (), "5 % are less than two deviations"
-
-
-def test_no_answer_at_all_tells_what_each_looked_for() -> None:
     with pytest.raises(InputError, match="board: none was given; focus: unknown"):
         ScaleResult.of([], {"focus": "unknown", "board": "none was given"})

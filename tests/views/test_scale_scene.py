@@ -82,7 +82,7 @@ def test_corners_of_the_board_are_where_they_are(pictures: Traced) -> None:
     assert np.sqrt(np.mean(np.sum(np.concatenate(off_px) ** 2, axis=1))) < 0.08
 
 
-def test_poses_of_all_views(model: SparseModel, truth: Similarity) -> None:
+def test_poses_of_all_views_and_depth_of_their_points(model: SparseModel, truth: Similarity, pictures: Traced) -> None:
     """A tenth of a millimetre at 1 m is a twentieth of a pixel here; the focal length is the breathing one of the nearest focus."""
     assert [view.name for view in model.views] == [f"view_{index}" for index in range(len(POSITIONS_M))] and not model.left_out
     centres = np.array([view.centre for view in model.views])
@@ -92,9 +92,6 @@ def test_poses_of_all_views(model: SparseModel, truth: Similarity) -> None:
         assert np.degrees(np.arccos(np.clip((np.trace(turned) - 1.0) / 2.0, -1.0, 1.0))) < 0.1
     assert model.views[0].camera.focal_px[0] == pytest.approx(LENS.focal_px(WIDTH_PX), rel=2e-3)
     assert len({view.camera.focal_px for view in model.views}) == 1, "one camera for one reference focus"
-
-
-def test_sparse_depth_is_the_true_depth(model: SparseModel, truth: Similarity, pictures: Traced) -> None:
     for index, view in enumerate(model.views):
         xy_px, depth = model.depths_in(view)
         true_m = pictures.depth_m[index][xy_px[:, 1].astype(int), xy_px[:, 0].astype(int)]
@@ -135,7 +132,7 @@ def test_an_interrupted_run_goes_on_with_its_matches(folder: Path, model: Sparse
 
 
 @pytest.mark.slow
-def test_three_scales_agree_with_the_truth(focused: Path, scaled: ScaledScene) -> None:
+def test_scale_focus_and_growth_of_blur_are_found(focused: Path, scaled: ScaledScene) -> None:
     """At 400 px the board's squares have 25 px and a point's focus is known to 0.006 dioptres; larger pictures do better."""
     views = read_sparse_model(focused / "reconstruction").views
     truth = umeyama(np.array([view.centre for view in views]), np.array(POSITIONS_M))
@@ -143,11 +140,18 @@ def test_three_scales_agree_with_the_truth(focused: Path, scaled: ScaledScene) -
     assert list(off) == ["board", "distance", "focus"]
     assert abs(off["board"]) < 2e-3 and abs(off["distance"]) < 1e-3 and abs(off["focus"]) < 5e-3
     assert scaled.result.contradictions == ()
+    # Within a tenth of a pixel of blur: 0.02 dioptres at 7 px each, where the slices are 0.15 apart; the growth within 4 %.
+    fit = scaled.calibrated["view_0"].fit
+    np.testing.assert_allclose(fit.dioptres, 1.0 / np.array(FOCUS_M), atol=0.02)
+    stack = read_focal_stack(focused / "view_0")
+    thin = [LENS.focused_at(d).coc_px_per_dioptre(WIDTH_PX) * each.scale for d, each in zip(FOCUS_M, stack.slices, strict=True)]
+    np.testing.assert_allclose(fit.px_per_dioptre, thin, rtol=0.04)
+    told = "\n".join(scale_lines(scaled))
+    assert "board: " in told and "% from the one used" in told and "px per dioptre" in told
 
 
 @pytest.mark.slow
-@pytest.mark.usefixtures("scaled")
-def test_scale_and_calibration_are_written(focused: Path) -> None:
+def test_scale_and_calibration_are_written_and_kept(focused: Path, scaled: ScaledScene) -> None:
     folder = focused
     document = json.loads((folder / "reconstruction" / "scale.json").read_text())
     assert document["used"] == "board" and set(document["disagreement"]) == {"distance", "focus"}
@@ -160,26 +164,6 @@ def test_scale_and_calibration_are_written(focused: Path) -> None:
     assert stack.camera is not None and stack.camera.focal_px == metric.view("view_0").camera.focal_px
     assert stack.metadata["distortion"] == list(metric.view("view_0").distortion)
     assert stated_distances_m(stack) == pytest.approx(FOCUS_M)
-
-
-@pytest.mark.slow
-def test_focus_and_growth_of_blur_are_found(focused: Path, scaled: ScaledScene) -> None:
-    """Within a tenth of a pixel of blur: 0.02 dioptres at 7 px each, where the slices are 0.15 apart; the growth within 4 %."""
-    fit = scaled.calibrated["view_0"].fit
-    np.testing.assert_allclose(fit.dioptres, 1.0 / np.array(FOCUS_M), atol=0.02)
-    stack = read_focal_stack(focused / "view_0")
-    thin = [LENS.focused_at(d).coc_px_per_dioptre(WIDTH_PX) * each.scale for d, each in zip(FOCUS_M, stack.slices, strict=True)]
-    np.testing.assert_allclose(fit.px_per_dioptre, thin, rtol=0.04)
-
-
-@pytest.mark.slow
-def test_the_answers_are_told(scaled: ScaledScene) -> None:
-    told = "\n".join(scale_lines(scaled))
-    assert "board: " in told and "% from the one used" in told and "px per dioptre" in told
-
-
-@pytest.mark.slow
-def test_a_scale_that_is_there_is_kept(focused: Path, scaled: ScaledScene) -> None:
     kept = scale_scene(focused, ScaleRequest())
     assert kept.result.used.metres_per_unit == scaled.result.used.metres_per_unit
 
