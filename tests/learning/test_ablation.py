@@ -1,8 +1,8 @@
 """Tables of trained variants on tiny stacks: that the machinery is right, not that the networks are good."""
 
 import csv
-import dataclasses
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +50,7 @@ def small_base(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The published form with one block, which is quick, in the range of the picture without its lights."""
     folder = tmp_path_factory.mktemp("base")
     plain = TrainSettings(epochs=1, learning_rate=5e-3, radiance_scale=1.2, saturation=1.0, validate_every_s=0.0, sheets=False)
-    write_settings(folder, dataclasses.replace(plain, network=dataclasses.replace(plain.network, blocks=1)))
+    write_settings(folder, replace(plain, network=replace(plain.network, blocks=1)))
     return folder / "settings.json"
 
 
@@ -67,16 +67,10 @@ def done(scene: Path, small_base: Path, tmp_path_factory: pytest.TempPathFactory
 
 def test_rows_are_those_of_the_paper() -> None:
     """Table 1 in its order, with its PSNR; Table 3's heart and its Nikon D3300 with the 28 mm lens."""
-    assert [(row.name, row.paper and row.paper.psnr_db) for row in TABLES["1"]] == [
-        ("published", 42.0),
-        ("3x3", 36.9),
-        ("no_tiling", 35.3),
-        ("no_overlap", 40.2),
-        ("loss_per_tile", 38.1),
-    ]
-    assert {name: each.psnr_db for name, each in PAPER_TABLE_3["heart"].items()} == {
-        "published": 42.1, "neural_camera": 26.7, "deepfocus": 29.4,
-    }  # fmt: skip
+    decibels = {"published": 42.0, "3x3": 36.9, "no_tiling": 35.3, "no_overlap": 40.2, "loss_per_tile": 38.1}
+    assert [(row.name, row.paper and row.paper.psnr_db) for row in TABLES["1"]] == list(decibels.items())
+    heart = {name: each.psnr_db for name, each in PAPER_TABLE_3["heart"].items()}
+    assert heart == {"published": 42.1, "neural_camera": 26.7, "deepfocus": 29.4}
     assert PAPER_TABLE_3["28mm"]["published"].lpips == 0.133
     assert paper_numbers(PUBLISHED, "3", ("ring",)) == PAPER_TABLE_3["circle"]["published"], "our name for it"
     assert paper_numbers(PUBLISHED, "3", ("heart", "ring")) is None is paper_numbers(PUBLISHED, "3", ("attic",))
@@ -97,25 +91,20 @@ def test_a_row_differs_from_the_published_network_in_what_it_says(row: Row) -> N
         assert all(getattr(mine.network, name) == value for name, value in row.network.items())
 
 
-def test_tiles_scale_with_the_picture() -> None:
+def test_tiles_and_splits_are_one_for_all_rows(scene: Path, tmp_path: Path) -> None:
     """200 px with 60 px overlap belong to 1920 px, where they make 14 by 8 tiles: as many at a quarter of it, of 50 px with 15."""
     whole, quarter = (settings_of(PUBLISHED, width, 0, BUDGET).network for width in (1920, 480))
     assert (whole.tile_px, whole.overlap_px, quarter.tile_px, quarter.overlap_px) == (200, 60, 50, 15)
     assert len(TileGrid(1080, 1920, 200, 60)) == len(TileGrid(270, 480, 50, 15)) == 14 * 8
-    chosen = settings_of(PUBLISHED, 480, 0, dataclasses.replace(BUDGET, tile_px=32, overlap_px=8)).network
+    chosen = settings_of(PUBLISHED, 480, 0, replace(BUDGET, tile_px=32, overlap_px=8)).network
     assert (chosen.tile_px, chosen.overlap_px) == (32, 8)
     no_overlap = settings_of(TABLES["1"][3], 480, 0, BUDGET).network
     assert (no_overlap.tile_px, no_overlap.overlap_px) == (50, 0)
     assert settings_of(TABLES["1"][2], 480, 0, BUDGET).network.tile_px == 0
-
-
-def test_one_split_for_all_rows_and_seeds(scene: Path, tmp_path: Path) -> None:
     sets = read_data_sets([scene])
     assert sets[0].width_px == SIZE[1] and len(sets[0].held_out) == 1
-    planned = planned_runs(list(TABLES["1"][:2]), sets, tmp_path, dataclasses.replace(BUDGET, seeds=2))
-    assert [(each.row.name, each.seed, each.settings.seed) for each in planned] == [
-        ("published", 0, 0), ("3x3", 0, 0), ("published", 1, 1), ("3x3", 1, 1),
-    ]  # fmt: skip
+    planned = planned_runs(list(TABLES["1"][:2]), sets, tmp_path, replace(BUDGET, seeds=2))
+    assert [(each.row.name, each.seed, each.settings.seed) for each in planned] == [(n, s, s) for s in (0, 1) for n in ("published", "3x3")]
     assert {each.data_set.held_out for each in planned} == {sets[0].held_out}
     with pytest.raises(InputError, match="at least two viewpoints"):
         read_data_sets([scene / "view_0"])
@@ -145,15 +134,15 @@ def test_the_numbers_of_the_table_are_those_of_the_networks(scene: Path, done: P
     assert float(rows[1]["paper_gap_db"]) == pytest.approx(35.3 - 42.0)
 
 
-def test_pages_hold_tables_pictures_and_commands(done: Path) -> None:
+def test_pages_hold_tables_and_finished_runs_are_not_trained_again(
+    done: Path, scene: Path, small_base: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     text, page = (done / "results.md").read_text(), (done / "results.html").read_text()
     table = (done / "table_1.md").read_text()
     assert "| Neural Bokeh as published | heart_scene |" in table and table in text and "no weights are shipped" in text
     assert text.count("mrbokeh train fit") == 2 and "(table_1.png)" in text
     assert "<h2>Variants of the design" in page and "data:image/png;base64" in page and "no tiling" in page and "train fit" in page
 
-
-def test_finished_runs_are_not_trained_again(scene: Path, done: Path, small_base: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def no_training(*_: object) -> None:
         raise AssertionError("trained again")
 
@@ -195,9 +184,8 @@ def test_a_dry_run_trains_nothing(scene: Path, done: Path, small_base: Path, tmp
     output = ablate(scene, "--out", tmp_path / "out", "--rows", "3x3,signed_coc", "--seeds", 2, "--dry-run")
     assert output.count("10.0 min") == 4 and "4 runs, about 40 min" in output
     assert "network.kernels=3x3" in output and "network.signed_coc=True" in output and not (tmp_path / "out").exists()
-    again = ablate(
-        scene, "--out", done, "--rows", "published,3x3", "--table", "1", "--epochs", 1, "--settings", small_base, *TILES, "--dry-run"
-    )
+    settings = ("--table", "1", "--epochs", 1, "--settings", small_base, *TILES)
+    again = ablate(scene, "--out", done, "--rows", "published,3x3", *settings, "--dry-run")
     assert "2 runs, about" in again and again.count("finished") == 1
     with pytest.raises(InputError, match="rows among published"):
         ablate(scene, "--out", tmp_path / "out", "--rows", "4x4")
@@ -219,7 +207,7 @@ def made(row: str, data_set: str, seed: int, psnr_db: float) -> RunResult:
     return RunResult(data_set, row, seed, 15, {"psnr_db": psnr_db} | measures, 100, 60.0, 10, "abc", "a machine")
 
 
-def test_means_are_over_sets_then_seeds() -> None:
+def test_means_are_over_sets_then_seeds_with_the_papers_numbers() -> None:
     """Seeds give (30 + 34) / 2 = 32 and (31 + 37) / 2 = 34: mean 33, standard deviation sqrt(2). The third seed lacks a set."""
     values = {("heart", 0): 30.0, ("round", 0): 34.0, ("heart", 1): 31.0, ("round", 1): 37.0, ("heart", 2): 99.0}
     results = [made("published", name, seed, value) for (name, seed), value in values.items()]
@@ -227,25 +215,16 @@ def test_means_are_over_sets_then_seeds() -> None:
     assert (found.seeds, found.slices, found.means["psnr_db"]) == (2, 30, 33.0)
     assert found.spreads["psnr_db"] == pytest.approx(np.sqrt(2.0))
     assert summary(PUBLISHED, results, ["bladed"]) is None
-
-
-def test_table_3_goes_set_by_set_with_the_papers_numbers() -> None:
-    """Gaps are to the first row of the same set: 30 - 40 in "my_heart", where the paper has 26.7 - 42.1; it has no square bokeh."""
-    results = [
-        made(row, name, 0, value) for name in ("my_heart", "square") for row, value in (("published", 40.0), ("neural_camera", 30.0))
-    ]
+    # Gaps are to the first row of the same set: 30 - 40 in "my_heart", where the paper has 26.7 - 42.1; it has no square bokeh.
+    values = (("published", 40.0), ("neural_camera", 30.0))
+    results = [made(row, name, 0, value) for name in ("my_heart", "square") for row, value in values]
     lines = lines_of("3", results, ["my_heart", "square"])
-    assert [(line.sets, line.summary.row.name, line.gap_db) for line in lines] == [
-        (("my_heart",), "published", 0.0), (("my_heart",), "neural_camera", -10.0),
-        (("square",), "published", 0.0), (("square",), "neural_camera", -10.0),
-    ]  # fmt: skip
+    expected = [((name,), *row) for name in ("my_heart", "square") for row in (("published", 0.0), ("neural_camera", -10.0))]
+    assert [(line.sets, line.summary.row.name, line.gap_db) for line in lines] == expected
     assert lines[1].paper_gap_db == pytest.approx(26.7 - 42.1) and np.isnan(lines[3].paper_gap_db)
     headings, rows = table_cells(lines)
     assert all(len(row) == len(headings) for row in rows)
     assert "| my_heart | PSNR dB | 40.00 (42.1) | 30.00 (26.7) |" in markdown_of("3", lines)
-
-
-def test_the_mean_over_sets_has_no_gap_without_the_first_row() -> None:
     lines = lines_of("1", [made("3x3", "heart", 0, 30.0)], ["heart"])
     assert [line.summary.row.name for line in lines] == ["3x3"] and np.isnan(lines[0].gap_db)
     assert read_result(Path("nowhere")) is None
