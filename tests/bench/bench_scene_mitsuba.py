@@ -9,13 +9,15 @@ import time
 from collections.abc import Callable
 from functools import partial
 
+import numpy as np
+
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Scene, shadow_catcher, sun, world_from_scene_placing
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.gltf.gltf_loader import load_glb
+from mrbokeh.scene.light import directions
 from mrbokeh.scene.light_change import light_change
 from mrbokeh.scene.mitsuba.mitsuba_tracer import MitsubaTracer
-from tests.bench.bench_scene import sky
 from tests.bench.machine import machine_line, memory_line
 from tests.conftest import SHARED_DATA
 
@@ -27,6 +29,13 @@ def helmet() -> Scene:
     scene = load_glb(SHARED_DATA / "objects" / "FlightHelmet.glb").without_lights()
     scene = scene.transformed(world_from_scene_placing(scene, (0.0, 0.28, 1.1), height_m=0.55, turn_rad=0.4))
     return scene.with_environment(Environment(sky())).with_lights(sun((0.5, 1.0, 0.6), 3.0))
+
+
+def sky() -> np.ndarray:
+    """A panorama of 512x1024 with a gradient and a wide lamp."""
+    towards = directions(512, 1024)
+    lamp = 20.0 * np.exp(60 * (towards @ np.array([0.6, -0.64, -0.48]) - 1))
+    return (np.stack([0.4 + 0.3 * -towards[..., 1]] * 3, axis=-1) + lamp[..., None]).astype(np.float32)
 
 
 def timed(work: Callable[[], object]) -> tuple[float, float]:

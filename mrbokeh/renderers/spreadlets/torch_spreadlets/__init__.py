@@ -8,7 +8,7 @@ Sums are taken in whole numbers of 64 bits, scaled so that the largest sum that 
 the same in any order, so that atomic additions, chunks of any size and the Triton kernel all give the same bits, and a unit is
 finer than the rounding of double precision of the largest sum. What may differ between devices, by rounding, is the integration:
 sine transforms by torch.fft in double precision. In single precision they would be off by 2e-5 in a picture up to 1, and by 1e-4
-where a lamp makes a disc of 80 (tests/bench/bench_torch_spreadlets.py measures it).
+where a lamp makes a disc of 80, as measured.
 
 torch comes with the extra `train`; without it, importing this package says so.
 """
