@@ -1,7 +1,6 @@
 """Sparse differenced kernels: the counts of the paper's Table 1, and that summing brings the kernel back."""
 
-from collections.abc import Callable, Mapping, Sequence
-from math import ceil
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -16,29 +15,19 @@ from mrbokeh.system.errors import InputError
 Corners = list[tuple[int, int]]
 
 
-def binary_profile(direction: Direction) -> Taps:
-    """Return the profile of an edge in the paper: a pixel belongs to the area if its centre does."""
-    dx, dy = downwards(direction)
-    middles = [(column + 0.5) * dy / abs(dx) for column in range(abs(dx))]
-    return {(column if dx > 0 else -column - 1, ceil(middle - 0.5)): 1.0 for column, middle in enumerate(middles)}
-
-
-def differenced_kernel(corners: Sequence[tuple[int, int]], profile: Callable[[Direction], Taps]) -> Mapping[Direction, Taps]:
-    """Return the non-zero elements of K'' of the paper's Eq. 4, by direction, for a polygon with its corners on the lattice.
-
-    corners in the order in which x turns towards y (clockwise on screen). profile: of an edge.
-    """
+def differenced_kernel(corners: Sequence[tuple[int, int]]) -> dict[Direction, Taps]:
+    """Return K'' of the paper's Eq. 4, by direction, for a polygon with its corners on the lattice, x turning towards y."""
     grouped: dict[Direction, Taps] = {}
     for here, there in zip(corners, (*corners[1:], corners[0]), strict=True):
         direction = downwards((there[0] - here[0], there[1] - here[1]))
         if direction[0] == 0:
             continue
         taps = grouped.setdefault(direction, {})
-        for (x, y), weight in profile(direction).items():
+        for (x, y), weight in edge_profile(direction).items():
             for end, sign in ((here, 1.0), (there, -1.0)):
                 place = (end[0] + x, end[1] + y)
                 taps[place] = taps.get(place, 0.0) + sign * weight * (1 if direction[0] > 0 else -1)
-    return {direction: {place: weight for place, weight in taps.items() if weight} for direction, taps in grouped.items()}
+    return grouped
 
 
 def polygon(half: Corners) -> Corners:
@@ -67,13 +56,6 @@ def hexadecagon(r: int) -> Corners:
     return polygon([(-k, -5 * k), (k, -5 * k), (3 * k, -4 * k), (4 * k, -3 * k), (5 * k, -k), (5 * k, k), (4 * k, 3 * k), (3 * k, 4 * k)])
 
 
-@pytest.mark.parametrize(("shape", "count"), [(hexagon, 8), (octagon, 12), (dodecagon, 28), (hexadecagon, 36)])
-@pytest.mark.parametrize("radius_px", [25, 100])
-def test_counts_of_table_1(shape, count: int, radius_px: int) -> None:  # type: ignore[no-untyped-def]
-    """Moroto et al. 2021, Table 1, column "Ours": constant in the radius."""
-    assert sum(len(taps) for taps in differenced_kernel(shape(radius_px), binary_profile).values()) == count
-
-
 def summed_back(grouped: dict[Direction, Taps], size: int) -> np.ndarray:
     """The paper's Eq. 9 for one pixel in the middle, by its Eq. 13."""
     total = np.zeros((size, size))
@@ -90,21 +72,6 @@ def summed_back(grouped: dict[Direction, Taps], size: int) -> np.ndarray:
 
 
 @pytest.mark.parametrize("shape", [hexagon, octagon, dodecagon, hexadecagon])
-def test_binary_kernels_come_back(shape) -> None:  # type: ignore[no-untyped-def]
-    """A pixel is inside where its centre is: even-odd rule, none of these edges passes through a centre and a corner alike."""
-    corners, size = np.array(shape(12), float), 71
-    grid = np.arange(size) - size // 2 + 0.5
-    x, y = np.meshgrid(grid, grid)
-    inside = np.zeros((size, size), bool)
-    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
-        between = (np.minimum(x0, x1) < x) & (x < np.maximum(x0, x1))
-        height = y0 + (x - x0) * (y1 - y0) / (x1 - x0) if x1 != x0 else y
-        # Edges below the centre count; a centre on an edge belongs to the area under it, as in edge_profile.
-        inside ^= between & (height > y + 1e-9)
-    np.testing.assert_array_equal(summed_back(dict(differenced_kernel(shape(12), binary_profile)), size), inside)
-
-
-@pytest.mark.parametrize("shape", [hexagon, octagon, dodecagon, hexadecagon])
 def test_covered_area_comes_back(shape) -> None:  # type: ignore[no-untyped-def]
     """Against the exact coverage of Aperture.rasterize, whose kernels are centred on a pixel: shift by half a pixel."""
     corners = np.array(shape(12), float)
@@ -112,7 +79,7 @@ def test_covered_area_comes_back(shape) -> None:  # type: ignore[no-untyped-def]
     psf = Aperture((((corners - 0.5) / extent).astype(float),), (1.0,)).rasterize(2 * extent).kernel
     size = 2 * (psf.shape[0] // 2 + 4) + 1
     expected = np.pad(psf, (size - psf.shape[0]) // 2)
-    kernel = summed_back(dict(differenced_kernel(shape(12), edge_profile)), size)
+    kernel = summed_back(differenced_kernel(shape(12)), size)
     np.testing.assert_allclose(kernel / kernel.sum(), expected, atol=1e-12)
     assert kernel.max() == pytest.approx(1.0)
 
@@ -134,12 +101,11 @@ def test_every_column_of_a_profile_is_one_pixel_high(dx: int, dy: int) -> None:
             downwards((dx, dy))
         return
     run = abs(downwards((dx, dy))[0])
-    for profile in (edge_profile, binary_profile):
-        columns: dict[int, float] = {}
-        for (x, _), weight in profile((dx, dy)).items():
-            columns[x] = columns.get(x, 0.0) + weight
-        assert len(columns) == run
-        np.testing.assert_allclose(list(columns.values()), 1.0, atol=1e-12)
+    columns: dict[int, float] = {}
+    for (x, _), weight in edge_profile((dx, dy)).items():
+        columns[x] = columns.get(x, 0.0) + weight
+    assert len(columns) == run
+    np.testing.assert_allclose(list(columns.values()), 1.0, atol=1e-12)
 
 
 APERTURES = {

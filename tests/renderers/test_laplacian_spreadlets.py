@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 from mrbokeh.images.image_metrics import psnr, ssim
-from mrbokeh.images.layer import opaque
 from mrbokeh.layering.light_field_samples import LightFieldSamples
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
@@ -136,8 +135,8 @@ def test_splatting_agrees_with_its_plain_twin() -> None:
     """Several cells, dark pixels, tiles that are cut off."""
     rng = np.random.default_rng(9)
     points = joined_points([taps_of(DISC.rasterize(size).kernel) for size in (3.0, 7.5, 12.0)])
-    values, cells = rng.uniform(size=(40, 37, 3)).astype(np.float32), rng.integers(-1, 3, (40, 37)).astype(np.int32)
-    found, plain = np.zeros((56, 53, 3)), np.zeros((56, 53, 3))
+    values, cells = rng.uniform(size=(20, 17, 3)).astype(np.float32), rng.integers(-1, 3, (20, 17)).astype(np.int32)
+    found, plain = np.zeros((36, 33, 3)), np.zeros((36, 33, 3))
     splat(found, values, cells, points, (-8, -8))
     splat_reference(plain, values, cells, points, (-8, -8))
     np.testing.assert_allclose(found, plain, atol=1e-12)
@@ -253,7 +252,7 @@ def test_whole_numbers_agree_with_the_plain_twin_and_sum_to_nothing() -> None:
     by less than 20 units."""
     rng = np.random.default_rng(20)
     kernels = [sparsify(DISC.rasterize(size).kernel, UNRELAXED) for size in (26.0, 29.0)]
-    cells = np.repeat(rng.integers(-1, 2, (60, 12)), 5, axis=1).astype(np.int32)
+    cells = np.repeat(rng.integers(-1, 2, (40, 8)), 5, axis=1).astype(np.int32)
     values = (rng.uniform(size=(*cells.shape, 4)) * (1.0, 0.01, 30.0, 1.0)).astype(np.float32)
     found, plain, gains = sums_in_whole_numbers(values, cells, kernels, (31, 70))
     again, _, _ = sums_in_whole_numbers(values, cells, kernels, ())
@@ -306,17 +305,6 @@ def test_lamps_agree_with_their_plain_twin(share: float) -> None:
     assert 0 < found.found.sum() < 0.03 * found.found.size
     assert np.all(found.largest >= plain.largest)
     assert np.all(found.largest <= 33.0 * np.abs(values).mean(axis=(0, 1)))
-
-
-def test_lamps_cost_no_likeness_elsewhere() -> None:
-    """A lamp of 1e5 leaves the rest of the picture as it was, but for its disc."""
-    values, coc_px = picture(22, (192, 192)), np.full((192, 192), 42.0, np.float32)
-    renderer = LaplacianSpreadlets()
-    before = renderer.sum_kernels(values, coc_px, DISC)
-    values[96, 96, :3] = 1e5
-    after = renderer.sum_kernels(values, coc_px, DISC)
-    far = np.hypot(*(np.indices((192, 192)) - 96)) > 24.0
-    np.testing.assert_allclose(after[far], before[far], atol=2e-3, err_msg="the pixel's own light is gone from its surroundings")
 
 
 def test_by_name_and_by_mistake() -> None:
@@ -414,17 +402,6 @@ def depth_for_coc_m(coc_px: np.ndarray, width_px: int) -> np.ndarray:
     return (1.0 / (1.0 / LENS.focus_distance_m - coc_px / LENS.coc_px_per_dioptre(width_px))).astype(np.float32)
 
 
-def test_a_bank_renders_layers_as_its_aperture_does() -> None:
-    """At circles that the bank holds, near an edge of depth."""
-    coc_px = np.full(SIZE, 18.0)
-    coc_px[:, :50] = -6.0
-    layer = opaque(np.ascontiguousarray(picture(11)[..., :3]), depth_for_coc_m(coc_px, SIZE[1]))
-    with_bank = LaplacianSpreadlets(bank_of(PENTAGON)).render([layer], LENS)
-    without = LaplacianSpreadlets().render([layer], LENS)
-    assert psnr(with_bank.rgb, without.rgb) > 45.0
-    assert with_bank.extra == {}
-
-
 def samples_of_a_plane(coc_px: float, count: int, motion_px: tuple[float, float] = (0.0, 0.0)) -> tuple[LightFieldSamples, np.ndarray]:
     """Samples of a bright square on black, one plane, and the sharp picture."""
     rng, width, height = np.random.default_rng(12), 90, 80
@@ -447,14 +424,9 @@ def test_reconstruction_puts_each_kernel_once_and_where_it_belongs(coc_px: float
     """Of 4 noisy samples per pixel, the blur of the sharp square; splatted at the samples' own places it would be blurred twice."""
     lens = replace(LENS, aperture=DISC)
     samples, sharp = samples_of_a_plane(coc_px, 4, motion_px)
-    many, _ = samples_of_a_plane(coc_px, 256, motion_px)
+    many, _ = samples_of_a_plane(coc_px, 128, motion_px)
     found = LaplacianSpreadlets().reconstruct(samples, lens).rgb
     truth = many.raw_picture()
     assert psnr(found, truth) > psnr(samples.raw_picture(), truth) + 6.0
     assert psnr(found, truth) > 34.0
     assert sharp.sum() * 0.9 < found.sum() < sharp.sum() * 1.1
-
-
-def test_whole_laplacians_of_three_colours() -> None:
-    kernel = np.dstack([DISC.rasterize(9.0).kernel, DISC.rasterize(9.0).kernel[::-1], DISC.rasterize(9.0).kernel.T])
-    assert whole_laplacian(kernel).values.shape[1] == 3

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.images.image_metrics import psnr
-from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon import polygon_differences
 from mrbokeh.renderers.polygon.directional_differences import PolygonCorners, edge_profile, polygon_corners
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
@@ -102,8 +100,8 @@ def point(size: int, diameter_px: float, aperture: Aperture, renderer: PolygonDi
 @pytest.mark.parametrize(("name", "side"), [("heart", 1.0), ("heart", -1.0), ("ring", 1.0), ("octagon", -1.0)])
 def test_the_plain_twin_agrees(name: str, side: float) -> None:
     """Signed light, so that nothing is set to 0; the result is rounded to float32, the impulses are not."""
-    values = (picture(14, 18) - 0.5).astype(np.float32)
-    coc_px = np.float32(side) * waves(14, 18, 8.0, 26.0)
+    values = (picture(9, 12) - 0.5).astype(np.float32)
+    coc_px = np.float32(side) * waves(9, 12, 8.0, 26.0)
     expected = plain_scatter(values, coc_px, name)
     np.testing.assert_allclose(SUMS_ONLY.sum_kernels(values, coc_px, APERTURES[name]), expected, atol=6e-8 * np.abs(expected).max())
     single = PolygonDifferences(exact_below_px=6.0, exact_highlights=False, precision="single")
@@ -121,14 +119,11 @@ def test_near_the_exact_kernels_of_the_true_aperture(name: str, least_db: float)
 @pytest.mark.parametrize("diameter_px", [8.0, 9.0, 13.0, 16.0, 21.5, 40.0, -33.3])
 def test_rims_are_where_they_belong(diameter_px: float) -> None:
     """Off the exact coverage of the octagon by at most 0.16 of a pixel anywhere, and in all by a few hundredths of its rim."""
-    kernel, size = point(61, diameter_px, APERTURES["octagon"]), 61
-    psf = APERTURES["octagon"].rasterize(diameter_px).kernel
-    exact = np.pad(psf, (size - psf.shape[0]) // 2)
+    kernel, psf = point(61, diameter_px, APERTURES["octagon"]), APERTURES["octagon"].rasterize(diameter_px).kernel
+    exact, squares = np.pad(psf, (61 - psf.shape[0]) // 2), (np.indices((61, 61)) - 30) ** 2
     assert np.abs(kernel - exact).max() < 0.16 * exact.max()
     assert np.abs(kernel - exact).sum() < 0.5 / abs(diameter_px)
-    assert (kernel * (np.indices((size, size)) - size // 2) ** 2).sum() == pytest.approx(
-        (exact * (np.indices((size, size)) - size // 2) ** 2).sum(), rel=0.01
-    )
+    assert (kernel * squares).sum() == pytest.approx((exact * squares).sum(), rel=0.01)
 
 
 @pytest.mark.parametrize("name", APERTURES)
@@ -166,26 +161,6 @@ def test_what_is_in_focus_stays_bit_for_bit() -> None:
     np.testing.assert_allclose(DEFAULT.sum_kernels(values, coc_px, APERTURES["disc"])[:, :180], values[:, :180], atol=1e-7)
 
 
-def test_it_is_linear() -> None:
-    one, two = picture(40, 50, seed=1), picture(40, 50, seed=2)
-    coc_px = waves(40, 50, 0.0, 25.0)
-    disc = APERTURES["disc"]
-    both = SUMS_ONLY.sum_kernels(one + 3.0 * two, coc_px, disc)
-    np.testing.assert_allclose(both, SUMS_ONLY.sum_kernels(one, coc_px, disc) + 3.0 * SUMS_ONLY.sum_kernels(two, coc_px, disc), atol=2e-6)
-    np.testing.assert_array_equal(DEFAULT.sum_kernels(4.0 * one, coc_px, disc), 4.0 * DEFAULT.sum_kernels(one, coc_px, disc))
-
-
-@pytest.mark.parametrize("renderer", [SUMS_ONLY, DEFAULT], ids=["sums only", "default"])
-def test_a_moved_picture_gives_a_moved_result(renderer: PolygonDifferences) -> None:
-    """Lamps among it, by steps that are no multiples of any tile."""
-    values, coc_px = np.zeros((120, 130, 4), np.float32), np.zeros((120, 130), np.float32)
-    values[30:70, 40:80], coc_px[30:70, 40:80] = picture(40, 40), waves(40, 40, 0.0, 22.0)
-    values[50, 60] = values[33, 43] = 1e3
-    result = renderer.sum_kernels(values, coc_px, APERTURES["heart"])
-    moved = renderer.sum_kernels(np.roll(values, (5, 11), (0, 1)), np.roll(coc_px, (5, 11), (0, 1)), APERTURES["heart"])
-    np.testing.assert_allclose(moved, np.roll(result, (5, 11), (0, 1)), rtol=2e-6, atol=2e-6)
-
-
 @pytest.mark.parametrize("name", ["octagon", "heart"])
 @pytest.mark.parametrize(("from_px", "to_px", "renderer"), [(0.95, 1.5, DEFAULT), (5.9, 7.1, SUMS_ONLY), (12.0, 13.0, SUMS_ONLY)])
 def test_a_focus_pull_does_not_pop(name: str, from_px: float, to_px: float, renderer: PolygonDifferences) -> None:
@@ -198,20 +173,12 @@ def test_a_focus_pull_does_not_pop(name: str, from_px: float, to_px: float, rend
     assert max(change.sum() for change in changes) < 0.06 / from_px
 
 
-@pytest.mark.parametrize("name", APERTURES)
-def test_an_even_field_stays_even(name: str) -> None:
-    values = np.full((150, 150, 4), 0.7, np.float32)
-    for coc_px in (6.5, 23.4, -37.0):
-        inside = DEFAULT.sum_kernels(values, np.full((150, 150), coc_px, np.float32), APERTURES[name])[25:-25, 25:-25]
-        np.testing.assert_allclose(inside, 0.7, rtol=1e-5)
-
-
 def test_lights_of_1e5_leave_their_surroundings_alone() -> None:
     """Error below 1e-4 of the local signal, beside and behind lights of 1e5 under small and large kernels. Against the plain
     twin in float64, so that all light goes through the sums."""
-    values, coc_px = 0.1 * picture(32, 40), waves(32, 40, 8.0, 24.0)
-    values[8, 12:16] = values[22, 28] = values[14, 34] = 1e5
-    coc_px[22, 28] = 8.0
+    values, coc_px = 0.1 * picture(20, 26), waves(20, 26, 8.0, 24.0)
+    values[5, 8:12] = values[14, 18] = values[9, 22] = 1e5
+    coc_px[14, 18] = 8.0
     expected = plain_scatter(values, coc_px, "octagon")
     automatic = PolygonDifferences(exact_below_px=6.0, exact_highlights=False)
     error = np.abs(automatic.sum_kernels(values, coc_px, APERTURES["octagon"]) - expected)
@@ -222,7 +189,7 @@ def test_lights_of_1e5_leave_their_surroundings_alone() -> None:
 
 @pytest.mark.parametrize("precision", ["single", "double"])
 def test_the_same_bits_for_any_number_of_threads(precision) -> None:  # type: ignore[no-untyped-def]
-    values, coc_px = picture(500, 300), waves(500, 300, 0.0, 30.0)
+    values, coc_px = picture(300, 200), waves(300, 200, 0.0, 30.0)
     values[200:210, 40] = 500.0
     one, three = (PolygonDifferences(threads=n, precision=precision).sum_kernels(values, coc_px, APERTURES["disc"]) for n in (1, 3))
     np.testing.assert_array_equal(one, three)
@@ -230,7 +197,7 @@ def test_the_same_bits_for_any_number_of_threads(precision) -> None:  # type: ig
 
 
 def test_calls_from_several_threads_do_not_meet() -> None:
-    pictures = [(picture(100 + 20 * i, 400, seed=i), waves(100 + 20 * i, 400, 0.0, 10.0 + 5.0 * i)) for i in range(6)]
+    pictures = [(picture(60 + 20 * i, 200, seed=i), waves(60 + 20 * i, 200, 0.0, 10.0 + 5.0 * i)) for i in range(4)]
     renderer = PolygonDifferences(threads=2)
     alone = [renderer.sum_kernels(values, coc_px, APERTURES["disc"]) for values, coc_px in pictures]
     with ThreadPoolExecutor(4) as pool:
@@ -245,24 +212,6 @@ def test_bands_and_parts_leave_no_seams(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.setattr(polygon_differences, "BAND_ROWS", 16)
     monkeypatch.setattr(polygon_differences, "RING_BYTES", 1)
     np.testing.assert_allclose(DEFAULT.sum_kernels(values, coc_px, APERTURES["disc"]), whole, atol=2e-6)
-
-
-def test_tiles_with_a_margin_make_the_same_picture() -> None:
-    values, coc_px = picture(90, 140, seed=4), waves(90, 140, 0.0, 20.0)
-    whole = DEFAULT.sum_kernels(values, coc_px, APERTURES["octagon"])
-    left, right = (DEFAULT.sum_kernels(values[:, part], coc_px[:, part], APERTURES["octagon"]) for part in (slice(0, 83), slice(57, 140)))
-    np.testing.assert_allclose(np.concatenate([left[:, :70], right[:, 13:]], axis=1), whole, atol=2e-6)
-
-
-@pytest.mark.parametrize("channels", [1, 4, 7])
-def test_any_number_of_channels_goes_the_same_way(channels: int) -> None:
-    """Extra channels may be signed, and lie under the same kernels as the first."""
-    values, coc_px = picture(60, 50, channels), waves(60, 50, 0.0, 20.0)
-    values[30, 20, 0] = 900.0
-    values[..., -1] = -2.0 * values[..., 0]
-    result = DEFAULT.sum_kernels(values, coc_px, APERTURES["ring"])
-    assert result.shape == values.shape and result.dtype == np.float32
-    np.testing.assert_allclose(result[..., -1], (-2.0 if channels > 1 else 1.0) * result[..., 0], rtol=1e-5, atol=1e-5)
 
 
 def test_pixels_without_light_have_no_say() -> None:
@@ -285,32 +234,23 @@ def test_light_beyond_the_border_is_lost() -> None:
 
 
 def test_mistakes_are_named() -> None:
-    values, coc_px = picture(10, 10), np.full((10, 10), np.nan, np.float32)
     with pytest.raises(InputError, match="finite circle of confusion"):
-        DEFAULT.sum_kernels(values, coc_px, APERTURES["disc"])
-    with pytest.raises(InputError, match="exact_below_px"):
-        PolygonDifferences(exact_below_px=0.5)
-
-
-def test_it_renders_layers() -> None:
-    """Mean colour of an opaque picture of one depth is kept, under the shared layering."""
-    lens = Lens(50.0, 2.0, 1.0, 36.0)
-    rgb = picture(64, 96, 3)
-    result = DEFAULT.render([opaque(rgb, np.full((64, 96), 3.0, np.float32))], lens)
-    assert result.rgb.shape == rgb.shape and result.alpha.min() == 1.0
-    np.testing.assert_allclose(result.rgb.mean((0, 1)), rgb.mean((0, 1)), rtol=0.02)
-    assert result.rgb.std() < 0.5 * rgb.std()
+        DEFAULT.sum_kernels(picture(10, 10), np.full((10, 10), np.nan, np.float32), APERTURES["disc"])
+    for wrong in ({"exact_below_px": 0.5}, {"halve_from_px": 10.0}):
+        with pytest.raises(InputError, match=next(iter(wrong))):
+            PolygonDifferences(**wrong)
 
 
 def test_sparse_light_is_spread_like_any() -> None:
     """A curved band of light and a few islands, worked through in narrow parts, and the rest of the picture: together the whole."""
-    values, coc_px = picture(400, 500), waves(400, 500, 5.0, 24.0)
-    y, x = np.mgrid[:400, :500]
-    sparse = (np.abs(y - 200 - 120 * np.sin(x / 80.0)) < 12) | (np.hypot(y - 40, x - 400) < 9) | (np.hypot(y - 380, x - 20) < 5)
-    renderer = PolygonDifferences(exact_highlights=False, precision="double")
+    values, coc_px = picture(240, 300), waves(240, 300, 5.0, 24.0)
+    y, x = np.mgrid[:240, :300]
+    sparse = (np.abs(y - 120 - 70 * np.sin(x / 50.0)) < 8) | (np.hypot(y - 24, x - 240) < 9) | (np.hypot(y - 220, x - 20) < 5)
     octagon = APERTURES["octagon"]
-    parts = [renderer.sum_kernels(np.where(mask[..., None], values, 0.0).astype(np.float32), coc_px, octagon) for mask in (sparse, ~sparse)]
-    np.testing.assert_allclose(parts[0] + parts[1], renderer.sum_kernels(values, coc_px, octagon), atol=3e-7)
+    parts = [
+        RECTIFIED.sum_kernels(np.where(mask[..., None], values, 0.0).astype(np.float32), coc_px, octagon) for mask in (sparse, ~sparse)
+    ]
+    np.testing.assert_allclose(parts[0] + parts[1], RECTIFIED.sum_kernels(values, coc_px, octagon), atol=3e-7)
     assert 0.0 < sparse.mean() < 0.2
 
 

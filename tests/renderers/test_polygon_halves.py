@@ -1,21 +1,19 @@
 """Polygonal differences at half the resolution: what is far out of focus, against the same at full resolution and a plain twin."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 
+from mrbokeh.images.image_metrics import psnr
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from mrbokeh.system.errors import InputError
 from tests.renderers.test_polygon_differences import picture, plain_scatter
 
 OCTAGON, HEART = Aperture.blades(8, np.pi / 8), Aperture.heart()
 FULL = PolygonDifferences(halve_from_px=np.inf, exact_highlights=False, precision="double")
 RENDERER = PolygonDifferences(halve_from_px=64.0)
 HALVED = PolygonDifferences(halve_from_px=64.0, exact_highlights=False, precision="double")
-
-
-def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    return float(-10.0 * np.log10(np.mean((a.astype(np.float64) - b) ** 2)))
 
 
 def hills(height: int, width: int, low_px: float, high_px: float) -> np.ndarray:
@@ -32,26 +30,22 @@ def shares(pixel: int) -> list[tuple[int, float]]:
 def plainly_halved(values: np.ndarray, diameter_px: float, name: str) -> np.ndarray:
     """Every pixel of one diameter to four cells, cells as pixels of half the diameter, and every pixel from four cells."""
     height, width, channels = values.shape
-    half = np.zeros((height // 2 + 2, width // 2 + 2, channels), np.float64)
-    for y in range(height):
-        for x in range(width):
-            for row, down in shares(y):
-                for column, across in shares(x):
-                    half[row, column] += down * across * values[y, x]
+    half, result = np.zeros((height // 2 + 2, width // 2 + 2, channels), np.float64), np.zeros(values.shape)
+    for y, x in np.ndindex(height, width):
+        for (row, down), (column, across) in product(shares(y), shares(x)):
+            half[row, column] += down * across * values[y, x]
     spread = plain_scatter(half.astype(np.float32), np.full(half.shape[:2], 0.5 * diameter_px, np.float32), name)
-    result = np.zeros(values.shape)
-    for y in range(height):
-        for x in range(width):
-            result[y, x] = sum(0.25 * down * across * spread[row, column] for row, down in shares(y) for column, across in shares(x))
+    for y, x in np.ndindex(height, width):
+        result[y, x] = sum(0.25 * down * across * spread[row, column] for (row, down), (column, across) in product(shares(y), shares(x)))
     return result
 
 
 @pytest.mark.parametrize(("name", "diameter_px"), [("octagon", 73.0), ("heart", -80.4)])
 def test_the_plain_twin_agrees(name: str, diameter_px: float) -> None:
-    values = picture(20, 26)
+    values = picture(12, 16)
     aperture = {"octagon": OCTAGON, "heart": HEART}[name]
     expected = plainly_halved(values, diameter_px, name)
-    reached = HALVED.sum_kernels(values, np.full((20, 26), diameter_px, np.float32), aperture)
+    reached = HALVED.sum_kernels(values, np.full((12, 16), diameter_px, np.float32), aperture)
     np.testing.assert_allclose(reached, np.maximum(expected, 0.0), atol=3e-7 * expected.max())
 
 
@@ -75,13 +69,6 @@ def test_light_stays_in_place_on_odd_and_even_pixels(place: tuple[int, int], dia
     y, x = np.mgrid[:300, :300]
     assert spread.sum() == pytest.approx(1.0, abs=1e-5)
     assert ((spread * y).sum(), (spread * x).sum()) == pytest.approx(place, abs=2e-3)
-
-
-def test_an_even_field_stays_even() -> None:
-    for diameter_px in (65.0, 70.0, 90.0, -230.0):
-        values, coc_px = np.full((401, 433, 4), 0.7, np.float32), np.full((401, 433), diameter_px, np.float32)
-        inside = HALVED.sum_kernels(values, coc_px, OCTAGON)[130:-130, 130:-130]
-        np.testing.assert_allclose(inside, 0.7, rtol=1e-5)
 
 
 def test_edges_of_depth_are_not_halved() -> None:
@@ -116,11 +103,6 @@ def test_highlights_are_spread_whole_at_full_resolution() -> None:
 
 
 def test_threads_do_not_change_a_bit() -> None:
-    values, coc_px = picture(640, 700), hills(640, 700, 10.0, 150.0)
+    values, coc_px = picture(400, 360), hills(400, 360, 10.0, 150.0)
     one, three = (PolygonDifferences(halve_from_px=64.0, threads=threads).sum_kernels(values, coc_px, OCTAGON) for threads in (1, 3))
     np.testing.assert_array_equal(one, three)
-
-
-def test_what_halving_needs_is_said() -> None:
-    with pytest.raises(InputError, match="halve_from_px"):
-        PolygonDifferences(halve_from_px=10.0)

@@ -1,5 +1,6 @@
 """Layered reconstruction by torch agrees with the compiled one, step by step and in its pictures."""
 
+import importlib
 import os
 import subprocess
 import sys
@@ -24,8 +25,8 @@ from mrbokeh.renderers.layered_reconstruction._filter_numba import sheared_slope
 from mrbokeh.renderers.layered_reconstruction._filter_numba import slope_distance as slope_distance_compiled
 from mrbokeh.renderers.layered_reconstruction._partitions_numba import seeded, xorshift
 from mrbokeh.stacks.light_field_samples_file import read_samples
-from mrbokeh.system.errors import InputError
-from tests.scenes.sampled_planes import LENS, Plane, checker, even, fence_scene, sample_planes, truth
+from mrbokeh.system.errors import InputError, MissingExtraError
+from tests.scenes.sampled_planes import LENS, fence_scene, sample_planes
 
 torch = pytest.importorskip("torch")
 
@@ -183,43 +184,6 @@ def test_how_much_is_done_at_a_time_changes_nothing(monkeypatch: pytest.MonkeyPa
     np.testing.assert_allclose(by_torch(fence_samples()), whole, atol=2e-6)
 
 
-# Pictures.
-
-
-@pytest.mark.parametrize("screen_filter", ["windows", "sheared", "direct"])
-def test_an_even_light_field_stays_even(screen_filter: str) -> None:
-    """Whatever lies at whichever depth and moves however: weights are shares."""
-    samples = sample_planes([replace(plane, colour=even(0.37)) for plane in fence_scene(SIZE_PX)], SIZE_PX, 4)
-    found = by_torch(samples, Settings(screen_filter=screen_filter))  # type: ignore[arg-type]
-    np.testing.assert_allclose(found, 0.37, rtol=1e-4)
-
-
-def test_a_sharp_still_plane_is_the_mean_of_its_samples() -> None:
-    samples = sample_planes([Plane(checker(5.3))], SIZE_PX, 8)
-    np.testing.assert_allclose(by_torch(samples, replace(Settings(), enough=np.inf)), samples.raw_picture(), atol=1e-5)
-
-
-def test_a_lamp_out_of_focus_keeps_its_light() -> None:
-    """One pixel of 100 at its own depth, spread over a disc of 6 px; the truth holds chance in how many samples see it."""
-    lamp = Plane(even(100.0), -6.0, covers=lambda x, y: (np.abs(x - 30.5) < 0.5) & (np.abs(y - 12.5) < 0.5))
-    planes = [lamp, Plane(even(0.0), 0.0)]
-    light = truth(planes, SIZE_PX, 256).sum()
-    found = by_torch(sample_planes(planes, SIZE_PX, 8))
-    assert found.sum() == pytest.approx(light, rel=0.25)
-    assert (found[..., 0] > 0.5).sum() == pytest.approx(np.pi * 9.0, rel=0.5), "a disc of 28 px, its rim uneven"
-
-
-def test_a_blurred_front_over_a_sharp_back_is_nearer_to_the_truth_than_its_samples() -> None:
-    """The 6 dB that are asked of the compiled renderer; where the bar covers everything or nothing its picture is known."""
-    bar = Plane(even(0.9), -12.0, covers=lambda x, _: np.abs(x - 22.0) < 9.0)
-    planes = [bar, Plane(checker(8.0), 0.0)]
-    exact, samples = truth(planes, SIZE_PX, 512), sample_planes(planes, SIZE_PX, 8)
-    found = by_torch(samples)
-    assert psnr(found, exact) > psnr(samples.raw_picture(), exact) + 6.0
-    np.testing.assert_allclose(found[:, 21:23], exact[:, 21:23], atol=0.01)
-    np.testing.assert_allclose(found[:, :5], samples.raw_picture()[:, :5], atol=0.02)
-
-
 # Steps.
 
 
@@ -322,30 +286,20 @@ def test_kernels_of_pupil_and_shutter_keep_light_and_have_their_variance() -> No
 # Mistakes, and what is not there.
 
 
-@pytest.mark.parametrize("device", ["tpu", "cuda:99", "mps"])
-def test_devices_that_are_not_there_are_refused(device: str) -> None:
-    with pytest.raises(InputError, match="device"):
-        TorchReconstruction(device=device)
-
-
-def test_filters_that_are_not_there_are_refused() -> None:
+def test_devices_and_filters_that_are_not_there_are_refused() -> None:
+    for device in ("tpu", "cuda:99", "mps"):
+        with pytest.raises(InputError, match="device"):
+            TorchReconstruction(device=device)
     with pytest.raises(InputError, match="windows, sheared, direct"):
         by_torch(fence_samples(), Settings(screen_filter="texture"))
 
 
-def test_without_torch_it_says_what_to_install() -> None:
-    code = """
-import sys
-sys.modules["torch"] = None
-from mrbokeh.system.errors import MissingExtraError
-try:
-    import mrbokeh.renderers.layered_reconstruction.torch_reconstruction
-except MissingExtraError as error:
-    assert "mrbokeh[train]" in str(error)
-    print("said so")
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "said so"
+@pytest.mark.parametrize("module", ["layered_reconstruction.torch_reconstruction", "spreadlets.torch_spreadlets"])
+def test_without_torch_it_says_what_to_install(module: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.delitem(sys.modules, name := f"mrbokeh.renderers.{module}", raising=False)
+    with pytest.raises(MissingExtraError, match=r"mrbokeh\[train\]"):
+        importlib.import_module(name)
 
 
 # Kernels for GPUs, interpreted, which has to be said before they are imported, and compiled for one that is not there.

@@ -226,17 +226,6 @@ def test_a_bank_of_three_colours_is_that_of_the_cpu() -> None:
     np.testing.assert_allclose(found, known, atol=3e-6)
 
 
-def test_light_is_kept_but_for_what_the_glass_absorbs() -> None:
-    """A patch amid a dark frame that all of its light stays in; the throughput of the bank, and coverage whole."""
-    values = np.zeros((90, 96, 4), np.float32)
-    values[40:50, 40:56] = picture(10)[24:34, :16]
-    for size, coc_px in ((0, 10.0), (1, 30.0)):
-        found = TorchSpreadlets(chromatic(), "cpu", None).sum_kernels(layer_of(values, np.full((90, 96), coc_px, np.float32)))
-        light, sent = found.numpy().astype(np.float64).sum(axis=(0, 1)), values.astype(np.float64).sum(axis=(0, 1))
-        np.testing.assert_allclose(light[:3], sent[:3] * chromatic().throughput[size], rtol=1e-5)
-        np.testing.assert_allclose(light[3:], sent[3], rtol=1e-5)
-
-
 def two_layers() -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     """In front a board with a hole, half there; behind an opaque picture."""
     board = 0.5 * picture(11)
@@ -279,23 +268,6 @@ def test_mistakes() -> None:
         add_light_on("cpu")(picture(), picture(), np.zeros(SIZE, np.int32), some_points(), "pyramid", 1)
     with pytest.raises(InputError, match="3 x 3"):
         integrate(torch.zeros(1, 2, 5))
-
-
-def test_without_torch_the_renderer_is_there_and_the_device_is_not() -> None:
-    code = """
-import sys
-import mrbokeh.renderers.spreadlets.laplacian_spreadlets
-assert "torch" not in sys.modules
-sys.modules["torch"] = None
-from mrbokeh.system.errors import MissingExtraError
-try:
-    import mrbokeh.renderers.spreadlets.torch_spreadlets
-except MissingExtraError as error:
-    assert "mrbokeh[train]" in str(error)
-    print("said so")
-"""
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "said so"
 
 
 def test_the_kernel_for_gpus_gives_the_same_bits() -> None:
