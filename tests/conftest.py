@@ -56,7 +56,7 @@ class _ChecksOfFirstCalls:
 
 
 jaxtyping.jaxtyped = _ChecksOfFirstCalls()
-jaxtyping.install_import_hook(_modules(), "beartype.beartype")
+jaxtyping.install_import_hook(_modules(), "tests.checked")
 
 
 def pytest_collection() -> None:
@@ -87,7 +87,6 @@ LONG_FILES = (
     "renderers/test_between_network.py",
     "live/test_page_browser.py",
     "compositing/test_compositing_rims.py",
-    "bench/test_spreadlet_benches.py",
     "house/test_demo.py",
     "learning/test_network_field.py",
     "learning/test_ablation.py",

@@ -10,9 +10,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt32
 
-from datasets_scripts.tracers._moving_bodies_numba import DIMENSIONS as SAMPLER_DIMENSIONS
-from mrbokeh.system.errors import InputError
-
 DIMENSIONS = 4
 
 
@@ -23,16 +20,6 @@ def sobol_table(samples: int) -> UInt32[np.ndarray, "samples 4"]:
     sequence = qmc.Sobol(DIMENSIONS, scramble=False, bits=32)
     points = sequence.random(1 << max(0, (samples - 1).bit_length()))[:samples]
     return np.round(points * 2.0**32).astype(np.uint64).astype(np.uint32)
-
-
-def mirrored_sobol(count: int) -> UInt32[np.ndarray, "count 5"]:
-    """Return the first points of the five-dimensional Sobol sequence as 32-bit fractions with their bits in reverse order."""
-    from scipy.stats import qmc
-
-    if count < 1:
-        raise InputError(f"expected at least 1 sample per pixel, got {count}")
-    points = qmc.Sobol(SAMPLER_DIMENSIONS, scramble=False, bits=32).random_base2((count - 1).bit_length())[:count]
-    return reversed_bits(np.round(points * 2.0**32).astype(np.uint64).astype(np.uint32))
 
 
 def owen_scrambled(bits: Any, seed: Any, reverse_bits: Callable[[Any], Any]) -> Any:

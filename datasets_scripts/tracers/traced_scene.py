@@ -1,7 +1,7 @@
-"""Bodies that our ray tracers see: textured quads and spheres and small bright discs with simple light, at rest or in motion."""
+"""Bodies that our ray tracer sees: textured quads and spheres and small bright discs with simple light."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -10,9 +10,6 @@ from mrbokeh.system.errors import InputError
 
 Texture = Float32[np.ndarray, "_ _ 3"]
 Vector = tuple[float, float, float]
-
-_STILL: Vector = (0.0, 0.0, 0.0)
-_SUN_DIRECTION: Vector = (-0.36, -0.64, -0.68)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,62 +90,6 @@ def emissive_quad(
 
 def plain_texture(rgb: Vector) -> Texture:
     return np.full((1, 1, 3), rgb, np.float32)
-
-
-@dataclass(frozen=True, eq=False)
-class Mover:
-    """A body where it is in the middle of the exposure, and what it moves in metres per shutter.
-
-    is_round: of a quad, only the ellipse that touches its edges. in_front: part of the front layer, else of the rest.
-    """
-
-    body: Quad | Sphere | DiscLight
-    velocity_m: Vector = _STILL
-    is_round: bool = False
-    in_front: bool = False
-
-
-@dataclass(frozen=True, eq=False)
-class MovingScene:
-    """Bodies and light; axes of the camera (x right, y down, z forward, the lens at the origin), metres."""
-
-    movers: tuple[Mover, ...]
-    sun_direction: Vector = _SUN_DIRECTION
-    sun: float = 0.75
-    ambient: float = 0.45
-    background_rgb: Vector = (0.0, 0.0, 0.0)
-
-    @property
-    def ordered(self) -> tuple[Mover, ...]:
-        """Quads first, then spheres, then lamps: the order of a packed scene."""
-        return tuple(mover for kind in (Quad, Sphere, DiscLight) for mover in self.movers if isinstance(mover.body, kind))
-
-    @property
-    def has_layers(self) -> bool:
-        return len({mover.in_front for mover in self.movers}) == 2
-
-    def part(self, in_front: bool) -> "MovingScene":
-        """Return the front layer or everything else, as if the other were not there."""
-        return replace(self, movers=tuple(mover for mover in self.movers if mover.in_front == in_front))
-
-    def at(self, time: float) -> Scene:
-        """Return all bodies where they are at a time of the exposure, 0 to 1."""
-        moved = [_moved(mover.body, (time - 0.5) * np.asarray(mover.velocity_m)) for mover in self.ordered]
-        return Scene(
-            quads=tuple(body for body in moved if isinstance(body, Quad)),
-            spheres=tuple(body for body in moved if isinstance(body, Sphere)),
-            lights=tuple(body for body in moved if isinstance(body, DiscLight)),
-            sun_direction=self.sun_direction,
-            sun=self.sun,
-            ambient=self.ambient,
-            background_rgb=self.background_rgb,
-        )
-
-
-def _moved(body: Quad | Sphere | DiscLight, by_m: np.ndarray) -> Quad | Sphere | DiscLight:
-    if isinstance(body, Quad):
-        return replace(body, corner_m=vector(body.corner_m + by_m))
-    return replace(body, centre_m=vector(body.centre_m + by_m))
 
 
 def vector(values: Sequence[float] | np.ndarray) -> Vector:

@@ -3,7 +3,7 @@
 The scene after Hasselgren 2015, Fig. 8 (an out-of-focus fence before a moving checkerboard and a slanted one) and a strongly slanted
 plane, both met by rays in closed form; truth is 1024 samples a pixel. Yardsticks: the raw samples, and OpenCV's and
 scikit-image's non-local means of them, each with the strength that suits the truth best (which nobody knows in earnest).
-FOLDER: sets of `datasets_scripts/render_samples.py`, met against their references instead, in linear light and as displayed
+FOLDER: sets of samples as in tests/data/samples, met against their references instead, in linear light and as displayed
 (sRGB), both clipped to [0, 1], in which papers count.
 """
 
