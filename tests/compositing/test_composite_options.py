@@ -65,17 +65,15 @@ def changed(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return np.abs(one - other).max(axis=2) > 2e-3
 
 
-def test_without_depth_it_stands_before_everything_and_with_it_the_post_hides_a_part(files: Path) -> None:
+def test_depth_hides_a_part_and_may_come_as_disparity(files: Path) -> None:
     before, behind = put_in(files), put_in(files, "--depth", files / "depth.exr")
     assert before[50, 35].min() > 0.9 and behind[50, 35].max() < 0.5
     np.testing.assert_array_equal(before[50, 60:80], behind[50, 60:80])
-
-
-def test_depth_may_come_as_disparity(files: Path) -> None:
-    """0.8 / depth is even in dioptres: 1 (white) at 0.8 m, 0 at infinity."""
+    # 0.8 / depth is even in dioptres: 1 (white) at 0.8 m, 0 at infinity.
     words = ("--depth", files / "disparity.png", "--disparity", "0.8:inf", "--mode", "over")
     stated = put_in(files, "--depth", files / "depth.exr", "--mode", "over")
     assert changed(put_in(files, *words), stated).mean() < 0.01
+    np.testing.assert_allclose(put_in(files, card="deep.exr"), put_in(files), atol=2e-3)
 
 
 def test_a_matte_with_its_distance_does_without_depth(files: Path) -> None:
@@ -96,10 +94,6 @@ def test_every_mode_leaves_what_it_does_not_touch(files: Path, mode: str) -> Non
     stored = plate_rgb().astype(np.float16).astype(np.float32)
     np.testing.assert_array_equal(picture[:20], stored[:20])
     assert changed(picture, stored)[50, 70]
-
-
-def test_a_deep_picture_is_what_it_flattens_to(files: Path) -> None:
-    np.testing.assert_allclose(put_in(files, card="deep.exr"), put_in(files), atol=2e-3)
 
 
 def test_sharp_layers_go_out_as_a_deep_picture(files: Path) -> None:
@@ -187,9 +181,8 @@ def test_the_ground_catches_a_shadow_or_all_that_changes(files: Path) -> None:
 
 def test_a_scene_file_with_its_camera(files: Path) -> None:
     """Seen from 5 cm to the right the cake stands 0.05 / 2 * 216 px = 5.4 px farther left."""
-    (files / "scene.toml").write_text(
-        f'up = "-y"\n[[object]]\nname = "cake"\nglb = "{CAKE}"\nposition_m = [0.0, 0.1, 2.0]\nheight_m = 0.2\n'
-    )
+    cake = f'[[object]]\nname = "cake"\nglb = "{CAKE}"\nposition_m = [0.0, 0.1, 2.0]\nheight_m = 0.2\n'
+    (files / "scene.toml").write_text(f'up = "-y"\n{cake}')
     focal_px = LENS.focal_px(WIDTH)
     camera = {"width_px": WIDTH, "height_px": HEIGHT, "focal_px": [focal_px, focal_px], "principal_px": [WIDTH / 2, HEIGHT / 2]}
     pose = np.eye(4)

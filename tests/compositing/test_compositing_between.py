@@ -45,8 +45,10 @@ def photograph(lens: Lens = LENS) -> Plate:
     return replace(plate_of(blurred, lens, depth_m), sharp_rgb=sharp)
 
 
-def columns() -> np.ndarray:
-    return np.arange(WIDTH) + 0.5
+def whole_wall() -> Layer:
+    """A red wall that fills the picture."""
+    rgb = np.broadcast_to(RED, (HEIGHT, WIDTH, 3)).copy()
+    return Layer(rgb, np.ones((HEIGHT, WIDTH), np.float32), np.full((HEIGHT, WIDTH), VIRTUAL_M, np.float32))
 
 
 def middle_row(plate: Plate, virtual: Layer, between: Between | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -58,7 +60,7 @@ def middle_row(plate: Plate, virtual: Layer, between: Between | None = None) -> 
 def half_share(lens: Lens, depth_m: float) -> np.ndarray:
     """What a half plane on the left of the edge covers of the pupil, by column; in focus an edge between pixels is sharp."""
     coc_px = max(abs(float(lens.coc_px(depth_m, WIDTH))), 0.5)
-    return 1.0 - disc_share(2.0 * (columns() - EDGE) / coc_px)
+    return 1.0 - disc_share(2.0 * (np.arange(WIDTH) + 0.5 - EDGE) / coc_px)
 
 
 def shares(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
@@ -67,15 +69,14 @@ def shares(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
 
 
 def test_an_object_that_fills_the_picture_shows_where_the_near_thing_does_not() -> None:
-    whole = Layer(
-        np.broadcast_to(RED, (HEIGHT, WIDTH, 3)).copy(),
-        np.ones((HEIGHT, WIDTH), np.float32),
-        np.full((HEIGHT, WIDTH), VIRTUAL_M, np.float32),
-    )
-    rgb, share = middle_row(photograph(), whole)
+    """Or the matte of a user in place of sharp picture and depth: near green over blue is solved from the photograph alone."""
+    rgb, share = middle_row(photograph(), whole_wall())
     near, _ = shares(LENS)
-    np.testing.assert_allclose(rgb, near[:, None] * GREEN + (1.0 - near)[:, None] * RED, atol=0.012)
+    expected = near[:, None] * GREEN + (1.0 - near)[:, None] * RED
+    np.testing.assert_allclose(rgb, expected, atol=0.012)
     np.testing.assert_allclose(share, 1.0 - near, atol=0.012)
+    plate = replace(photograph(), depth_m=None, sharp_rgb=None, near_alpha=half_plane(True, NEAR_M, GREEN).alpha)
+    np.testing.assert_allclose(middle_row(plate, whole_wall(), Between(near_depth_m=NEAR_M))[0], expected, atol=0.06)
 
 
 def test_an_object_hidden_by_the_same_half_of_the_pupil_does_not_show() -> None:
@@ -91,34 +92,16 @@ def test_an_object_hidden_by_the_same_half_of_the_pupil_does_not_show() -> None:
     assert abs(share[EDGE - 24]) < 0.04 < 0.2 < near[EDGE - 24] * (1.0 - virtual[EDGE - 24])
 
 
-def test_an_object_in_the_other_half_of_the_pupil_shows_whole() -> None:
+@pytest.mark.parametrize(("focus_m", "tolerance"), [(LENS.focus_distance_m, 0.025), (0.8, 0.04), (1.4, 0.04)])
+def test_an_object_in_the_other_half_of_the_pupil_shows_whole(focus_m: float, tolerance: float) -> None:
     """At the edge each takes its half and nothing is left for what is far; multiplied, a quarter would be left."""
-    rgb, share = middle_row(photograph(), half_plane(False, VIRTUAL_M, RED))
-    near, left_part = shares(LENS)
-    seen = np.minimum(1.0 - left_part, 1.0 - near)
-    np.testing.assert_allclose(share, seen, atol=0.025)
-    np.testing.assert_allclose(rgb, near[:, None] * GREEN + seen[:, None] * RED + (1.0 - near - seen)[:, None] * BLUE, atol=0.03)
-
-
-@pytest.mark.parametrize("focus_m", [0.8, 1.4])
-def test_the_same_on_both_sides_of_the_focus(focus_m: float) -> None:
     lens = LENS.focused_at(focus_m)
-    _, share = middle_row(photograph(lens), half_plane(False, VIRTUAL_M, RED))
+    rgb, share = middle_row(photograph(lens), half_plane(False, VIRTUAL_M, RED))
     near, left_part = shares(lens)
-    np.testing.assert_allclose(share, np.minimum(1.0 - left_part, 1.0 - near), atol=0.04)
-
-
-def test_a_matte_of_the_user_stands_in_for_sharp_picture_and_depth() -> None:
-    """Near green over blue is solved from the photograph alone."""
-    plate = replace(photograph(), depth_m=None, sharp_rgb=None, near_alpha=half_plane(True, NEAR_M, GREEN).alpha)
-    whole = Layer(
-        np.broadcast_to(RED, (HEIGHT, WIDTH, 3)).copy(),
-        np.ones((HEIGHT, WIDTH), np.float32),
-        np.full((HEIGHT, WIDTH), VIRTUAL_M, np.float32),
-    )
-    rgb, _ = middle_row(plate, whole, Between(near_depth_m=NEAR_M))
-    near, _ = shares(LENS)
-    np.testing.assert_allclose(rgb, near[:, None] * GREEN + (1.0 - near)[:, None] * RED, atol=0.06)
+    seen = np.minimum(1.0 - left_part, 1.0 - near)
+    np.testing.assert_allclose(share, seen, atol=tolerance)
+    if lens == LENS:
+        np.testing.assert_allclose(rgb, near[:, None] * GREEN + seen[:, None] * RED + (1.0 - near - seen)[:, None] * BLUE, atol=0.03)
 
 
 def test_where_rays_see_one_far_colour_the_pupil_is_shared_as_in_over(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -140,15 +123,7 @@ def test_where_rays_see_one_far_colour_the_pupil_is_shared_as_in_over(monkeypatc
     np.testing.assert_allclose(short.virtual.alpha, whole.virtual.alpha, atol=1e-5)
 
 
-def test_what_is_missing_is_asked_for() -> None:
-    virtual, bare = half_plane(True, VIRTUAL_M, RED), replace(photograph(), depth_m=None, sharp_rgb=None)
-    with pytest.raises(InputError, match=r"needs depth .* or a matte"):
-        Between().insert(bare, [virtual], ScatterReference())
-    with pytest.raises(InputError, match="needs its distance"):
-        Between().insert(replace(bare, near_alpha=virtual.alpha), [virtual], ScatterReference())
-
-
-def test_each_setting_matters() -> None:
+def test_each_setting_matters_and_what_is_missing_is_asked_for() -> None:
     plate, virtual = photograph(), half_plane(False, VIRTUAL_M, RED)
     usual = Between().insert(plate, [virtual], ScatterReference()).rgb
     assert np.abs(Between(tolerance=0.9).insert(plate, [virtual], ScatterReference()).rgb - usual).max() > 0.1
@@ -156,6 +131,11 @@ def test_each_setting_matters() -> None:
     matted = replace(plate, near_alpha=1.0 - virtual.alpha)
     nearer, farther = (Between(near_depth_m=d).insert(matted, [virtual], ScatterReference()).rgb for d in (0.8, 1.2))
     assert np.abs(nearer - farther).max() > 0.05
+    virtual, bare = half_plane(True, VIRTUAL_M, RED), replace(photograph(), depth_m=None, sharp_rgb=None)
+    with pytest.raises(InputError, match=r"needs depth .* or a matte"):
+        Between().insert(bare, [virtual], ScatterReference())
+    with pytest.raises(InputError, match="needs its distance"):
+        Between().insert(replace(bare, near_alpha=virtual.alpha), [virtual], ScatterReference())
 
 
 def test_the_edge_of_an_object_cuts_the_disc_of_a_light_behind_it() -> None:
@@ -188,15 +168,12 @@ def test_lights_of_the_object_are_hidden_by_near_edges_alone() -> None:
 # The steps.
 
 
-def test_points_of_the_pupil_are_evenly_spread_over_the_opening() -> None:
+def test_points_of_the_pupil_are_evenly_spread_and_transmission_is_that_of_the_outlines() -> None:
     points = pupil_points(Aperture.disc(), 4096)
     np.testing.assert_allclose(points[:, :2].mean(axis=0), 0.0, atol=5e-3)
     np.testing.assert_allclose((points[:, :2] ** 2).mean(axis=0), 0.25, atol=5e-3)  # of a disc: r^2 / 4
     ring = pupil_points(Aperture.ring(0.5), 4096)
     assert np.hypot(*ring[:, :2].T).min() > 0.49 and np.all(ring[:, 2] == 1.0)
-
-
-def test_transmission_is_the_sum_of_the_outlines_around_a_point() -> None:
     ring = Aperture.ring(0.5)
     np.testing.assert_allclose(transmission(ring, np.array([[0.0, 0.0], [0.75, 0.0], [0.0, -0.75], [1.2, 0.0]])), [0, 1, 1, 0], atol=1e-9)
 
@@ -204,12 +181,8 @@ def test_transmission_is_the_sum_of_the_outlines_around_a_point() -> None:
 def rays_through_flat_layers(focus_m: float = 1.0) -> Rays:
     rng = np.random.default_rng(1)
     near = half_plane(True, NEAR_M, GREEN)
-    scene = NearAndFar(
-        replace(near, depth_m=np.full_like(near.alpha, NEAR_M)),
-        rng.uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32),
-        np.full((HEIGHT, WIDTH), FAR_M, np.float32),
-        NO_HIGHLIGHTS,
-    )
+    near, far_rgb = replace(near, depth_m=np.full_like(near.alpha, NEAR_M)), rng.uniform(0, 1, (HEIGHT, WIDTH, 3)).astype(np.float32)
+    scene = NearAndFar(near, far_rgb, np.full((HEIGHT, WIDTH), FAR_M, np.float32), NO_HIGHLIGHTS)
     alpha = rng.uniform(0, 1, (HEIGHT, WIDTH)).astype(np.float32)
     virtual = Layer(alpha[..., None] * RED, alpha, np.full((HEIGHT, WIDTH), VIRTUAL_M, np.float32))
     return Rays.of(scene, virtual, virtual.depth_m, LENS.focused_at(focus_m), 32)
@@ -259,7 +232,7 @@ def test_what_hides_behind_near_things_is_filled_in_as_far_as_the_lens_sees_at_t
     np.testing.assert_allclose(short.virtual.alpha, whole.virtual.alpha, atol=1e-6)
 
 
-def test_lights_whose_discs_come_to_no_wanted_pixel_are_not_followed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lights_are_followed_where_they_are_wanted_and_arrive_whole(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where light is wanted it is that of all lights."""
     rays, wanted = rays_through_flat_layers(), np.zeros((HEIGHT, WIDTH), bool)
     rays.virtual.rgb[:] = 0.1 * rays.virtual.alpha[..., None]
@@ -271,17 +244,15 @@ def test_lights_whose_discs_come_to_no_wanted_pixel_are_not_followed(monkeypatch
     assert few.one[wanted].sum() > 10.0 and few.one.sum() < 0.5 * every.one.sum()
     np.testing.assert_array_equal(few.one[wanted], every.one[wanted])
     np.testing.assert_array_equal(few.both[wanted], every.both[wanted])
-
-
-def test_all_light_of_a_light_arrives_where_nothing_hides_it() -> None:
     rays = rays_through_flat_layers()
     rays.virtual.rgb[:] = 0.1 * rays.virtual.alpha[..., None]
     rays.virtual.rgb[20, 70] = 100.0
+    monkeypatch.undo()
     through = virtual_highlights(rays, np.ones_like(rays.virtual.alpha, bool))
     assert through.one.sum() == pytest.approx(300.0, rel=0.02) and through.both.sum() == pytest.approx(through.one.sum(), rel=1e-5)
 
 
-def test_a_smooth_surface_is_cut_without_taking_its_colours_apart() -> None:
+def test_surfaces_are_cut_hard_and_mixed_pixels_of_a_rim_taken_apart() -> None:
     """A table that recedes: what is near and what is far of it add up to it, hard at the cut."""
     sharp = np.random.default_rng(2).uniform(0, 1, (40, 60, 3)).astype(np.float32)
     depth_m = np.repeat(np.linspace(2.4, 1.6, 40, dtype=np.float32)[:, None], 60, axis=1)
@@ -290,10 +261,7 @@ def test_a_smooth_surface_is_cut_without_taking_its_colours_apart() -> None:
     assert set(np.unique(scene.near.alpha)) == {0.0, 1.0} and 0.3 < near.mean() < 0.6
     np.testing.assert_array_equal(scene.near.rgb[near], sharp[near])
     np.testing.assert_array_equal(scene.far_rgb[~near], sharp[~near])
-
-
-def test_mixed_pixels_of_a_rim_are_taken_apart() -> None:
-    """A dark bar over grey whose border pixels are 40 % bar: its coverage there is found again."""
+    # A dark bar over grey whose border pixels are 40 % bar: its coverage there is found again.
     alpha = np.zeros((30, 40), np.float32)
     alpha[:, 10:16], alpha[:, [9, 16]] = 1.0, 0.4
     sharp = (alpha[..., None] * 0.1 + (1.0 - alpha[..., None]) * 0.6).repeat(3, axis=2).astype(np.float32)
@@ -301,9 +269,6 @@ def test_mixed_pixels_of_a_rim_are_taken_apart() -> None:
     scene = cut_in_two(sharp, depth_m, alpha > 0.5, 8.0, 0.03)
     np.testing.assert_allclose(scene.near.alpha, alpha, atol=0.02)
     np.testing.assert_allclose(scene.far_rgb, 0.6, atol=0.02)
-
-
-def test_clean_colours_of_two_flat_ones() -> None:
     alpha = np.repeat(np.clip((np.arange(120, dtype=np.float32) - 50) / 20, 0, 1)[None], 40, axis=0)
     picture = (alpha[..., None] * GREEN + (1.0 - alpha[..., None]) * BLUE).astype(np.float32)
     front, behind = clean_colours(picture, alpha)

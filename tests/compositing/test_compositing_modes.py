@@ -48,11 +48,15 @@ each_mode = pytest.mark.parametrize("mode", MODES)
 
 
 @each_mode
-def test_no_layers_give_the_plate(mode: str) -> None:
+def test_no_layers_or_pixels_without_virtual_light_give_the_plate_bit_for_bit(mode: str) -> None:
     photo = plate()
     found = inserted(mode, [], photo)
     np.testing.assert_array_equal(found.rgb, photo.rgb)
     assert not found.virtual.alpha.any()
+    picture = inserted(mode, [card(1.0)], plate()).rgb
+    np.testing.assert_allclose(picture[16:32, 24:40], np.broadcast_to(np.float32(RED), (16, 16, 3)), atol=2e-4)
+    with pytest.raises(InputError, match="virtual layer is 10x10 px but the photograph is 64x48 px"):
+        inserted(mode, [card(1.0, size=(10, 10))], plate())
 
 
 @each_mode
@@ -65,12 +69,6 @@ def test_pixels_without_virtual_light_are_the_plates_bit_for_bit(mode: str, rend
     np.testing.assert_array_equal(found.rgb[untouched], photo.rgb[untouched])
 
 
-@each_mode
-def test_an_opaque_layer_in_focus_before_everything_replaces_the_plate(mode: str) -> None:
-    picture = inserted(mode, [card(1.0)], plate()).rgb
-    np.testing.assert_allclose(picture[16:32, 24:40], np.broadcast_to(np.float32(RED), (16, 16, 3)), atol=2e-4)
-
-
 @pytest.mark.parametrize("mode", [mode for mode in MODES if mode != "front"])
 def test_a_layer_behind_everything_changes_nothing(mode: str) -> None:
     photo = plate(0.8)
@@ -78,7 +76,7 @@ def test_a_layer_behind_everything_changes_nothing(mode: str) -> None:
 
 
 @each_mode
-def test_twice_the_light_gives_twice_the_picture(mode: str) -> None:
+def test_twice_the_light_gives_twice_the_picture_and_is_never_negative(mode: str) -> None:
     depth_m = np.full(SIZE, 3.0, np.float32)
     depth_m[:, :30] = 0.7
     photo, layer = plate(depth_m), card(1.3)
@@ -86,26 +84,9 @@ def test_twice_the_light_gives_twice_the_picture(mode: str) -> None:
     once = inserted(mode, [layer], photo).rgb
     brighter = replace(photo, rgb=2.0 * photo.rgb, sharp_rgb=2.0 * photo.sharp_rgb)
     np.testing.assert_allclose(inserted(mode, [replace(layer, rgb=2.0 * layer.rgb)], brighter).rgb, 2.0 * once, atol=2e-4)
-
-
-@each_mode
-def test_light_is_never_negative_and_coverage_is_a_share(mode: str) -> None:
-    depth_m = np.full(SIZE, 3.0, np.float32)
-    depth_m[:, 26:30] = 0.7
+    depth_m[:, :26], depth_m[:, 26:30] = 3.0, 0.7
     found = inserted(mode, [card(1.3)], plate(depth_m), PolygonDifferences())
     assert found.rgb.min() >= 0.0 and found.virtual.alpha.min() >= 0.0 and found.virtual.alpha.max() <= 1.0 + 1e-5
-
-
-@each_mode
-def test_another_size_is_refused(mode: str) -> None:
-    with pytest.raises(InputError, match="virtual layer is 10x10 px but the photograph is 64x48 px"):
-        inserted(mode, [Layer(np.zeros((10, 10, 3), np.float32), np.zeros((10, 10), np.float32), np.ones((10, 10), np.float32))], plate())
-
-
-def test_modes_by_name() -> None:
-    assert DEFAULT_MODE in MODES
-    with pytest.raises(InputError, match="front, over, matte, between, rerender, got 'under'"):
-        insertion_of("under")
 
 
 # The box: a part of the picture gives what the whole gives.
@@ -138,24 +119,14 @@ class Recorder:
         return OverPhotograph(by_depth=False).insert(photo, layers, renderer)
 
 
-def test_circles_of_confusion_keep_their_size_in_the_box() -> None:
+def test_circles_of_confusion_keep_their_size_in_the_box_and_near_things_go_on_beyond_the_frame() -> None:
     photo, recorder = plate(size=(100, 150)), Recorder()
     InDirtyRectangle(recorder).insert(photo, [card(1.3, size=(100, 150))], ScatterReference())
     part, _ = recorder.seen[0]
     width = part.rgb.shape[1]
     assert width < 120 and part.lens.coc_px(1.3, width) == pytest.approx(float(LENS.coc_px(1.3, 150)))
     assert part.lens.image_distance_mm == LENS.image_distance_mm
-
-
-@pytest.mark.parametrize("lens", [replace(LENS, tilt_rad=(0.05, 0.0)), replace(LENS, aperture=replace(LENS.aperture, cat_eye=0.5))])
-def test_a_lens_that_differs_over_the_frame_gets_the_whole_frame(lens: Lens) -> None:
-    photo, recorder = replace(plate(size=(100, 150)), lens=lens), Recorder()
-    InDirtyRectangle(recorder).insert(photo, [card(1.3, size=(100, 150))], ScatterReference())
-    assert recorder.seen[0][0].rgb.shape == (100, 150, 3)
-
-
-def test_near_things_that_the_frame_cuts_off_go_on_beyond_it() -> None:
-    """A near wall over the whole height hides as much at the border of the frame as in its middle; without the box it fades out."""
+    # A near wall over the whole height hides as much at the border of the frame as in its middle; without the box it fades out.
     depth_m = np.full(SIZE, 3.0, np.float32)
     depth_m[:, :32] = 0.8
     everywhere = Layer(np.ones((*SIZE, 3), np.float32), np.ones(SIZE, np.float32), np.full(SIZE, 1.3, np.float32))
@@ -166,26 +137,29 @@ def test_near_things_that_the_frame_cuts_off_go_on_beyond_it() -> None:
     assert bare[0, 28] > share[0, 28] + 0.1
 
 
+@pytest.mark.parametrize("lens", [replace(LENS, tilt_rad=(0.05, 0.0)), replace(LENS, aperture=replace(LENS.aperture, cat_eye=0.5))])
+def test_a_lens_that_differs_over_the_frame_gets_the_whole_frame(lens: Lens) -> None:
+    photo, recorder = replace(plate(size=(100, 150)), lens=lens), Recorder()
+    InDirtyRectangle(recorder).insert(photo, [card(1.3, size=(100, 150))], ScatterReference())
+    assert recorder.seen[0][0].rgb.shape == (100, 150, 3)
+
+
 # The paper's matte, and blurring all anew.
 
 
-def test_erosion_takes_whole_pixels_off_the_sharp_matte() -> None:
+def test_the_matte_is_eroded_and_smoothed_and_without_filters_occlusion_by_depth() -> None:
     matte = SmoothedMatte(erode_px=2, sigma_px=0.0).smoothed(card(1.0).alpha)
     assert matte.sum() == (24 - 4) * (24 - 4)
     np.testing.assert_array_equal(matte[14:34, 22:42], 1.0)
-
-
-def test_the_gaussian_smooths_the_rim_and_keeps_its_place() -> None:
     row = SmoothedMatte(erode_px=0, sigma_px=1.5).smoothed(card(1.0).alpha)[24]
     assert row[19] + row[20] == pytest.approx(1.0, abs=1e-3) and 0.0 < row[18] < row[19] < row[20] < row[21] < 1.0
-
-
-def test_without_its_filters_the_matte_is_occlusion_by_depth() -> None:
     depth_m = np.full(SIZE, 3.0, np.float32)
     depth_m[:, :32] = 0.7
     photo, layer = plate(depth_m), card(1.3)
     plain = OverPhotograph().insert(photo, [layer], ScatterReference()).rgb
     np.testing.assert_allclose(SmoothedMatte(0, 0.0).insert(photo, [layer], ScatterReference()).rgb, plain, atol=1e-6)
+    with pytest.raises(InputError, match="pixels from 0 up, got erosion -1"):
+        SmoothedMatte(erode_px=-1)
 
 
 @pytest.mark.parametrize("changed", [SmoothedMatte(erode_px=3), SmoothedMatte(sigma_px=2.0)])
@@ -195,20 +169,15 @@ def test_each_size_of_the_matte_matters(changed: SmoothedMatte) -> None:
     assert np.abs(pictures[0] - pictures[1]).max() > 0.02
 
 
-def test_sizes_of_the_matte_are_checked() -> None:
-    with pytest.raises(InputError, match="pixels from 0 up, got erosion -1"):
-        SmoothedMatte(erode_px=-1)
-
-
-def test_blurring_anew_needs_the_sharp_scene() -> None:
+def test_blurring_anew_needs_the_sharp_scene_and_shows_near_things_before_the_layer() -> None:
     with pytest.raises(InputError, match="all-in-focus picture and depth are needed"):
         Rerendered().insert(replace(plate(), sharp_rgb=None), [card(1.3)], ScatterReference())
-
-
-def test_blurring_anew_shows_near_things_before_the_layer() -> None:
     depth_m = np.full(SIZE, 3.0, np.float32)
     depth_m[:, :32] = 0.7
     photo = plate(depth_m, LENS.focused_at(0.7))
     picture = inserted("rerender", [card(1.3)], photo).rgb
     np.testing.assert_allclose(picture[24, 22:28], photo.rgb[24, 22:28], atol=2e-3)
     np.testing.assert_allclose(picture[24, 35:38], np.broadcast_to(np.float32(RED), (3, 3)), atol=2e-2)
+    assert DEFAULT_MODE in MODES
+    with pytest.raises(InputError, match="front, over, matte, between, rerender, got 'under'"):
+        insertion_of("under")

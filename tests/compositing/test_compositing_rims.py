@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 import pytest
@@ -15,15 +14,10 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from tests.scenes.mixed_reality_cases import MixedCase, card_cases, wider
+from tests.scenes.mixed_reality_cases import MixedCase, small_card_cases, wider
 
 RENDERER = PolygonDifferences()
 EXACT_DB, RECOVERED = 0.1, 1.0 / 3.0
-
-
-@cache
-def cards() -> tuple[MixedCase, ...]:
-    return tuple(card_cases(120, 96, ("disc",), positions=120, radius_px=4.5))
 
 
 def found_db(case: MixedCase, *, refine_edges: bool) -> float:
@@ -34,15 +28,12 @@ def mean_db(cases: Sequence[MixedCase], *, refine_edges: bool) -> float:
     return float(np.mean([found_db(case, refine_edges=refine_edges) for case in cases]))
 
 
-def test_exact_depth_loses_nothing() -> None:
-    """Mean of three focus distances."""
-    assert mean_db(cards(), refine_edges=True) > mean_db(cards(), refine_edges=False) - EXACT_DB
-
-
-def test_a_pixel_too_wide_costs_less() -> None:
+def test_exact_depth_loses_nothing_and_a_pixel_too_wide_costs_less() -> None:
     """Mean of three focus distances. Colours of these cards say little; on the traced sets, which no test can carry, it is two thirds."""
-    cases = [case.with_near_wider_by(1) for case in cards()]
-    exact, kept, mended = mean_db(cards(), refine_edges=False), mean_db(cases, refine_edges=False), mean_db(cases, refine_edges=True)
+    cards = small_card_cases()
+    cases = [case.with_near_wider_by(1) for case in cards]
+    exact, kept, mended = mean_db(cards, refine_edges=False), mean_db(cases, refine_edges=False), mean_db(cases, refine_edges=True)
+    assert mean_db(cards, refine_edges=True) > exact - EXACT_DB
     assert exact - kept > 3.0  # there is something to win
     assert mended > kept + RECOVERED * (exact - kept)
 
@@ -72,18 +63,14 @@ def test_colours_find_the_rim(by_px: int) -> None:
     np.testing.assert_array_equal(EdgeColours.of(plate.sharp_rgb, wrong, np.ones(SIZE, bool)).by_colour(), near)
 
 
-def test_twice_the_light_tells_the_same() -> None:
+def test_twice_the_light_tells_the_same_on_fishers_line() -> None:
     plate, _ = strip(1, noise=0.3)
     assert plate.sharp_rgb is not None and plate.depth_m is not None
     once, twice = (
         EdgeColours.of(np.float32(factor) * plate.sharp_rgb, plate.depth_m < 2.0, np.ones(SIZE, bool)).nearness for factor in (1.0, 2.0)
     )
     np.testing.assert_allclose(once, twice, atol=1e-4)
-
-
-def test_nearness_is_fishers_line() -> None:
-    """The compiled loop against NumPy at one pixel."""
-    plate, _ = strip(1, noise=0.3)
+    # The compiled loop against NumPy at one pixel.
     assert plate.sharp_rgb is not None and plate.depth_m is not None
     rims = EdgeColours.of(plate.sharp_rgb, plate.depth_m < 2.0, np.ones(SIZE, bool))
     y, x = 20, 33
@@ -100,26 +87,20 @@ def test_nearness_is_fishers_line() -> None:
     assert rims.nearness[y, x] == pytest.approx(expected, abs=1e-3)
 
 
-def test_lights_at_a_rim_may_be_far_and_never_become_near() -> None:
+def test_lights_at_a_rim_may_be_far_and_a_thin_wire_keeps_its_middle() -> None:
     plate, near = strip(1)
     assert plate.sharp_rgb is not None and plate.depth_m is not None
     rgb = plate.sharp_rgb.copy()
     rgb[20, 33], rgb[30, 48] = 50.0, 50.0
     told = EdgeColours.of(rgb, plate.depth_m < 2.0, np.ones(SIZE, bool)).by_colour()
     assert not told[20, 33] and not told[30, 48] and near[20, 34]
-
-
-def test_a_thin_wire_keeps_its_middle() -> None:
-    """Grey on grey, where colours do not tell: the proposal takes a rim of a broad thing, but never all of a thin one."""
+    # Grey on grey, where colours do not tell: the proposal takes a rim of a broad thing, but never all of a thin one.
     near = np.zeros((30, 60), bool)
     near[:, 10:12], near[:, 30:45] = True, True
     told = EdgeColours.of(np.full((30, 60, 3), 0.3, np.float32), near, np.ones_like(near))
     assert np.isnan(told.nearness).all() and (told.by_colour() == near).all()
     left = told.without_rim()
     assert left[2:-2, 10:12].any(axis=1).all() and left[15].sum() < near[15].sum()
-
-
-def test_moved_depth_is_that_of_the_nearest_of_its_side() -> None:
     depth_m = np.array([[1.0, 1.1, 3.0, 3.2, 3.4]], np.float32)
     near = depth_m < 2.0
     np.testing.assert_allclose(moved(depth_m, near, np.array([[True, True, True, False, False]])), [[1.0, 1.1, 1.1, 3.2, 3.4]])
@@ -146,19 +127,13 @@ def test_it_can_be_switched_off(mode: str) -> None:
     assert np.abs(trusted - mended).max() > 0.05
 
 
-def test_large_pictures_are_compared_at_half_their_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    exact, wrong, mended = (Between(refine_edges=rims).insert(strip(by_px)[0], [virtual_wall()], RENDERER).rgb for by_px, rims in STRIPS)
+def test_large_pictures_are_compared_at_half_their_size_and_a_users_matte_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    strips = ((0, False), (2, False), (2, True))  # how many pixels too wide, and whether rims are looked for
+    exact, wrong, mended = (Between(refine_edges=rims).insert(strip(by_px)[0], [virtual_wall()], RENDERER).rgb for by_px, rims in strips)
     monkeypatch.setattr("mrbokeh.compositing.edge_refinement._LARGE_PX", 100)
     halved = Between().insert(strip(2)[0], [virtual_wall()], RENDERER).rgb
     assert not np.array_equal(halved, mended)  # it is another comparison
     assert np.abs(halved - exact).mean() < 0.5 * np.abs(wrong - exact).mean()
-
-
-STRIPS = ((0, False), (2, False), (2, True))
-"""How many pixels too wide, and whether rims are looked for."""
-
-
-def test_a_users_matte_stays_as_it_is() -> None:
     plate, near = strip(1)
     matted = replace(plate, near_alpha=near.astype(np.float32))
     trusted, asked = (Between(refine_edges=rims).insert(matted, [virtual_wall()], RENDERER).rgb for rims in (False, True))

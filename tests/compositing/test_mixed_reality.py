@@ -1,6 +1,7 @@
 """The mixed-reality truth: the object lies where it should, both pictures differ by it alone, sets go on where they stopped."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -25,13 +26,14 @@ from tests.scenes.card_scene import FOCUS_CARD, mixed_cards
 from tests.scenes.mixed_reality_cases import traced_cases
 from tests.scenes.scalar_truth_tracer import require_mitsuba
 
+virtual_objects = cache(virtual_object)
 PLAN = TruthPlan(width_px=64, height_px=36, samples=4, scenes=("fence",), shapes=("disc",))
 
 
 @pytest.mark.parametrize(("name", "seed"), [*zip(OBJECT_DISTANCES_M, (1, 2), strict=True)])
 def test_the_object_lies_behind_all_near_things_and_before_the_rest(name: str, seed: int) -> None:
     """Of the rest, what lies in the picture counts; the ground reaches below it to the camera."""
-    scene, virtual = scene_around(name, seed), virtual_object(name, seed)
+    scene, virtual = scene_around(name, seed), virtual_objects(name, seed)
     depths_m = [body.vertices_m[:, 2] for body in virtual.bodies]
     nearest_m, farthest_m = min(each.min() for each in depths_m), max(each.max() for each in depths_m)
     assert max(body.vertices_m[:, 2].max() for body in scene.bodies if body.thin) < nearest_m
@@ -39,15 +41,13 @@ def test_the_object_lies_behind_all_near_things_and_before_the_rest(name: str, s
     assert min([*(each[:, 2].min() for each in seen if len(each)), *(lamp.centre_m[2] for lamp in scene.lamps)]) > farthest_m
 
 
-def test_without_shadows_all_light_is_light_of_the_sky() -> None:
-    packed = pack(with_object(make_scene("fence", 1), virtual_object("fence", 1)), PLAN.camera(0))
+def test_without_shadows_all_light_is_light_of_the_sky_on_one_object_for_a_seed() -> None:
+    packed = pack(with_object(make_scene("fence", 1), virtual_objects("fence", 1)), PLAN.camera(0))
     flat = without_shadows(packed)
     assert not flat.facets[:, 6:9].any() and packed.facets[:, 6:9].any()
     np.testing.assert_allclose(flat.facets[:, 9:12], packed.facets[:, 6:9] + packed.facets[:, 9:12], rtol=1e-6)
-
-
-def test_one_seed_gives_one_object_and_another_another() -> None:
-    first, again, other = (virtual_object("fence", seed).bodies[0].vertices_m for seed in (1, 1, 2))
+    objects = (virtual_objects("fence", 1), virtual_object("fence", 1), virtual_object("fence", 2))
+    first, again, other = (each.bodies[0].vertices_m for each in objects)
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-3
 
@@ -69,15 +69,12 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_a_complete_set_is_left_alone_and_a_missing_file_is_made(folder: Path) -> None:
+def test_a_complete_set_is_left_alone_and_other_settings_are_refused(folder: Path) -> None:
     view = folder / "fence_1" / "view_00"
     kept = (view / "object.exr").stat().st_mtime_ns
     (view / "both" / "disc_1.exr").unlink()
     assert mixed_reality(folder, PLAN) == 1 and mixed_reality(folder, PLAN) == 0
     assert (view / "object.exr").stat().st_mtime_ns == kept and (view / "sheet.png").is_file()
-
-
-def test_other_settings_are_refused(folder: Path) -> None:
     with pytest.raises(InputError, match="made with other settings"):
         mixed_reality(folder, replace(PLAN, samples=8))
 

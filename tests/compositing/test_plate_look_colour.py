@@ -15,6 +15,7 @@ from mrbokeh.compositing.plate_look.exposure_match import (
     white_balance_gain,
     white_of_kelvin,
 )
+from mrbokeh.images.color import rec709_from_XYZ
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
 from mrbokeh.system.errors import InputError
@@ -43,15 +44,30 @@ def a_layer(seed: int = 2) -> Layer:
     return Layer(alpha[..., None] * colour, alpha, np.where(alpha > 0, 2.0, np.inf).astype(np.float32))
 
 
-def test_a_grey_card_under_a_cast_gives_the_gain_back() -> None:
+def test_a_grey_card_under_a_cast_gives_the_gain_back_in_a_dark_corner_as_well() -> None:
     """Twelve thousand values of noise 0.004 on 0.18: the mean of 21x21 is good to about 0.3 % of the weakest channel's 0.09."""
     plate = photographed(reflectances())
     found = grey_card_match(plate, PixelBox(80, 68, 10), black=BLACK)
     np.testing.assert_allclose(found.gain, CAST, rtol=0.01)
     assert found.black == BLACK
+    plate = photographed(reflectances())
+    found = grey_card_match(plate, PixelBox(80, 68, 10), rendered=(0.36, 0.18, 0.09), black=BLACK)
+    np.testing.assert_allclose(found.gain, np.array(CAST) / (2.0, 1.0, 0.5), rtol=0.01)
+    plate = (0.7 * reflectances()).astype(np.float32)
+    np.testing.assert_allclose(grey_card_match(plate, PixelBox(80, 68, 10), falloff=(0.7, 0.7, 0.7)).gain, 1.0, rtol=1e-5)
+    plate = photographed(reflectances(), noise=0.0)
+    clean = patch_colour(plate, PixelBox(80, 68, 10))
+    plate[66:72, 78:84] = 3.0
+    np.testing.assert_allclose(patch_colour(plate, PixelBox(80, 68, 10)), clean, rtol=1e-5)
 
 
-def test_with_card_and_hole_the_rendered_scene_becomes_the_photographed_one() -> None:
+def test_the_darkest_places_give_the_black_with_which_the_scene_becomes_the_photograph() -> None:
+    """The hole is 768 pixels; a single pixel's noise is 0.004, a block's of 16 pixels 0.001."""
+    found = darkest_black(photographed(reflectances()))
+    np.testing.assert_allclose(found, BLACK, atol=0.003)
+    bright = (reflectances() * 0 + 0.3).astype(np.float32)
+    np.testing.assert_allclose(darkest_black(bright), 0.3, rtol=1e-6)
+    assert darkest_black(bright - np.float32(0.4)) == (0.0, 0.0, 0.0)
     scene = reflectances()
     plate = photographed(scene)
     black = patch_colour(plate, PixelBox(24, 20, 8))
@@ -60,37 +76,7 @@ def test_with_card_and_hole_the_rendered_scene_becomes_the_photographed_one() ->
     np.testing.assert_allclose(match.applied(rendered).rgb, photographed(scene, noise=0.0), atol=0.01)
 
 
-def test_the_rendered_card_may_be_what_the_renderer_gave() -> None:
-    plate = photographed(reflectances())
-    found = grey_card_match(plate, PixelBox(80, 68, 10), rendered=(0.36, 0.18, 0.09), black=BLACK)
-    np.testing.assert_allclose(found.gain, np.array(CAST) / (2.0, 1.0, 0.5), rtol=0.01)
-
-
-def test_a_card_in_a_dark_corner_gives_the_gain_of_the_middle() -> None:
-    plate = (0.7 * reflectances()).astype(np.float32)
-    np.testing.assert_allclose(grey_card_match(plate, PixelBox(80, 68, 10), falloff=(0.7, 0.7, 0.7)).gain, 1.0, rtol=1e-5)
-
-
-def test_a_speck_on_the_card_does_not_count() -> None:
-    plate = photographed(reflectances(), noise=0.0)
-    clean = patch_colour(plate, PixelBox(80, 68, 10))
-    plate[66:72, 78:84] = 3.0
-    np.testing.assert_allclose(patch_colour(plate, PixelBox(80, 68, 10)), clean, rtol=1e-5)
-
-
-def test_the_darkest_places_give_the_black_and_not_the_darkest_pixels() -> None:
-    """The hole is 768 pixels; a single pixel's noise is 0.004, a block's of 16 pixels 0.001."""
-    found = darkest_black(photographed(reflectances()))
-    np.testing.assert_allclose(found, BLACK, atol=0.003)
-
-
-def test_black_is_never_above_what_the_photograph_shows_and_never_below_zero() -> None:
-    bright = (reflectances() * 0 + 0.3).astype(np.float32)
-    np.testing.assert_allclose(darkest_black(bright), 0.3, rtol=1e-6)
-    assert darkest_black(bright - np.float32(0.4)) == (0.0, 0.0, 0.0)
-
-
-def test_of_the_black_a_pixel_gets_what_it_covers() -> None:
+def test_of_the_black_a_pixel_gets_what_it_covers_and_gain_is_linear() -> None:
     """gain * light + black * alpha: over the lifted plate, (1 - a)(P + black) + that, the black is whole at every coverage."""
     layer = a_layer()
     found = ColourMatch((2.0, 1.0, 0.5), BLACK).applied(layer)
@@ -100,59 +86,48 @@ def test_of_the_black_a_pixel_gets_what_it_covers() -> None:
     scene = np.float32(0.2)
     through = (1 - layer.alpha[..., None]) * (scene + np.float32(BLACK)) + ColourMatch(black=BLACK).applied(layer).rgb
     np.testing.assert_allclose(through, (1 - layer.alpha[..., None]) * scene + layer.rgb + np.float32(BLACK), atol=1e-6)
-
-
-def test_a_match_of_nothing_is_the_layer_itself() -> None:
     layer = a_layer()
     assert ColourMatch().applied(layer) is layer and ColourMatch().is_nothing
-
-
-def test_the_gain_is_linear_in_light() -> None:
     layer, match = a_layer(), ColourMatch((1.3, 0.8, 2.0))
     doubled = match.applied(replace(layer, rgb=2 * layer.rgb)).rgb
     np.testing.assert_allclose(doubled, 2 * match.applied(layer).rgb, rtol=1e-6)
 
 
-def test_absolute_exposure_is_that_of_the_sunny_sixteen() -> None:
+def test_exposure_is_that_of_the_sunny_sixteen_in_stops_of_two() -> None:
     """ISO 100, 1/100 s, f/16: EV 14.64, so 1.2 * 2^14.64 = 30720 cd/m^2 fill the sensor (ISO 12232: 78 N^2 / (0.65 t S))."""
     full_cd_m2 = 1.0 / matched_exposure(Exposure(0.01, 100.0, 16.0)).gain[0]
     assert full_cd_m2 == pytest.approx(78.0 * 16.0**2 / (0.65 * 0.01 * 100.0), rel=1e-6)
     assert full_cd_m2 == pytest.approx(1.2 * 2 ** np.log2(16.0**2 / 0.01), rel=1e-6)
-
-
-def test_a_stop_is_a_factor_of_two_however_it_is_set() -> None:
     panorama = Exposure(0.01, 200.0, 4.0)
     for plate in (Exposure(0.02, 200.0, 4.0), Exposure(0.01, 400.0, 4.0), Exposure(0.01, 200.0, 8**0.5), Exposure(0.01, 200.0, 4.0, 2.0)):
         np.testing.assert_allclose(matched_exposure(plate, panorama).gain, 2.0)
-
-
-def test_exposure_of_a_slice_counts_the_gain_of_its_stack() -> None:
     metadata = {"exposure_time_s": 0.1, "iso": 200.0, "f_number": 2.0, "exposure_gain": 0.25}
     assert exposure_of_metadata(metadata) == Exposure(0.1, 200.0, 2.0, 0.25)
     with pytest.raises(InputError, match="f_number is missing"):
         exposure_of_metadata(metadata | {"f_number": None})
 
 
-def test_exposure_from_real_photographs(shared_data: Path) -> None:
+def test_exposure_and_card_of_real_photographs(shared_data: Path) -> None:
     """The numbers are those that exiftool prints; the D70 states no ISO."""
     assert exposure_of_photo(shared_data / "exif" / "canon_450d_4.6m.jpg") == Exposure(0.001, 100.0, 4.5)
     assert exposure_of_photo(shared_data / "exif" / "nikon_d60_0.45m.jpg") == Exposure(0.008, 100.0, 4.5)
     with pytest.raises(InputError, match=r"iso is missing: pick a grey card"):
         exposure_of_photo(shared_data / "exif" / "nikon_d70_0.45m.jpg")
+    # Two patches of plain paper in a photograph (Nikon D70), far apart: one says what colour the other has, up to its own brightness.
+    plate = read_image(shared_data / "exif" / "nikon_d70_0.45m.jpg")
+    near, far = (np.array(grey_card_match(plate, PixelBox(*at, 20), rendered=0.8).gain) for at in ((780, 1820), (2220, 1500)))
+    np.testing.assert_allclose(near / near[1], far / far[1], rtol=0.02)
+    assert near[1] > 1.05 * far[1]
 
 
-def test_white_of_known_illuminants() -> None:
+def test_white_of_known_illuminants_and_lamps() -> None:
     """D65 is the white of Rec.709 (0.3127, 0.3290). Illuminant A is XYZ 1.0985, 1, 0.3558 (CIE 15): through the matrix of Rec.709."""
-    from mrbokeh.images.color import rec709_from_XYZ
 
     np.testing.assert_allclose(white_of_kelvin(6504.0), 1.0, atol=0.003)
     of_a = rec709_from_XYZ @ (1.0985, 1.0, 0.3558)
     np.testing.assert_allclose(white_of_kelvin(2856.0), of_a / of_a[1], rtol=0.02)
     of_d50 = rec709_from_XYZ @ (0.9642, 1.0, 0.8251)
     np.testing.assert_allclose(white_of_kelvin(5003.0), of_d50 / of_d50[1], rtol=0.01)
-
-
-def test_white_balance_for_lamps_makes_daylight_blue_and_has_no_step() -> None:
     red, green, blue = white_balance_gain(2856.0)
     assert red < 0.5 and green == 1.0 and blue > 3.0
     np.testing.assert_allclose(white_balance_gain(4300.0, 4300.0), 1.0)
@@ -162,17 +137,7 @@ def test_white_balance_for_lamps_makes_daylight_blue_and_has_no_step() -> None:
     np.testing.assert_allclose(white_of_kelvin(7000.0), white_of_kelvin(7000.5), rtol=1e-3)
 
 
-@pytest.mark.parametrize("text", ["", "5", "1,2,3,4", "a,b", "-1,2", "1.5,2"])
-def test_patches_that_make_no_sense_are_refused(text: str) -> None:
-    with pytest.raises(InputError, match="--match-grey: expected X,Y"):
-        PixelBox.parse(text)
-
-
-def test_patches_by_text() -> None:
-    assert PixelBox.parse("3,4") == PixelBox(3, 4, 8) and PixelBox.parse("3,4,5") == PixelBox(3, 4, 5)
-
-
-def test_what_cannot_be_a_grey_card_is_refused() -> None:
+def test_patches_by_text_and_what_cannot_be_a_grey_card() -> None:
     plate = photographed(reflectances())
     with pytest.raises(InputError, match="within the photograph of 160x112 px"):
         grey_card_match(plate, PixelBox(155, 60, 8))
@@ -182,13 +147,9 @@ def test_what_cannot_be_a_grey_card_is_refused() -> None:
     burnt[60:76, 70:90] = 1.7
     with pytest.raises(InputError, match="clipped in 100%"):
         grey_card_match(np.minimum(burnt, np.float32(1.0)), PixelBox(80, 68, 5))
+    for text in ("", "5", "1,2,3,4", "a,b", "-1,2", "1.5,2"):
+        with pytest.raises(InputError, match="--match-grey: expected X,Y"):
+            PixelBox.parse(text)
     with pytest.raises(InputError, match="expected gains above 0"):
         ColourMatch((0.0, 1.0, 1.0))
-
-
-def test_card_of_a_real_chart(shared_data: Path) -> None:
-    """Two patches of plain paper in a photograph (Nikon D70), far apart: one says what colour the other has, up to its own brightness."""
-    plate = read_image(shared_data / "exif" / "nikon_d70_0.45m.jpg")
-    near, far = (np.array(grey_card_match(plate, PixelBox(*at, 20), rendered=0.8).gain) for at in ((780, 1820), (2220, 1500)))
-    np.testing.assert_allclose(near / near[1], far / far[1], rtol=0.02)
-    assert near[1] > 1.05 * far[1]
+    assert PixelBox.parse("3,4") == PixelBox(3, 4, 8) and PixelBox.parse("3,4,5") == PixelBox(3, 4, 5)

@@ -1,6 +1,7 @@
 """The finished picture: identity where nothing virtual is, grain that cannot be told from the plate's, and the order of the steps."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -41,12 +42,17 @@ def soft_disc(colour: tuple[float, float, float] = (0.3, 0.3, 0.3)) -> Layer:
     return Layer(alpha[..., None] * np.float32(colour), alpha, depth_m, {"id": alpha[..., None].copy()})
 
 
+def red_card() -> Layer:
+    card = np.zeros((48, 64), np.float32)
+    card[12:36, 20:44] = 1.0
+    return Layer(card[..., None] * np.float32([0.8, 0.1, 0.1]), card, np.where(card > 0, 1.3, np.inf).astype(np.float32))
+
+
 def put_in(plate: Plate, layer: Layer) -> Inserted:
     return Inserted(behind(plate.rgb, layer), layer)
 
 
-def scene_plate(seed: int = 0) -> Plate:
-    return noisy(smooth_scene(), seed)
+scene_plate = cache(lambda: noisy(smooth_scene(), 0))
 
 
 STEPS = {
@@ -59,50 +65,44 @@ STEPS = {
 
 
 @pytest.mark.parametrize("name", STEPS)
-def test_pixels_without_virtual_light_stay_bit_for_bit(name: str) -> None:
+def test_pixels_without_virtual_light_and_what_came_in_stay_bit_for_bit(name: str) -> None:
     plate = scene_plate()
     inserted = put_in(plate, soft_disc())
+    before = [each.copy() for each in (inserted.virtual.rgb, inserted.photo_rgb, plate.rgb)]
     found = finished(inserted, plate, STEPS[name], frame=3)
+    for after, each in zip((inserted.virtual.rgb, inserted.photo_rgb, plate.rgb), before, strict=True):
+        np.testing.assert_array_equal(after, each)
     untouched = inserted.virtual.alpha == 0
     np.testing.assert_array_equal(found.rgb[untouched], plate.rgb[untouched])
     assert untouched.mean() > 0.5 and (found.rgb[~untouched] != inserted.rgb[~untouched]).mean() > 0.2
     np.testing.assert_array_equal(found.photo_rgb, inserted.photo_rgb)
     np.testing.assert_array_equal(found.virtual.alpha, inserted.virtual.alpha)
     np.testing.assert_array_equal(found.virtual.extra["id"], inserted.virtual.extra["id"])
-
-
-@pytest.mark.parametrize("name", STEPS)
-def test_what_came_in_is_not_changed(name: str) -> None:
     plate = scene_plate()
     inserted = put_in(plate, soft_disc())
-    before = [each.copy() for each in (inserted.virtual.rgb, inserted.photo_rgb, plate.rgb)]
-    finished(inserted, plate, STEPS[name])
-    for after, each in zip((inserted.virtual.rgb, inserted.photo_rgb, plate.rgb), before, strict=True):
-        np.testing.assert_array_equal(after, each)
 
 
-@pytest.mark.parametrize(
-    "finishing",
-    [Finishing(), Finishing(ColourMatch(), None, Grain(NoiseLevel((0.0,) * 3, (0.0,) * 3)), LightWrap(0.0))],
-)
-def test_a_finishing_that_does_nothing_gives_back_what_came(finishing: Finishing) -> None:
+def test_a_finishing_or_a_layer_that_is_nothing_gives_back_what_came() -> None:
+    """An empty finishing is no copy even."""
     plate = scene_plate()
-    inserted = put_in(plate, soft_disc())
-    assert finished(inserted, plate, finishing) is inserted
-
-
-def test_nothing_virtual_gives_the_plate() -> None:
-    plate = scene_plate()
+    inserted, silent = put_in(plate, soft_disc()), Grain(NoiseLevel((0.0,) * 3, (0.0,) * 3))
+    for finishing in (Finishing(), Finishing(ColourMatch(), None, silent, LightWrap(0.0))):
+        assert finished(inserted, plate, finishing) is inserted
     nothing = soft_disc()
     empty = Layer(0 * nothing.rgb, 0 * nothing.alpha, np.full(SIZE, np.inf, np.float32))
     np.testing.assert_array_equal(finished(put_in(plate, empty), plate, ALL).rgb, plate.rgb)
+    plate = scene_plate()
+    with pytest.raises(InputError, match="expected the plate that was inserted into"):
+        finished(put_in(plate, soft_disc()), plate_of(np.zeros((8, 8, 3), np.float32), LENS), ALL)
+    with pytest.raises(InputError, match="strength 0 to 1"):
+        LightWrap(1.5)
+    with pytest.raises(InputError, match="radius above 0"):
+        LightWrap(0.5, 0.0)
 
 
 def test_behind_an_insertion_untouched_pixels_are_those_of_the_plate() -> None:
     """The same through a true insertion, blurred by the lens."""
-    card = np.zeros((48, 64), np.float32)
-    card[12:36, 20:44] = 1.0
-    layer = Layer(card[..., None] * np.float32([0.8, 0.1, 0.1]), card, np.where(card > 0, 1.3, np.inf).astype(np.float32))
+    layer = red_card()
     plate = plate_of(np.random.default_rng(0).uniform(0, 1, (48, 64, 3)).astype(np.float32), LENS)
     inserted = OverPhotograph().insert(plate, [layer], ScatterReference())
     found = finished(inserted, plate, ALL)
@@ -114,28 +114,26 @@ def test_behind_an_insertion_untouched_pixels_are_those_of_the_plate() -> None:
 @pytest.mark.parametrize("alpha", [0.1, 0.5, 1.0])
 def test_the_picture_has_the_noise_that_the_sensor_gives_its_final_level(alpha: float) -> None:
     """98304 white values: their variance is good to 0.45 %, asked to four times that. P = 0.4, V = alpha * 0.2, M = (1 - alpha) P + V."""
-    grain = Grain(NoiseLevel((4e-4, 2e-4, 6e-4), (2e-5, 1e-5, 4e-5)))
     plate = noisy(np.full((*SIZE, 3), 0.4), 5, sigma_px=0.0)
     coverage = np.full(SIZE, alpha, np.float32)
     layer = Layer(np.full((*SIZE, 3), 0.2 * alpha, np.float32), coverage, np.ones(SIZE, np.float32))
-    picture = finished(put_in(plate, layer), plate, Finishing(grain=grain)).rgb
+    picture = finished(put_in(plate, layer), plate, Finishing(grain=GRAIN)).rgb
     level = (1 - alpha) * 0.4 + alpha * 0.2
     np.testing.assert_allclose(picture.var(axis=(0, 1)), SHOT * level + READ, rtol=0.018)
     np.testing.assert_allclose(picture.mean(axis=(0, 1)), level, rtol=1e-3)
 
 
-def test_a_shadow_gets_the_noise_of_its_darker_level() -> None:
-    plate = noisy(np.full((*SIZE, 3), 0.4), 6, sigma_px=0.0)
-    shadow = Layer(np.zeros((*SIZE, 3), np.float32), np.full(SIZE, 0.6, np.float32), np.ones(SIZE, np.float32))
-    picture = finished(put_in(plate, shadow), plate, Finishing(grain=GRAIN)).rgb
-    np.testing.assert_allclose(picture.var(axis=(0, 1)), SHOT * 0.16 + READ, rtol=0.018)
-
-
-def test_light_without_coverage_adds_its_own_shot_noise() -> None:
-    plate = noisy(np.full((*SIZE, 3), 0.2), 7, sigma_px=0.0)
-    glow = Layer(np.full((*SIZE, 3), 0.3, np.float32), np.zeros(SIZE, np.float32), np.full(SIZE, np.inf, np.float32))
-    picture = finished(put_in(plate, glow), plate, Finishing(grain=GRAIN)).rgb
-    np.testing.assert_allclose(picture.var(axis=(0, 1)), SHOT * 0.5 + READ, rtol=0.018)
+def test_shadows_get_the_noise_of_their_darker_level_and_glow_its_own_shot_noise() -> None:
+    """A shadow of 0.6 on 0.4 leaves 0.16; light of 0.3 without coverage adds to 0.2. Without grain a patch would be found out."""
+    everywhere = np.ones(SIZE, np.float32)
+    shadow = Layer(np.zeros((*SIZE, 3), np.float32), 0.6 * everywhere, everywhere)
+    glow = Layer(np.full((*SIZE, 3), 0.3, np.float32), 0 * everywhere, np.inf * everywhere)
+    for layer, level, seed, final in ((shadow, 0.4, 6, 0.16), (glow, 0.2, 7, 0.5)):
+        plate = noisy(np.full((*SIZE, 3), level), seed, sigma_px=0.0)
+        picture = finished(put_in(plate, layer), plate, Finishing(grain=GRAIN)).rgb
+        np.testing.assert_allclose(picture.var(axis=(0, 1)), SHOT * final + READ, rtol=0.018)
+    picture = put_in(noisy(np.full((*SIZE, 3), 0.3), 8), soft_disc()).rgb
+    assert picture[100:150, 140:180].var() < 0.01 * picture[:, 300:].var()
 
 
 def autocorrelation(patch: np.ndarray, lag: int) -> np.ndarray:
@@ -180,13 +178,7 @@ def test_a_patch_in_a_real_photograph_has_its_grain(shared_data: Path) -> None:
     np.testing.assert_allclose(autocorrelation(fine[1], 1), autocorrelation(fine[0], 1), atol=0.15)
 
 
-def test_without_grain_the_patch_would_be_found_out() -> None:
-    plate = noisy(np.full((*SIZE, 3), 0.3), 8)
-    picture = put_in(plate, soft_disc()).rgb
-    assert picture[100:150, 140:180].var() < 0.01 * picture[:, 300:].var()
-
-
-def test_frames_differ_and_repeat() -> None:
+def test_frames_differ_and_repeat_and_grain_stands_in_the_frame() -> None:
     plate = scene_plate()
     inserted = put_in(plate, soft_disc())
     first, again, second = (finished(inserted, plate, Finishing(grain=GRAIN), frame).virtual.rgb for frame in (4, 4, 5))
@@ -196,10 +188,7 @@ def test_frames_differ_and_repeat() -> None:
     assert abs(np.corrcoef(noise[0].ravel(), noise[1].ravel())[0, 1]) < 0.02  # 23000 values
     other_seed = finished(inserted, plate, Finishing(grain=replace(GRAIN, seed=1)), 4).virtual.rgb
     assert (other_seed[inner] != first[inner]).mean() > 0.99
-
-
-def test_grain_stands_in_the_frame_and_not_in_the_box() -> None:
-    """A speck far away makes the box larger; the grain on the disc stays the same."""
+    # A speck far away makes the box larger; the grain on the disc stays the same.
     plate = scene_plate()
     disc = soft_disc()
     alpha, rgb = disc.alpha.copy(), disc.rgb.copy()
@@ -225,20 +214,16 @@ def values_reference(draw: GrainDraw, size_px: tuple[int, int]) -> np.ndarray:
     return draw.sign * draw.grain.texture[np.ix_(rows, columns)]
 
 
-def test_the_compiled_loop_agrees_with_its_plain_twin() -> None:
+def test_added_variance_is_the_formula_and_the_compiled_loop_its_twin() -> None:
     plate = scene_plate()
     inserted = put_in(plate, soft_disc((0.9, 0.2, 0.05)))
     draw = GrainDraw(GRAIN, 7)
     light = inserted.virtual.rgb.copy()
     add_grain_to(light, inserted.virtual.alpha, inserted.photo_rgb, plate.rgb, draw)
-    expected = np.sqrt(added_variance_reference(inserted.virtual, inserted.photo_rgb, plate.rgb, GRAIN.level)) * values_reference(
-        draw, SIZE
-    )
+    variance = added_variance_reference(inserted.virtual, inserted.photo_rgb, plate.rgb, GRAIN.level)
+    expected = np.sqrt(variance) * values_reference(draw, SIZE)
     np.testing.assert_allclose(light - inserted.virtual.rgb, expected, atol=2e-6)
-
-
-def test_added_variance_is_the_formula_and_never_negative() -> None:
-    """shot (V + a (1 - a) P) + read a (2 - a) for a photograph that keeps 1 - a of itself."""
+    # shot (V + a (1 - a) P) + read a (2 - a) for a photograph that keeps 1 - a of itself.
     plate = plate_of(np.full((*SIZE, 3), 0.4, np.float32), LENS)
     layer = soft_disc()
     a, v = layer.alpha[..., None], layer.rgb
@@ -248,26 +233,16 @@ def test_added_variance_is_the_formula_and_never_negative() -> None:
     assert (found >= 0).all() and (found[layer.alpha == 0] == 0).all()
 
 
-def test_colour_and_falloff_are_linear_in_virtual_light() -> None:
+def test_colour_and_falloff_are_linear_and_may_come_before_the_blur_or_after_it() -> None:
     plate = scene_plate()
     steps = Finishing(ColourMatch((1.2, 1.0, 0.8)), RadialFalloff(-0.4))
     once, twice = (finished(put_in(plate, soft_disc((f * 0.3,) * 3)), plate, steps).virtual.rgb for f in (1.0, 2.0))
     np.testing.assert_allclose(twice, 2 * once, rtol=1e-5)
-
-
-def test_the_gain_may_come_before_the_blur_or_after_it() -> None:
-    """Blur is linear in light and its weights sum to 1."""
-    card = np.zeros((48, 64), np.float32)
-    card[12:36, 20:44] = 1.0
-    layer = Layer(card[..., None] * np.float32([0.8, 0.1, 0.1]), card, np.where(card > 0, 1.3, np.inf).astype(np.float32))
-    match, renderer = ColourMatch((1.7, 0.8, 0.4), (0.02, 0.01, 0.03)), ScatterReference()
-    np.testing.assert_allclose(
-        match.applied(renderer.render([layer], LENS)).rgb, renderer.render([match.applied(layer)], LENS).rgb, atol=1e-6
-    )
-
-
-def test_black_does_not_fall_off_and_gain_does() -> None:
-    """An opaque white everywhere: gain * falloff + black."""
+    # Blur is linear in light and its weights sum to 1.
+    match, renderer, layer = ColourMatch((1.7, 0.8, 0.4), (0.02, 0.01, 0.03)), ScatterReference(), red_card()
+    first, last = match.applied(renderer.render([layer], LENS)), renderer.render([match.applied(layer)], LENS)
+    np.testing.assert_allclose(first.rgb, last.rgb, atol=1e-6)
+    # An opaque white everywhere: gain * falloff + black.
     plate = plate_of(np.full((64, 96, 3), 0.2, np.float32), LENS)
     white = Layer(np.ones((64, 96, 3), np.float32), np.ones((64, 96), np.float32), np.ones((64, 96), np.float32))
     steps = Finishing(ColourMatch((0.5, 0.5, 0.5), (0.1, 0.1, 0.1)), RadialFalloff(-0.6))
@@ -275,7 +250,7 @@ def test_black_does_not_fall_off_and_gain_does() -> None:
     assert picture[32, 48, 0] == pytest.approx(0.6, abs=1e-3) and picture[0, 0, 0] == pytest.approx(0.5 * 0.4 + 0.1, abs=0.01)
 
 
-def test_light_wrap_adds_the_light_that_it_says() -> None:
+def test_light_wrap_adds_the_light_beside_the_edge_that_it_says() -> None:
     """Before an even photograph B is its level: strength * a (1 - a) * B, nothing where a is 0 or 1, and linear in the photograph."""
     plate = plate_of(np.full((*SIZE, 3), 0.4, np.float32), LENS)
     inserted = put_in(plate, soft_disc())
@@ -284,31 +259,15 @@ def test_light_wrap_adds_the_light_that_it_says() -> None:
     added = wrapped.virtual.rgb - inserted.virtual.rgb
     np.testing.assert_allclose(added, np.broadcast_to(0.5 * a * (1 - a) * 0.4, added.shape), atol=1e-6)
     assert (added[inserted.virtual.alpha == 1] == 0).all() and added.max() <= 0.25 * 0.5 * 0.4 + 1e-6
-
-
-def test_light_wrap_takes_the_light_beside_the_edge() -> None:
-    """Left of the disc the photograph is red, right of it blue."""
+    # Left of the disc the photograph is red, right of it blue.
     rgb = np.zeros((*SIZE, 3), np.float32)
     rgb[:, :160, 0], rgb[:, 160:, 2] = 1.0, 1.0
     plate = plate_of(rgb, LENS)
     inserted = put_in(plate, soft_disc((0.0, 0.0, 0.0)))
     added = finished(inserted, plate, Finishing(light_wrap=LightWrap(1.0, 4.0))).virtual.rgb
     assert added[128, 95, 0] > 0.2 and added[128, 95, 2] < 1e-6 and added[128, 225, 2] > 0.2
-
-
-def test_light_wrap_does_not_depend_on_the_box() -> None:
     plate = scene_plate()
     inserted = put_in(plate, soft_disc())
     cut = finished(inserted, plate, Finishing(light_wrap=LightWrap(0.7, 4.0))).virtual.rgb
     whole = LightWrap(0.7, 4.0).wrapped(inserted.virtual, inserted.photo_rgb).rgb
     np.testing.assert_allclose(cut, whole, atol=1e-6)
-
-
-def test_mistakes_are_told() -> None:
-    plate = scene_plate()
-    with pytest.raises(InputError, match="expected the plate that was inserted into"):
-        finished(put_in(plate, soft_disc()), plate_of(np.zeros((8, 8, 3), np.float32), LENS), ALL)
-    with pytest.raises(InputError, match="strength 0 to 1"):
-        LightWrap(1.5)
-    with pytest.raises(InputError, match="radius above 0"):
-        LightWrap(0.5, 0.0)

@@ -31,13 +31,10 @@ def photo_with_exif(path: Path, exposure_time_s: float = 0.01, lens_model: str =
     return path
 
 
-def test_nothing_typed_does_nothing(frames: tuple[np.ndarray, np.ndarray]) -> None:
+def test_nothing_typed_does_nothing_and_grey_black_and_value_what_they_say(frames: tuple[np.ndarray, np.ndarray]) -> None:
     assert finishing_of(LookOptions(), frames[0]) == Finishing()
     assert finishing_of(LookOptions(match_black="off", vignetting="off", grain="off", light_wrap="off"), frames[0]) == Finishing()
-
-
-def test_grey_black_and_value(frames: tuple[np.ndarray, np.ndarray]) -> None:
-    """At (100, 100) the scene is smooth_scene()[100, 100]; the card's value divides, the black is taken off first."""
+    # At (100, 100) the scene is smooth_scene()[100, 100]; the card's value divides, the black is taken off first.
     level = smooth_scene()[100, 100]
     found = finishing_of(LookOptions(match_grey="100,100,4"), frames[0]).colour
     assert found is not None
@@ -51,9 +48,6 @@ def test_grey_black_and_value(frames: tuple[np.ndarray, np.ndarray]) -> None:
         lifted = finishing_of(LookOptions(match_grey="100,100,4", match_black=text), with_hole).colour
         assert lifted is not None and lifted.black == pytest.approx((0.02, 0.01, 0.015), rel=1e-5)
         np.testing.assert_allclose(lifted.gain, (np.array(found.gain) * 0.18 - lifted.black) / 0.18)
-
-
-def test_a_card_in_the_corner_counts_the_falloff(frames: tuple[np.ndarray, np.ndarray]) -> None:
     plain = finishing_of(LookOptions(match_grey="10,10,4"), frames[0]).colour
     found = finishing_of(LookOptions(match_grey="10,10,4", vignetting="-0.5"), frames[0])
     assert plain is not None and found.colour is not None and found.vignetting == RadialFalloff(-0.5)
@@ -80,17 +74,14 @@ def test_grain_of_the_plate_of_a_file_and_of_two_frames(tmp_path: Path, frames: 
     assert found is not None and found.level == alone.level and found.seed == 9
 
 
-def test_vignetting_by_coefficients_flat_field_and_lensfun(tmp_path: Path, frames: tuple[np.ndarray, np.ndarray]) -> None:
+def test_vignetting_by_coefficients_flat_field_and_lensfun_and_light_wrap(frames: tuple[np.ndarray, np.ndarray], tmp_path: Path) -> None:
+    assert finishing_of(LookOptions(light_wrap="0.3"), frames[0]).light_wrap == LightWrap(0.3)
+    assert finishing_of(LookOptions(light_wrap="0.3,5"), frames[0]).light_wrap == LightWrap(0.3, 5.0)
     write_image(tmp_path / "flat.exr", np.full((32, 48, 3), 0.5, np.float32))
     assert isinstance(finishing_of(LookOptions(vignetting=str(tmp_path / "flat.exr")), frames[0]).vignetting, FlatField)
     pytest.importorskip("lensfunpy")
     found = finishing_of(LookOptions(vignetting="auto"), frames[0], photo_with_exif(tmp_path / "plate.jpg")).vignetting
     assert found == lensfun_falloff(CameraAndLens("Canon", "Canon EOS 450D", LENS_MODEL), 100.0, 2.8)
-
-
-def test_light_wrap(frames: tuple[np.ndarray, np.ndarray]) -> None:
-    assert finishing_of(LookOptions(light_wrap="0.3"), frames[0]).light_wrap == LightWrap(0.3)
-    assert finishing_of(LookOptions(light_wrap="0.3,5"), frames[0]).light_wrap == LightWrap(0.3, 5.0)
 
 
 @pytest.mark.parametrize(

@@ -25,20 +25,22 @@ def board_track() -> CameraTrack:
     return CameraTrack({0: TrackedFrame(camera()), 1: TrackedFrame(camera((0.05, 1.0, -0.1)))}, up="-z")
 
 
-def test_a_track_that_agrees_is_taken(tmp_path: Path) -> None:
+def test_a_track_that_agrees_is_taken_and_other_options_stay(tmp_path: Path) -> None:
     write_track(tmp_path / "track.json", board_track())
     found = scene_track(tmp_path / "track.json", SIZE, "-z")
     assert found.up == "-z" and found.numbers == [0, 1]
+    # A .chan does not tell the size of its pictures: it is the plate's.
+    write_track(tmp_path / "track.chan", board_track(), TrackOptions())
+    assert scene_track(tmp_path / "track.chan", SIZE, "+y").size_px == SIZE
+    with pytest.raises(InputError, match="there is none"):
+        scene_track(tmp_path / "none.json", SIZE, "-z")
 
 
-def test_one_camera_follows_the_scene(tmp_path: Path) -> None:
+def test_a_camera_follows_the_scene_in_pictures_of_its_shape(tmp_path: Path) -> None:
     write_json(tmp_path / "camera.json", camera_to_json(camera()))
     for up in ("-z", "-y", "+y", "+z"):
         assert scene_track(tmp_path / "camera.json", SIZE, up).up == up
-
-
-def test_a_camera_of_pictures_of_another_shape_is_refused(tmp_path: Path) -> None:
-    """Stretched to the plate it would show objects too narrow; another size of the same shape is well."""
+    # Stretched to the plate it would show objects too narrow; another size of the same shape is well.
     write_json(tmp_path / "camera.json", camera_to_json(camera()))
     assert scene_track(tmp_path / "camera.json", (2 * WIDTH, 2 * HEIGHT), "-z").size_px == SIZE
     with pytest.raises(InputError, match=rf"plate's shape \({HEIGHT}x{WIDTH}\), got one for {WIDTH}x{HEIGHT}"):
@@ -81,11 +83,3 @@ def test_both_commands_refuse_and_what_the_sentence_says_helps(tmp_path: Path) -
         # 0.2 m at 1 m and 150 px: 30 px high, standing on the board's corner 0.1 m below the axis, 15 px below the middle.
         rows = np.flatnonzero((alpha > 0.5).any(axis=1))
         assert len(rows) == pytest.approx(30, abs=1) and rows.mean() == pytest.approx(HEIGHT / 2 - 0.5, abs=1)
-
-
-def test_other_options_of_tracks_stay(tmp_path: Path) -> None:
-    """A .chan does not tell the size of its pictures: it is the plate's."""
-    write_track(tmp_path / "track.chan", board_track(), TrackOptions())
-    assert scene_track(tmp_path / "track.chan", SIZE, "+y").size_px == SIZE
-    with pytest.raises(InputError, match="there is none"):
-        scene_track(tmp_path / "none.json", SIZE, "-z")

@@ -2,6 +2,7 @@
 
 import csv
 import dataclasses
+import shutil
 import sys
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from mrbokeh.system.errors import InputError
 from tests.learning.test_train import DEMO_LIKE
 from tests.scenes.card_stack import CARD_M, CARD_PX, LENS, SIZE, WALL_M, make_card_scene, make_card_stack
 from tests.scenes.command_line import printed_by
+from tests.scenes.made_networks import jittered
 from training.cli import app
 from training.data.dataset import PairSet
 from training.data.pairs import WHERE_TRUTH_IS_KNOWN
@@ -44,6 +46,7 @@ from training.evaluation.report import HEADINGS, table_rows
 from training.evaluation.scores import MEASURES, OnnxPerceptualDistance, Score, SliceScorer, mean_known
 from training.evaluation.unseen_slice import UnseenSlice, edge_band, highlight_discs, sharp_side, unseen_slice
 from training.fitting import train
+from training.fitting.run_folder import load_run, save_network
 
 ON_THE_CARD, ON_THE_WALL = 0, 2
 
@@ -55,26 +58,25 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def runs(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    folder = tmp_path_factory.mktemp("runs")
-    for seed in range(2):
-        train.fit(training_data([scene]), folder / f"seed_{seed}", dataclasses.replace(DEMO_LIKE, epochs=1, seed=seed), ["view_1"])
-    return [folder / f"seed_{seed}" for seed in range(2)]
+    """A trained network, and another one: its weights a little off."""
+    first, second = (tmp_path_factory.mktemp("runs") / f"seed_{seed}" for seed in range(2))
+    train.fit(training_data([scene]), first, dataclasses.replace(DEMO_LIKE, epochs=1), ["view_1"])
+    shutil.copytree(first, second)
+    save_network(second, jittered(load_run(first)[0], 0.01))
+    return [first, second]
 
 
 def slice_of(scene: Path, index: int) -> UnseenSlice:
     return unseen_slice(PairSet(training_data([scene]).stacks[:1], WHERE_TRUTH_IS_KNOWN, cache_mib=0), index)
 
 
-def test_the_band_reaches_as_far_as_the_blur(scene: Path) -> None:
+def test_the_band_and_the_sharp_side_follow_the_blur(scene: Path) -> None:
     """Focused on the card, the wall's circle of confusion is LENS.coc_px; half of it, rounded up, on both sides of the card's edge."""
     seen = slice_of(scene, ON_THE_CARD)
     reach = int(np.ceil(LENS.focused_at(CARD_M).coc_px(WALL_M, SIZE[1]) / 2))
     band = np.flatnonzero(edge_band(seen)[SIZE[0] // 2])
     assert (band[0], band[-1]) == (CARD_PX - 1 - reach, CARD_PX + reach)
     assert not edge_band(dataclasses.replace(seen, depth_m=np.full(SIZE, CARD_M, np.float32))).any()
-
-
-def test_the_sharp_side_is_what_is_in_focus(scene: Path) -> None:
     card, wall = (sharp_side(slice_of(scene, index)) for index in (ON_THE_CARD, ON_THE_WALL))
     assert card[:, :CARD_PX].any() and not card[:, CARD_PX:].any()
     assert wall[:, CARD_PX:].any() and not wall[:, :CARD_PX].any()
@@ -93,15 +95,12 @@ def test_discs_of_lights_have_their_size(scene: Path) -> None:
     assert not highlight_discs(dataclasses.replace(lit, pair=dataclasses.replace(lit.pair, all_in_focus=np.minimum(rgb, 1.0)))).any()
 
 
-def test_the_truth_itself_has_no_errors(scene: Path) -> None:
+def test_every_failure_is_seen_by_its_measure_and_the_truth_has_none(scene: Path) -> None:
     seen = slice_of(scene, ON_THE_CARD)
     score = SliceScorer(seen).score("truth", seen.pair.target)
     assert (score.psnr_db, score.edge_psnr_db, score.energy_ratio) == (float("inf"), float("inf"), 1.0)
     assert (score.leak, score.highlight_error) == (0.0, 0.0) and score.ssim == pytest.approx(1.0)
-
-
-def test_every_failure_is_seen_by_its_measure(scene: Path) -> None:
-    """Light of the wall over the sharp card is leak; lights cut off are a highlight error that PSNR hardly sees; both alone."""
+    # Light of the wall over the sharp card is leak; lights cut off are a highlight error that PSNR hardly sees; both alone.
     seen = slice_of(scene, ON_THE_CARD)
     truth, scorer = seen.pair.target, SliceScorer(seen)
     clipped = scorer.score("clipped", np.minimum(truth, 0.5 * truth.max()))
@@ -145,19 +144,16 @@ def flickering(amplitude: float) -> Method:
     return Method("flickering", blur, "renderer")
 
 
-def test_a_network_that_flickers_scores_worse(scene: Path) -> None:
+def test_a_network_that_flickers_scores_worse_and_a_fine_stack_is_its_own_pull(scene: Path, tmp_path: Path) -> None:
     """Between slices the truth is the polygon renderer itself; alternating by 0.02 scores 0.02, less what is clipped at 0 and 1."""
     pull = focus_pull(training_data([scene]).stacks[0], frames=5)
     focus_m = [frame.lens.focus_distance_m for frame in pull.frames]
     assert focus_m[0] == pytest.approx(0.55) and focus_m[-1] == pytest.approx(CARD_M)
     assert np.allclose(np.diff(1.0 / np.array(focus_m)), (1 / CARD_M - 1 / 0.55) / 4)
-    assert pull.flicker_of(renderer_method("polygon")) == 0.0
-    assert pull.flicker_of(flickering(0.02)) == pytest.approx(0.02, rel=0.05)
-    assert pull.flicker_of(flickering(0.05)) > pull.flicker_of(flickering(0.02)) > pull.flicker_of(renderer_method("scatter"))
-
-
-def test_a_fine_stack_is_its_own_pull(tmp_path: Path) -> None:
-    """Steps of 1 px in the circle of confusion: 1 / coc_px_per_dioptre dioptres each."""
+    methods = (renderer_method("polygon"), renderer_method("scatter"), flickering(0.02), flickering(0.05))
+    calm, exact, less, more = (pull.flicker_of(each) for each in methods)
+    assert calm == 0.0 and less == pytest.approx(0.02, rel=0.05) and more > less > exact
+    # Steps of 1 px in the circle of confusion: 1 / coc_px_per_dioptre dioptres each.
     step = 1.0 / LENS.focused_at(CARD_M).coc_px_per_dioptre(SIZE[1])
     focus_m = tuple(float(1.0 / (1.0 / WALL_M + step * index)) for index in range(5))
     stack = make_card_stack(tmp_path / "view", 0, focus_m)
@@ -172,11 +168,9 @@ def write_distance(path: Path, inputs: int = 2) -> Path:
     """Mean absolute difference of two pictures as a network, in the place of LPIPS."""
     size = [1, 3, "height", "width"]
     given = [helper.make_tensor_value_info(name, TensorProto.FLOAT, size) for name in ("a", "b")[:inputs]]
-    nodes = [
-        helper.make_node("Sub", ["a", "b" if inputs == 2 else "a"], ["difference"]),
-        helper.make_node("Abs", ["difference"], ["absolute"]),
-        helper.make_node("ReduceMean", ["absolute"], ["distance"], keepdims=1),
-    ]
+    steps = (("Sub", ["a", "b" if inputs == 2 else "a"], "difference", {}), ("Abs", ["difference"], "absolute", {}))
+    steps += (("ReduceMean", ["absolute"], "distance", {"keepdims": 1}),)
+    nodes = [helper.make_node(name, inputs_of, [output], **options) for name, inputs_of, output, options in steps]
     graph = helper.make_graph(nodes, "distance", given, [helper.make_tensor_value_info("distance", TensorProto.FLOAT, [1, 1, 1, 1])])
     onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9), path)
     return path
@@ -200,14 +194,6 @@ def test_peak_memory_counts_what_was_given_back() -> None:
     assert peak_memory_mib(lambda: np.ones(2**23).sum()) == pytest.approx(64.0, abs=4.0)
 
 
-def test_names_of_networks() -> None:
-    assert network_names([Path("runs/a")]) == [NETWORK]
-    assert network_names([Path("runs/a"), Path("b.onnx")]) == ["a", "b"]
-    assert network_names([Path("x/lens.onnx"), Path("y/lens.onnx")]) == ["x/lens.onnx", "y/lens.onnx"]
-    with pytest.raises(InputError, match="expected renderers among"):
-        renderer_methods(["gauss"])
-
-
 def test_renderers_with_a_measured_bank(scene: Path, tmp_path: Path) -> None:
     """A bank of the true opening, sampled per pixel of blur, is as good as the opening itself; networks and LRDM take none."""
     pairs = PairSet(training_data([scene]).stacks[:1], WHERE_TRUTH_IS_KNOWN, cache_mib=0)
@@ -221,11 +207,6 @@ def test_renderers_with_a_measured_bank(scene: Path, tmp_path: Path) -> None:
     assert (measured.name, measured.kind) == ("scatter, measured", "renderer")
     exact = renderer_method("scatter").blur(seen)
     assert psnr(measured.blur(seen), exact) > 45.0 > psnr(seen.pair.all_in_focus, exact)
-
-
-def test_means_leave_out_what_was_not_measured() -> None:
-    assert mean_known([1.0, float("nan"), 3.0]) == 2.0
-    assert np.isnan(mean_known([float("nan")]))
 
 
 def read_numbers(path: Path) -> list[Score]:
@@ -263,13 +244,20 @@ def test_one_network_with_its_data_behind_it(scene: Path, runs: list[Path]) -> N
     assert "network over no blur" in told and "no weights are shipped" in (runs[0] / "evaluation.md").read_text()
 
 
-def test_what_evaluate_wants(scene: Path, runs: list[Path]) -> None:
+def test_what_evaluate_wants_and_names_of_networks(scene: Path, runs: list[Path]) -> None:
     with pytest.raises(InputError, match="give --data"):
         printed_by(app, "evaluate", runs[0])
     with pytest.raises(InputError, match="give --out"):
         printed_by(app, "evaluate", *runs, "--data", scene)
     with pytest.raises(InputError, match="trained on every slice of these"):
         unseen_of(training_data([scene]).stacks, [Seen(("card/view_0", "card/view_1"))])
+    assert network_names([Path("runs/a")]) == [NETWORK]
+    assert network_names([Path("runs/a"), Path("b.onnx")]) == ["a", "b"]
+    assert network_names([Path("x/lens.onnx"), Path("y/lens.onnx")]) == ["x/lens.onnx", "y/lens.onnx"]
+    with pytest.raises(InputError, match="expected renderers among"):
+        renderer_methods(["gauss"])
+    assert mean_known([1.0, float("nan"), 3.0]) == 2.0
+    assert np.isnan(mean_known([float("nan")]))
 
 
 def test_the_table_is_sorted_and_has_a_cell_for_everything(scene: Path, tmp_path: Path) -> None:

@@ -25,28 +25,16 @@ from training.fitting.settings import TrainSettings, better_settings, demo_setti
 from training.networks.network import BlurNetwork
 from training.networks.network_settings import NetworkSettings
 
-FACTS = RunFacts(
-    lens=Lens(35.0, 2.8, 1.25, 23.5, Aperture.blades(6)),
-    width_px=60,
-    height_px=40,
-    largest_coc_px=6.5,
-    radiance_scale=12.0,
-    trained_on=("attic/view_0", "attic/view_1"),
-    held_out=("attic/view_2",),
-    commit="0123abc",
-    f_numbers=(1.4, 5.6),
-    focal_lengths_mm=(24.0, 70.0),
-)
+LENS = Lens(35.0, 2.8, 1.25, 23.5, Aperture.blades(6))
+FACTS = RunFacts(LENS, 60, 40, 6.5, 12.0, ("attic/view_0", "attic/view_1"), ("attic/view_2",), "0123abc", (1.4, 5.6), (24.0, 70.0))
 FORMS = {
     "published": NetworkSettings(tile_px=24, overlap_px=8),
     "published, one tile": NetworkSettings(tile_px=0, overlap_px=0, width=2, mixing="tile"),
     "gated": demo_settings().network,
     "gated, tiles, unsigned": replace(demo_settings().network, tile_px=32, overlap_px=6, signed_coc=False),
-    "published, 3x3, place and lens": NetworkSettings(
-        kernels="3x3", tile_px=24, overlap_px=8, field_position=True, lens_inputs=True, headroom=1.5
-    ),
     "gated, place": better_settings().network,
 }
+FORMS["published, 3x3, place and lens"] = replace(FORMS["published"], kernels="3x3", field_position=True, lens_inputs=True, headroom=1.5)
 
 
 def _network(settings: NetworkSettings, seed: int = 0) -> BlurNetwork:
@@ -69,14 +57,13 @@ def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     return network, request.param, path
 
 
-def test_parity(exported: tuple[BlurNetwork, NetworkSettings, Path]) -> None:
+def test_parity_and_what_the_file_says_of_itself(exported: tuple[BlurNetwork, NetworkSettings, Path]) -> None:
     """The product promises 1e-4."""
-    network, _, path = exported
+    network, settings, path = exported
     assert largest_difference(network, OnnxNetwork(path)) < 1e-4
     onnx.checker.check_model(str(path))
-
-
-def test_facts_survive_in_the_file(exported: tuple[BlurNetwork, NetworkSettings, Path]) -> None:
+    # Other weights than those exported are far off, so the check can fail.
+    assert largest_difference(_network(settings, seed=1), OnnxNetwork(path)) > 1e-3
     _, settings, path = exported
     facts = OnnxNetwork(path).facts
     assert (facts.width_px, facts.height_px, facts.largest_coc_px, facts.radiance_scale) == (60, 40, 6.5, 12.0)
@@ -87,6 +74,9 @@ def test_facts_survive_in_the_file(exported: tuple[BlurNetwork, NetworkSettings,
     assert facts.field_position == settings.field_position and facts.lens_inputs == settings.lens_inputs
     assert (facts.f_numbers, facts.focal_lengths_mm) == (((1.4, 5.6), (24.0, 70.0)) if settings.lens_inputs else (None, None))
     assert np.allclose(facts.lens.aperture.outlines[0], FACTS.lens.aperture.outlines[0])
+    _, settings, path = exported
+    further = ["place"] * settings.field_position + ["lens"] * settings.lens_inputs
+    assert [each.name for each in onnx.load(path).graph.input] == ["rgb", "coc_px", *further]
 
 
 def test_size_is_free_without_tiles_only(exported: tuple[BlurNetwork, NetworkSettings, Path]) -> None:
@@ -100,12 +90,6 @@ def test_size_is_free_without_tiles_only(exported: tuple[BlurNetwork, NetworkSet
     planes = torch.from_numpy(rgb).permute(2, 0, 1)[None], torch.from_numpy(coc_px)[None, None]
     expected = network(*planes, place, torch.tensor([[2.8, 35.0]]))[0].permute(1, 2, 0)
     assert np.allclose(OnnxNetwork(path).blur(rgb, coc_px), expected.detach().numpy(), atol=1e-4)  # whole frame, lens of the facts
-
-
-def test_graph_has_the_inputs_it_uses_and_no_others(exported: tuple[BlurNetwork, NetworkSettings, Path]) -> None:
-    _, settings, path = exported
-    further = ["place"] * settings.field_position + ["lens"] * settings.lens_inputs
-    assert [each.name for each in onnx.load(path).graph.input] == ["rgb", "coc_px", *further]
 
 
 def test_files_from_before_place_and_lens_still_load(exported: tuple[BlurNetwork, NetworkSettings, Path], tmp_path: Path) -> None:
@@ -123,20 +107,7 @@ def test_files_from_before_place_and_lens_still_load(exported: tuple[BlurNetwork
     assert np.array_equal(OnnxNetwork(tmp_path / "old.onnx").blur(rgb, coc_px[..., 0]), OnnxNetwork(path).blur(rgb, coc_px[..., 0]))
 
 
-def test_a_network_that_computes_something_else_is_not_written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(onnx_export, "largest_difference", lambda *_: 2 * LARGEST_DIFFERENCE)
-    with pytest.raises(InputError, match="nothing was written"):
-        export_network(_network(FORMS["gated"]), FORMS["gated"], FACTS, tmp_path / "lens.onnx")
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_difference_is_noticed(exported: tuple[BlurNetwork, NetworkSettings, Path]) -> None:
-    """Other weights than those exported are far off, so the check can fail."""
-    _, settings, path = exported
-    assert largest_difference(_network(settings, seed=1), OnnxNetwork(path)) > 1e-3
-
-
-def test_command(tmp_path: Path) -> None:
+def test_a_command_writes_what_computes_the_same_and_nothing_else(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run, out = tmp_path / "run", tmp_path / "lens.onnx"
     run.mkdir()
     settings = TrainSettings(network=NetworkSettings(tile_px=0, overlap_px=0, blocks=1))
@@ -148,6 +119,10 @@ def test_command(tmp_path: Path) -> None:
     assert "any size" in printed_by(app, "export", run, "--out", out)
     with pytest.raises(InputError, match="--overwrite"):
         printed_by(app, "export", run, "--out", out)
+    monkeypatch.setattr(onnx_export, "largest_difference", lambda *_: 2 * LARGEST_DIFFERENCE)
+    with pytest.raises(InputError, match="nothing was written"):
+        printed_by(app, "export", run, "--out", tmp_path / "other.onnx")
+    assert not list(tmp_path.glob("*other*"))
 
 
 def test_foreign_and_damaged_files_are_refused(tmp_path: Path, exported: tuple[BlurNetwork, NetworkSettings, Path]) -> None:

@@ -97,13 +97,10 @@ def test_the_file_is_an_ordinary_network_and_a_record_lies_beside_it(tmp_path: P
     assert record["factors"] == list(done.plan.factors)
 
 
-def test_nothing_is_written_where_no_plan_keeps_within_the_budget(tmp_path: Path) -> None:
+def test_what_keeps_no_budget_or_has_no_fast_graph_is_said(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no fast form of this network loses at most -1 dB"):
         export_fast_network(untrained(GATED, 5.0), GATED, _facts(), tmp_path / "fast.onnx", max_psnr_loss_db=-1.0)
     assert not any(tmp_path.iterdir())
-
-
-def test_forms_that_have_no_fast_graph_are_said() -> None:
     with pytest.raises(InputError, match="without tiles"):
         plans(untrained(GATED, grid=TileGrid(*SIZE, 20, 8)))
     with pytest.raises(InputError, match="channel by channel"):

@@ -17,6 +17,14 @@ from training.export.gated_weights import fewer_knots, hats, thinned, weights_of
 from training.networks.gated_network import bins_px
 from training.networks.network import BlurNetwork
 
+FORMS: dict[str, dict] = {
+    "demo": {},
+    "unsigned": {"width": 1, "signed_coc": False, "kernels_per_colour": True},
+    "field": {"field_bases": 3, "field_position": True},
+    "field and lens": {"field_bases": 2, "field_position": True, "lens_inputs": True, "kernels_per_colour": True, "width": 1},
+    "tanh": {"activation": "tanh"},
+}
+
 
 @torch.no_grad()
 def _refined(coarse: BlurNetwork, changes: dict) -> BlurNetwork:
@@ -42,17 +50,7 @@ def _refined(coarse: BlurNetwork, changes: dict) -> BlurNetwork:
     return fine
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {},
-        {"width": 1, "signed_coc": False, "kernels_per_colour": True},
-        {"field_bases": 3, "field_position": True},
-        {"field_bases": 2, "field_position": True, "lens_inputs": True, "kernels_per_colour": True, "width": 1},
-        {"activation": "tanh"},
-    ],
-    ids=["demo", "unsigned", "field", "field and lens", "tanh"],
-)
+@pytest.mark.parametrize("changes", FORMS.values(), ids=FORMS)
 def test_the_gated_graph_at_full_resolution_is_the_network(changes: dict) -> None:
     """Nothing is factorised, so that it agrees like a plain export; the size is odd and no multiple of anything."""
     network = untrained(replace(GATED, **changes))
@@ -95,13 +93,10 @@ def test_bins_without_pixels_are_not_run_and_not_missed(tmp_path: Path) -> None:
     assert counts[1] <= 2
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [{}, {"signed_coc": False, "kernels_per_colour": True}, {"field_bases": 3, "field_position": True}],
-    ids=["demo", "unsigned", "field"],
-)
-def test_fewer_bins_give_back_the_network_that_the_others_were_drawn_between(changes: dict) -> None:
+@pytest.mark.parametrize("form", ["demo", "unsigned", "field"])
+def test_fewer_bins_give_back_the_network_that_the_others_were_drawn_between(form: str) -> None:
     """Bins of width 1 lie at every other knot of width 2, so the squares that the fit makes small can be 0."""
+    changes = {name: value for name, value in FORMS[form].items() if name != "width"}
     coarse = untrained(replace(GATED, **changes, width=1))
     knots_px, fine = weights_of(coarse.tiles).knots_px, weights_of(_refined(coarse, changes).tiles)
     assert len(fine.knots_px) == 2 * len(knots_px) - 1
@@ -137,12 +132,17 @@ def test_knots_thin_out_with_diameter_and_fill_their_groups(signed: bool) -> Non
     np.testing.assert_array_equal(fewer_knots(every, 0.0, 4), every)
 
 
-def test_thinned_weights_keep_every_sum_and_reach_no_farther() -> None:
+def test_thinned_weights_keep_every_sum_and_plans_go_from_cheap_to_dear() -> None:
     weights = weights_of(untrained(GATED, 49.0).tiles)
     few = thinned(weights, 0.2)
     assert len(few.knots_px) < 0.4 * len(weights.knots_px)
     np.testing.assert_allclose([kernel.sum() for kernel in few.kernels], 1.0, atol=1e-9)
     assert reach_px(few, [1] * 25) == reach_px(weights, [1] * 25) == 25
+    network = untrained(GATED, 25.0)
+    whole, found = weights_of(network.tiles), plans(network)
+    costs = [cost(thinned(whole, plan.spacing), plan.factors) for plan in found]
+    assert costs == sorted(costs) and found[0].bins < found[-1].bins
+    assert any(plan.bins == len(whole.knots_px) and set(plan.factors) == {1} for plan in found)
 
 
 def test_groups_hold_every_bin_once_and_fill_their_channels() -> None:
@@ -156,21 +156,11 @@ def test_groups_hold_every_bin_once_and_fill_their_channels() -> None:
         assert {factor for bins, factor in parts if 24 in bins} == {1}
 
 
-def test_plans_go_from_cheap_to_dear_and_one_changes_nothing() -> None:
-    network = untrained(GATED, 25.0)
-    whole, found = weights_of(network.tiles), plans(network)
-    costs = [cost(thinned(whole, plan.spacing), plan.factors) for plan in found]
-    assert costs == sorted(costs)
-    assert any(plan.bins == len(whole.knots_px) and set(plan.factors) == {1} for plan in found)
-    assert found[0].bins < found[-1].bins
-
-
 def _two_cards() -> dict[str, torch.Tensor]:
     """In focus, with a near card at the border and a far one inside; 170 and 250 are no multiples of 4."""
     inputs = pictures((170, 250))
     coc_px = torch.zeros_like(inputs["coc_px"])
-    coc_px[..., :17, 100:] = -10.5
-    coc_px[..., 40:57, 31:52] = 8.7
+    coc_px[..., :17, 100:], coc_px[..., 40:57, 31:52] = -10.5, 8.7
     return inputs | {"coc_px": coc_px}
 
 

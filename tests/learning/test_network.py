@@ -34,13 +34,14 @@ def _count(module: torch.nn.Module) -> int:
     return sum(each.numel() for each in module.parameters())
 
 
-@pytest.mark.parametrize(("coc_px", "blocks"), [(0.3, 1), (3.0, 1), (3.1, 2), (7.2, 4), (-13.0, 6), (13.5, 7), (81.0, 40)])
-def test_the_largest_kernel_covers_the_largest_circle_of_confusion(coc_px: float, blocks: int) -> None:
-    """N is the smallest number with 2N + 1 >= |CoC|; 81 px is the largest lens of the paper's Table 2."""
-    assert network_blocks(coc_px) == blocks
+def test_the_largest_kernel_covers_the_largest_circle_of_confusion() -> None:
+    """N is the smallest number with 2N + 1 >= |CoC|; 81 px is the largest lens of the paper's Table 2. Gated kernels cover a pixel more:
+    2N - 1 >= |CoC|, so that 5 px need N = 3, 5.1 px N = 4; without blur one size is left."""
+    assert [network_blocks(each) for each in (0.3, 3.0, 3.1, 7.2, -13.0, 13.5, 81.0)] == [1, 1, 2, 4, 6, 7, 40]
+    assert [blocks_for_gates(each) for each in (0.0, 1.0, -5.0, 5.1, 13.0)] == [1, 1, 3, 4, 7]
 
 
-def test_published_default_has_the_parameters_of_the_paper() -> None:
+def test_published_form_has_the_parameters_and_the_reach_of_the_paper() -> None:
     """Per tile: C1 is 4 -> 3 (12 + 3), C2 is 3 + 3 -> 3 (18 + 3), and R_n has two convolutions of 3 kernels (2n+1)^2 with 3 biases.
 
     N = 4: 2 * 3 * (9 + 25 + 49 + 81) + 4 * 2 * 3 = 1008, and 36 more; a picture of 40 x 24 px has 2 * 1 tiles of 24 px with overlap 8.
@@ -49,21 +50,7 @@ def test_published_default_has_the_parameters_of_the_paper() -> None:
     grid = TileGrid(24, 40, 24, 8)
     assert len(grid) == 2
     assert _count(BlurNetwork(NetworkSettings(), 9.0, 1.0, grid)) == 2 * (1008 + 36)
-
-
-@pytest.mark.parametrize(
-    ("mixing", "expected"),
-    [("none", 2 * 6 * 34 + 24), ("colour", 2 * 12 * 34 + 24), ("tile", 2 * 6 * 34 + 24 + 2 * (36 + 6))],
-)
-def test_width_and_mixing(mixing: str, expected: int) -> None:
-    """Width 2 makes 6 features; N = 2 has kernels of 9 + 25 = 34. Depthwise: 6 of them per convolution; per colour: 6 * 2 (two inputs
-    each); 2 convolutions and 2 * 2 * 6 = 24 biases. "tile" adds a 6 x 6 mixture with 6 biases per block."""
-    tiles = PublishedTiles(replace(ONE_TILE, width=2, mixing=mixing), blocks=2, largest_coc_px=5.0, tiles=1)
-    assert _count(tiles.blocks) == expected
-
-
-def test_kernels_grow_and_receptive_field_is_their_sum() -> None:
-    """Two convolutions of radius n per block reach 2 (1 + ... + N) = N (N + 1) px; N = 3 gives 12."""
+    # Two convolutions of radius n per block reach 2 (1 + ... + N) = N (N + 1) px; N = 3 gives 12.
     torch.manual_seed(0)  # some random weights around the blocks close every rectifier, and then nothing is seen
     network = BlurNetwork(replace(ONE_TILE, activation="identity", initialisation="default"), 7.0, 1.0)
     assert network.reach_px == 12
@@ -75,6 +62,24 @@ def test_kernels_grow_and_receptive_field_is_their_sum() -> None:
     network(rgb, torch.zeros(1, 1, 41, 41))[0, 0, 20, 20].backward()
     touched = torch.nonzero(rgb.grad[0, 0])
     assert touched.amin(0).tolist() == [8, 8] and touched.amax(0).tolist() == [32, 32]
+    # CoC 7 px gives N = 3 either way. 3x3: two convolutions of radius 1 in each of 3 blocks reach 6 px, and have
+    # 2 * 3 * 3 (9 + 1) = 180 parameters; growing ones 2 * 3 * (9 + 25 + 49 + 3) = 516 and 12 px.
+    growing, small = BlurNetwork(ONE_TILE, 7.0, 1.0), BlurNetwork(replace(ONE_TILE, kernels="3x3"), 7.0, 1.0)
+    assert [len(each.tiles.blocks) for each in (growing, small)] == [3, 3]
+    assert [sum(p.numel() for p in each.tiles.blocks.parameters()) for each in (growing, small)] == [516, 180]
+    assert (growing.reach_px, small.reach_px) == (12, 6)
+    assert [block.first.kernel_size for block in small.tiles.blocks] == [(3, 3)] * 3
+
+
+@pytest.mark.parametrize(
+    ("mixing", "expected"),
+    [("none", 2 * 6 * 34 + 24), ("colour", 2 * 12 * 34 + 24), ("tile", 2 * 6 * 34 + 24 + 2 * (36 + 6))],
+)
+def test_width_and_mixing(mixing: str, expected: int) -> None:
+    """Width 2 makes 6 features; N = 2 has kernels of 9 + 25 = 34. Depthwise: 6 of them per convolution; per colour: 6 * 2 (two inputs
+    each); 2 convolutions and 2 * 2 * 6 = 24 biases. "tile" adds a 6 x 6 mixture with 6 biases per block."""
+    tiles = PublishedTiles(replace(ONE_TILE, width=2, mixing=mixing), blocks=2, largest_coc_px=5.0, tiles=1)
+    assert _count(tiles.blocks) == expected
 
 
 @pytest.mark.parametrize("settings", [NetworkSettings(), GATED], ids=["published", "gated"])
@@ -108,19 +113,23 @@ def test_output_keeps_the_size_and_every_parameter_learns(settings: NetworkSetti
     assert all(each.grad is not None and each.grad.abs().sum() > 0 for each in network.parameters())
 
 
-def test_output_of_the_published_form_stays_in_its_range() -> None:
+def test_output_of_the_published_form_stays_in_its_range_and_near_is_not_far_without_signs() -> None:
     """tanh in [-1, 1] is [0, radiance scale] outside, whatever comes in."""
     network = BlurNetwork(ONE_TILE, 7.0, radiance_scale=8.0)
     rgb, coc_px = _pictures()
     result = network(rgb * 100.0, coc_px)
     assert result.min() >= 0.0 and result.max() <= 8.0
-
-
-def test_unsigned_circle_of_confusion_cannot_tell_near_from_far() -> None:
     rgb, coc_px = _pictures()
     unsigned, signed = BlurNetwork(ONE_TILE, 7.0, 1.0), BlurNetwork(replace(ONE_TILE, signed_coc=True), 7.0, 1.0)
     assert torch.equal(unsigned(rgb, coc_px), unsigned(rgb, -coc_px))
     assert not torch.allclose(signed(rgb, coc_px), signed(rgb, -coc_px))
+    # Without headroom 0 and 8 become -1 and 1; with a headroom of 2 the scale lies in the middle.
+    rgb = torch.tensor([0.0, 8.0, 8.0])[None, :, None, None]
+    coc_px = torch.full((1, 1, 1, 1), 3.5)
+    assert BlurNetwork(ONE_TILE, 7.0, 8.0).encode(rgb, coc_px).flatten().tolist() == [-1.0, 1.0, 1.0, 0.0]
+    assert BlurNetwork(replace(ONE_TILE, headroom=2.0), 7.0, 8.0).encode(rgb, coc_px).flatten().tolist() == [-1.0, 0.0, 0.0, 0.0]
+    network = BlurNetwork(ONE_TILE, 7.0, 1.0)
+    assert torch.equal(network.tile_outputs(*_pictures()), network(*_pictures()))
 
 
 @pytest.mark.parametrize("signed", [False, True])
@@ -136,7 +145,7 @@ def test_gates_share_every_pixel_out(signed: bool) -> None:
 
 
 @torch.no_grad()
-def test_gated_form_blurs_a_light_to_the_disc_it_starts_with() -> None:
+def test_gated_form_keeps_light_and_covers_the_largest_circle_of_confusion() -> None:
     """All pixels at 5 px blur: the gate of n = 3 alone is open, so a light becomes its kernel of 7 px, 95 % a disc and 5 % flat, and
     keeps its energy."""
     network = BlurNetwork(GATED, largest_coc_px=5.0, radiance_scale=1.0)
@@ -146,16 +155,7 @@ def test_gated_form_blurs_a_light_to_the_disc_it_starts_with() -> None:
     expected = 0.95 * disc_kernel(7, 5.0) + 0.05 / 49.0
     assert torch.allclose(result, expected, atol=1e-5)
     assert result.sum() == pytest.approx(1.0, abs=1e-4)
-
-
-def test_gated_kernels_cover_the_largest_circle_of_confusion_and_a_pixel_around_it() -> None:
-    """2N - 1 >= |CoC|: 5 px need N = 3, 5.1 px N = 4; without blur one size is left."""
-    assert [blocks_for_gates(each) for each in (0.0, 1.0, -5.0, 5.1, 13.0)] == [1, 1, 3, 4, 7]
-
-
-@torch.no_grad()
-def test_gated_form_is_linear_in_radiance_and_keeps_a_uniform_picture() -> None:
-    """The weights come from the circles of confusion alone; they are divided by their sum."""
+    # The weights come from the circles of confusion alone; they are divided by their sum.
     network = BlurNetwork(GATED, 7.0, 3.0)
     for parameter in network.parameters():
         torch.nn.init.normal_(parameter, std=0.5)
@@ -163,11 +163,7 @@ def test_gated_form_is_linear_in_radiance_and_keeps_a_uniform_picture() -> None:
     assert torch.allclose(network(rgb * 1000.0, coc_px), network(rgb, coc_px) * 1000.0, rtol=1e-3, atol=1e-2)
     grey = torch.full_like(rgb, 0.18)
     assert torch.allclose(network(grey, coc_px), grey, atol=1e-4)
-
-
-@torch.no_grad()
-def test_leaving_out_unused_bins_changes_nothing() -> None:
-    """A picture wholly behind the focus uses half of the bins; computing all of them gives the same."""
+    # A picture wholly behind the focus uses half of the bins; computing all of them gives the same.
     network = BlurNetwork(GATED, 7.0, 1.0)
     torch.nn.init.normal_(network.tiles.hide_out.weight)
     rgb, coc_px = _pictures()
@@ -176,36 +172,25 @@ def test_leaving_out_unused_bins_changes_nothing() -> None:
     assert torch.allclose(few, network(rgb, coc_px.abs()), atol=1e-6)
 
 
-def test_settings_survive_json_and_reject_what_they_do_not_know() -> None:
+def test_settings_survive_json_and_presets_are_what_they_were() -> None:
     for settings in (TrainSettings(), demo_settings(1.5)):
         assert settings_from_json(settings_to_json(settings)) == settings
     with pytest.raises(InputError, match="unknown settings \\['depth'\\]"):
         settings_from_json(settings_to_json(TrainSettings()) | {"depth": 3})
-
-
-def test_the_published_form_is_the_default() -> None:
-    """Section 3: tiles of 200 px with 60 px overlap, three channels, tanh, unsigned circle of confusion, unweighted MSE."""
+    # Section 3: tiles of 200 px with 60 px overlap, three channels, tanh, unsigned circle of confusion, unweighted MSE.
     network = TrainSettings().network
     assert (network.form, network.tile_px, network.overlap_px, network.width, network.mixing) == ("published", 200, 60, 1, "none")
     assert (network.activation, network.signed_coc) == ("tanh", False)
     assert (TrainSettings().loss_weighting, TrainSettings().crop_px) == ("uniform", 0)
-
-
-def test_settings_that_contradict_each_other_are_refused() -> None:
     with pytest.raises(InputError, match="overlap_px < tile_px"):
         NetworkSettings(tile_px=50, overlap_px=60)
     with pytest.raises(InputError, match="either in minutes or in epochs"):
         TrainSettings(minutes=1.0, epochs=3)
-
-
-def test_small_kernels_in_as_many_blocks() -> None:
-    """CoC 7 px gives N = 3 either way. 3x3: two convolutions of radius 1 in each of 3 blocks reach 6 px, and have
-    2 * 3 * 3 (9 + 1) = 180 parameters; growing ones 2 * 3 * (9 + 25 + 49 + 3) = 516 and 12 px."""
-    growing, small = BlurNetwork(ONE_TILE, 7.0, 1.0), BlurNetwork(replace(ONE_TILE, kernels="3x3"), 7.0, 1.0)
-    assert [len(each.tiles.blocks) for each in (growing, small)] == [3, 3]
-    assert [sum(p.numel() for p in each.tiles.blocks.parameters()) for each in (growing, small)] == [516, 180]
-    assert (growing.reach_px, small.reach_px) == (12, 6)
-    assert [block.first.kernel_size for block in small.tiles.blocks] == [(3, 3)] * 3
+    # As published; the demo, whose quality others rely on; and everything that we add.
+    assert set(PRESETS) == {"paper", "demo", "better"} and PRESETS["paper"]() == TrainSettings()
+    demo, better = demo_settings().network, better_settings().network
+    assert (demo.form, demo.field_position, demo.field_bases, demo.kernels_per_colour) == ("gated", False, 1, False)
+    assert better == replace(demo, field_position=True, field_bases=4, kernels_per_colour=True)
 
 
 @pytest.mark.parametrize("overlap_px", [0, 8])
@@ -219,11 +204,6 @@ def test_tile_outputs_are_what_the_picture_is_assembled_from(settings: NetworkSe
     assert torch.allclose(assemble(outputs, grid), network(*_pictures()), atol=1e-5)
 
 
-def test_without_tiles_the_picture_is_the_only_tile() -> None:
-    network = BlurNetwork(ONE_TILE, 7.0, 1.0)
-    assert torch.equal(network.tile_outputs(*_pictures()), network(*_pictures()))
-
-
 @pytest.mark.parametrize(("headroom", "expected"), [(1.0, 8.0 * (1 + math.tanh(2.0)) / 2), (1.5, 8.0), (2.0, 8.0)])
 def test_headroom_lets_a_light_at_the_scale_through(headroom: float, expected: float) -> None:
     """The output that should be the radiance scale, 8, is 2 / headroom - 1 in [-1, 1]. With headroom 1.5 and 2 tanh reaches it at
@@ -233,14 +213,6 @@ def test_headroom_lets_a_light_at_the_scale_through(headroom: float, expected: f
         network.tiles.c2.weight.zero_()
         network.tiles.c2.bias.fill_(2.0 if headroom == 1.0 else math.atanh(2.0 / headroom - 1.0))
     assert network(*_pictures()).unique().item() == pytest.approx(expected, rel=1e-5)
-
-
-def test_black_and_the_scale_are_the_ends_of_the_inputs_range() -> None:
-    """Without headroom 0 and 8 become -1 and 1; with a headroom of 2 the scale lies in the middle."""
-    rgb = torch.tensor([0.0, 8.0, 8.0])[None, :, None, None]
-    coc_px = torch.full((1, 1, 1, 1), 3.5)
-    assert BlurNetwork(ONE_TILE, 7.0, 8.0).encode(rgb, coc_px).flatten().tolist() == [-1.0, 1.0, 1.0, 0.0]
-    assert BlurNetwork(replace(ONE_TILE, headroom=2.0), 7.0, 8.0).encode(rgb, coc_px).flatten().tolist() == [-1.0, 0.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize("form", ["published", "gated", "deepfocus", "neural_camera"])
@@ -271,14 +243,6 @@ def test_every_form_takes_the_same_inputs(form: Any, further: dict[str, Any]) ->
 def test_what_cannot_be_combined_is_refused(choices: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         NetworkSettings(**choices)
-
-
-def test_presets() -> None:
-    """As published; the demo, whose quality others rely on; and everything that we add."""
-    assert set(PRESETS) == {"paper", "demo", "better"} and PRESETS["paper"]() == TrainSettings()
-    demo, better = demo_settings().network, better_settings().network
-    assert (demo.form, demo.field_position, demo.field_bases, demo.kernels_per_colour) == ("gated", False, 1, False)
-    assert better == replace(demo, field_position=True, field_bases=4, kernels_per_colour=True)
 
 
 def plain(maps: Tensor, kernels: Tensor, bias: Tensor | None, padding: int) -> Tensor:

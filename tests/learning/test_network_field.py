@@ -10,7 +10,6 @@ from torch import Tensor
 
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import field_positions
-from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.onnx_network import OnnxNetwork
 from mrbokeh.system.errors import InputError
 from tests.renderers.test_onnx_network import LARGEST_COC_PX, LENS, card
@@ -38,19 +37,14 @@ def _jittered(settings: NetworkSettings) -> BlurNetwork:
     return jittered(BlurNetwork(settings, COC_PX, 4.0), 0.5)
 
 
-def test_field_positions() -> None:
+def test_places_and_bases_begin_apart_and_their_mean_leans_nowhere() -> None:
     """A frame of 4 x 3 px has a half diagonal of 2.5 px: the centre of its first pixel lies 1.5 px left and 1 px up of the middle."""
     whole = field_positions((3, 4))
     assert whole[0, 0].tolist() == pytest.approx([-0.6, -0.4])
     assert whole[1, :, 1].tolist() == [0.0] * 4
     assert np.array_equal(field_positions((2, 2), frame_px=(3, 4), origin_px=(1, 2)), whole[1:, 2:])
-
-
-def test_bases_begin_apart_and_their_mean_leans_nowhere() -> None:
-    """Four kernels of one bin: none like another, together symmetric; a single one is the disc that it always was.
-
-    In focus (n = 1) only the floor of 0.5 % differs: of neighbouring sides by 0.005 * LEAN * 2 / sqrt(2) = 0.0035 in a corner.
-    """
+    # Four kernels of one bin: none like another, together symmetric; a single one is the disc that it always was.
+    # In focus (n = 1) only the floor of 0.5 % differs: of neighbouring sides by 0.005 * LEAN * 2 / sqrt(2) = 0.0035 in a corner.
     for n, knot in ((1, 0.0), (4, 7.0)):
         kernels = fresh_kernels(n, [knot], 4, "disc")
         assert kernels.shape == (4, 2 * n + 1, 2 * n + 1)
@@ -76,7 +70,7 @@ def test_light_of_every_place_is_kept(blur_px: float) -> None:
 
 
 @torch.no_grad()
-def test_result_is_linear_in_radiance_and_kernels_follow_the_source() -> None:
+def test_result_is_linear_in_radiance_and_all_bases_give_what_the_used_ones_do() -> None:
     """Two lights far apart give the sum of what each gives; and the same light elsewhere is blurred otherwise."""
     network, place = _jittered(VARYING), _place()
     coc_px = torch.full((1, 1, *SIZE), COC_PX)
@@ -85,13 +79,8 @@ def test_result_is_linear_in_radiance_and_kernels_follow_the_source() -> None:
     of_left, of_right = network(left, coc_px, place), network(right, coc_px, place)
     assert torch.allclose(network(1000.0 * left + right, coc_px, place), 1000.0 * of_left + of_right, rtol=1e-3, atol=1e-3)
     assert (of_left[..., 11:22, 5:16] - of_right[..., 11:22, 41:52]).abs().max() > 0.002
-    assert torch.allclose(
-        network(left, coc_px, _place() * 0.0)[..., 11:22, 5:16], network(right, coc_px, _place() * 0.0)[..., 11:22, 41:52]
-    )
-
-
-@torch.no_grad()
-def test_all_bases_computed_or_only_those_of_used_bins() -> None:
+    of_left, of_right = (network(each, coc_px, place * 0.0) for each in (left, right))
+    assert torch.allclose(of_left[..., 11:22, 5:16], of_right[..., 11:22, 41:52])
     network = _jittered(replace(VARYING, width=2, kernels_per_colour=True))
     rgb, coc_px = torch.rand(1, 3, *SIZE, generator=torch.Generator().manual_seed(1)), torch.full((1, 1, *SIZE), 4.3)
     few = network(rgb, coc_px, _place())
@@ -119,9 +108,8 @@ def _lights(seed: int) -> tuple[Tensor, Tensor]:
         kernel = CAT_EYE.seen(1, (float(place[y, x, 0]), float(place[y, x, 1]))).rasterize(COC_PX).kernel
         first = margin - kernel.shape[0] // 2
         sharp[:, y, x] += colour
-        blurred[:, y + first : y + first + len(kernel), x + first : x + first + len(kernel)] += colour[:, None, None] * kernel.astype(
-            np.float32
-        )
+        rows, columns = (slice(each + first, each + first + len(kernel)) for each in (y, x))
+        blurred[:, rows, columns] += colour[:, None, None] * kernel.astype(np.float32)
     return torch.from_numpy(sharp), torch.from_numpy(blurred[:, margin:-margin, margin:-margin].copy())
 
 
@@ -169,21 +157,18 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> OnnxNetwork:
     return OnnxNetwork(path, threads=1)
 
 
-def test_the_trained_range_goes_from_minus_1_to_1_in_stops() -> None:
+def test_the_trained_range_goes_from_minus_1_to_1_in_stops_and_little_is_hardly_amplified() -> None:
     """f/1.4 to f/5.6 are four stops with f/2.8 in the middle; 24 to 96 mm two octaves with 48 mm in the middle."""
     scale = LensScale(((1.4, 5.6), (24.0, 96.0)))
     lenses = torch.tensor([[1.4, 24.0], [2.8, 48.0], [5.6, 96.0]])
     assert torch.allclose(scale(lenses), torch.tensor([[-1.0, -1.0], [0.0, 0.0], [1.0, 1.0]]), atol=1e-6)
-
-
-def test_what_hardly_varies_is_hardly_amplified() -> None:
-    """A single f-number counts as a range of a factor 2: 0.5 % beside it is 2 * 0.005 / ln 2 = 0.0144."""
+    # A single f-number counts as a range of a factor 2: 0.5 % beside it is 2 * 0.005 / ln 2 = 0.0144.
     scale = LensScale(((2.8, 2.8), (35.0, 35.0)))
     assert scale(torch.tensor([[2.8, 35.0]])).abs().max() < 1e-6
     assert scale(torch.tensor([[2.8 * 1.005, 35.0]]))[0, 0].item() == pytest.approx(0.0144, abs=1e-4)
 
 
-def test_ranges_are_the_runs_not_the_weights() -> None:
+def test_ranges_are_the_runs_not_the_weights_and_one_lens_is_one(exported: OnnxNetwork) -> None:
     """Weights of a run load into a network that is built from its facts; without ranges in the facts those of its one lens hold."""
     network = _network()
     assert not [name for name in network.state_dict() if "lens_scale" in name]
@@ -193,6 +178,13 @@ def test_ranges_are_the_runs_not_the_weights() -> None:
     assert facts_from_json(old, "here").f_numbers is None
     with pytest.raises(InputError, match="needs the ranges of f-number"):
         BlurNetwork(SETTINGS, 7.0, 4.0)
+    # Trained on one lens alone, with lens_inputs it takes that lens and no other; without them no range is written.
+    facts = replace(FACTS, f_numbers=None, focal_lengths_mm=None)
+    of_one = network_facts_of(_network(facts=facts), SETTINGS, facts)
+    assert (of_one.f_numbers, of_one.focal_lengths_mm) == ((2.8, 2.8), (35.0, 35.0)) and of_one.lens_inputs
+    assert exported.facts.f_numbers == (1.4, 5.6)
+    plain = replace(SETTINGS, lens_inputs=False)
+    assert not network_facts_of(_network(plain), plain, FACTS).lens_inputs
 
 
 @torch.no_grad()
@@ -221,17 +213,14 @@ def test_lenses_within_the_trained_range_are_rendered_as_they_are(exported: Onnx
         assert exported.render([card(1.0)], lens).alpha.sum() == pytest.approx(400.0, rel=0.05)
 
 
-@pytest.mark.parametrize(
-    ("lens", "message"),
-    [
+def test_lenses_outside_the_trained_range_are_refused(exported: OnnxNetwork) -> None:
+    for lens, message in (
         (replace(LENS, f_number=16.0), "trained for a lens with f_number from 1.4 to 5.6, but came with 16"),
         (replace(LENS, focal_length_mm=50.0), "trained for a lens with focal_length_mm 35, but came with 50"),
         (replace(LENS, sensor_width_mm=36.0), "trained for a lens with sensor_width_mm 5, but came with 36"),
-    ],
-)
-def test_lenses_outside_the_trained_range_are_refused(exported: OnnxNetwork, lens: Lens, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        exported.render([card(1.0)], lens)
+    ):
+        with pytest.raises(InputError, match=message):
+            exported.render([card(1.0)], lens)
     with pytest.raises(InputError, match=r"f_number from 1\.4 to 5\.6, but came with 1"):
         exported.blur(np.zeros((8, 8, 3), np.float32), np.zeros((8, 8), np.float32), lens=(1.0, 35.0))
 
@@ -246,13 +235,3 @@ def test_a_layer_keeps_its_true_place_when_it_is_cropped(exported: OnnxNetwork) 
     assert reached.any() and np.allclose(result.rgb[reached], whole[reached], atol=1e-5)
     elsewhere = exported.render([layer], LENS)
     assert np.abs(np.roll(elsewhere.rgb, (-24, 36), axis=(0, 1)) - result.rgb).max() > 1e-3
-
-
-def test_a_network_of_one_lens_says_so(exported: OnnxNetwork) -> None:
-    """Trained on one lens alone, with lens_inputs it takes that lens and no other; without them no range is written."""
-    facts = replace(FACTS, f_numbers=None, focal_lengths_mm=None)
-    of_one = network_facts_of(_network(facts=facts), SETTINGS, facts)
-    assert (of_one.f_numbers, of_one.focal_lengths_mm) == ((2.8, 2.8), (35.0, 35.0)) and of_one.lens_inputs
-    assert exported.facts.f_numbers == (1.4, 5.6)
-    plain = replace(SETTINGS, lens_inputs=False)
-    assert not network_facts_of(_network(plain), plain, FACTS).lens_inputs

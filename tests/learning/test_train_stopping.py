@@ -71,7 +71,7 @@ def steps_logged(log: Path) -> int:
     return len(log.read_text().splitlines()) if log.exists() else 0
 
 
-def test_a_signal_that_was_ignored_stays_so() -> None:
+def test_signals_that_were_ignored_stay_so_and_a_second_one_does_not_wait() -> None:
     """Shells start background jobs with SIGINT ignored: Ctrl-C in the terminal is for the job in front."""
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -83,6 +83,17 @@ def test_a_signal_that_was_ignored_stays_so() -> None:
         assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, before)
+    before = signal.getsignal(signal.SIGINT)
+    with Interruption() as alone:
+        signal.raise_signal(signal.SIGINT)
+        assert alone.asked == signal.SIGINT
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    with Interruption(alone=False) as one_of_many:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        assert one_of_many.asked == signal.SIGINT
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 @pytest.mark.slow
@@ -141,20 +152,6 @@ def test_ctrl_c_in_the_first_steps_changes_nothing(name: str, scene: Path, tmp_p
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["network.pt", "old", "settings.json"]
 
 
-def test_a_second_ctrl_c_does_not_wait_but_one_that_torchrun_repeats_does() -> None:
-    before = signal.getsignal(signal.SIGINT)
-    with Interruption() as alone:
-        signal.raise_signal(signal.SIGINT)
-        assert alone.asked == signal.SIGINT
-        with pytest.raises(KeyboardInterrupt):
-            signal.raise_signal(signal.SIGINT)
-    with Interruption(alone=False) as one_of_many:
-        signal.raise_signal(signal.SIGINT)
-        signal.raise_signal(signal.SIGINT)
-        assert one_of_many.asked == signal.SIGINT
-    assert signal.getsignal(signal.SIGINT) is before
-
-
 def looks_of(values: list[float], monkeypatch: pytest.MonkeyPatch) -> list[dict[str, torch.Tensor]]:
     """Let the looks at held-out slices come out like this, the last one from then on; returns what was looked at."""
     seen: list[dict[str, torch.Tensor]] = []
@@ -167,19 +164,17 @@ def looks_of(values: list[float], monkeypatch: pytest.MonkeyPatch) -> list[dict[
     return seen
 
 
-def test_patience_ends_a_run_and_keeps_the_best(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_patience_ends_a_run_and_keeps_the_best_across_an_interruption(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A look after each step: the third of 20, 21, 25, 24, 23, 22 dB is the best, three without a better one end the run at step 6."""
     settings = dataclasses.replace(SHORT, epochs=50, patience=3, validate_every_s=1e-9)
     seen = looks_of([20.0, 21.0, 25.0, 24.0, 23.0, 22.0], monkeypatch)
     progress = train.fit(training_data([scene]), tmp_path / "run", settings, ["view_2"])
     assert (progress.step, progress.stopped_early, progress.kept_step, progress.best_psnr_db) == (6, True, 3, 25.0)
     assert len(seen) == 6 and same(weights(tmp_path / "run"), seen[2]) and not same(seen[2], seen[5])
-
-
-def test_the_best_so_far_outlives_an_interruption(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stopped after the fourth look, the third being the best; going on, two more looks use up the patience."""
-    settings = dataclasses.replace(SHORT, epochs=50, patience=3, validate_every_s=1e-9)
-    seen, step = looks_of([20.0, 21.0, 25.0, 24.0], monkeypatch), Run._step
+    # Stopped after the fourth look, the third being the best; going on, two more looks use up the patience.
+    seen, step, run = looks_of([20.0, 21.0, 25.0, 24.0], monkeypatch), Run._step, tmp_path / "interrupted"
 
     def interrupted(run: Run, rate_factor: float) -> None:
         step(run, rate_factor)
@@ -188,31 +183,27 @@ def test_the_best_so_far_outlives_an_interruption(scene: Path, tmp_path: Path, m
 
     monkeypatch.setattr(Run, "_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        train.fit(training_data([scene]), tmp_path / "run", settings, ["view_2"])
+        train.fit(training_data([scene]), run, settings, ["view_2"])
     monkeypatch.setattr(Run, "_step", step)
-    progress = train.fit(training_data([scene]), tmp_path / "run", settings, ["view_2"])
-    assert (progress.step, progress.kept_step) == (6, 3) and same(weights(tmp_path / "run"), seen[2])
+    progress = train.fit(training_data([scene]), run, settings, ["view_2"])
+    assert (progress.step, progress.kept_step) == (6, 3) and same(weights(run), seen[2])
 
 
-def test_without_patience_the_last_weights_are_kept(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_patience_the_last_weights_are_kept_and_patience_needs_looks(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     seen = looks_of([30.0, 20.0], monkeypatch)
     progress = train.fit(training_data([scene]), tmp_path / "run", dataclasses.replace(SHORT, validate_every_s=1e-9), ["view_2"])
     assert progress.kept_step == progress.step == 12 and same(weights(tmp_path / "run"), seen[-1])
     assert progress.best_step == 1
-
-
-def test_patience_without_looks_is_refused(scene: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="patience of 2 looks needs looks"):
-        train.fit(training_data([scene]), tmp_path / "run", dataclasses.replace(SHORT, patience=2), ["view_2"])
-
-
-def test_a_look_that_found_nothing_is_not_the_best() -> None:
+        train.fit(training_data([scene]), tmp_path / "blind", dataclasses.replace(SHORT, patience=2), ["view_2"])
     progress = Progress()
     assert not progress.looked(math.nan) and progress.looked(10.0) and not progress.looked(math.nan) and not progress.looked(10.0)
     assert progress.looks_since_best == 2
 
 
-def test_curve_and_sheets_tell_how_it_came_along(scene: Path, tmp_path: Path) -> None:
+def test_curve_and_sheets_tell_how_it_came_along_in_bounded_room(scene: Path, tmp_path: Path) -> None:
     """12 steps are less than the 200 points of a curve, so each has one; a look after each adds its own, and the last look one more.
     The first picture of the sheets is of step 1, the last of step 12."""
     settings = dataclasses.replace(SHORT, validate_every_s=1e-9, sheets=True)
@@ -227,14 +218,11 @@ def test_curve_and_sheets_tell_how_it_came_along(scene: Path, tmp_path: Path) ->
     sheets = sorted(path.name for path in (tmp_path / "run" / "sheets").iterdir())
     assert sheets[0] == "step_0000001.png" and sheets[-1] == "step_0000012.png"
     assert (tmp_path / "run" / "curve.png").stat().st_size > 0
-
-
-def test_sheets_take_bounded_room_and_cover_the_whole_run(tmp_path: Path, scene: Path) -> None:
-    """After 100 looks: the first, the last, and no gap between that is more than a third of the run."""
+    # After 100 looks: the first, the last, and no gap between that is more than a third of the run.
     rows = HeldOutSlices(training_data([scene]).stacks[:1]).look(_Sharp(), torch.device("cpu")).rows[:1]
     for step in range(1, 101):
-        write_sheet(tmp_path, step, rows)
-        steps = sorted(int(path.stem.removeprefix("step_")) for path in (tmp_path / "sheets").iterdir())
+        write_sheet(tmp_path / "many", step, rows)
+        steps = sorted(int(path.stem.removeprefix("step_")) for path in (tmp_path / "many" / "sheets").iterdir())
         assert len(steps) <= MOST_KEPT and steps[0] == 1 and steps[-1] == step
     assert max(np.diff(steps)) <= 34
 

@@ -31,23 +31,19 @@ def errors(dioptres: np.ndarray, strength: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("strength", [0.5, 1.0, 2.0])
-def test_the_median_relative_error_is_the_measured_one(strength: float) -> None:
+def test_the_median_relative_error_and_the_share_of_gross_ones_are_the_measured_ones(strength: float) -> None:
     """0.13 to 0.19 % at strength 1, in proportion to it otherwise; regions that are mistaken, and shifts by a pixel (0.03 % on this wall),
-    are included."""
+    are included. 2.1 to 6.3 % are off by more than 0.05 dioptres on a scene with edges: a card of 120 x 160 px, 0.5 dioptres nearer."""
     relative = np.median(np.abs(errors(wall(), strength) / wall()))
     assert 0.0013 * strength < relative < 0.0019 * strength
-
-
-@pytest.mark.parametrize("strength", [0.5, 1.0])
-def test_the_share_of_gross_errors_is_the_measured_one(strength: float) -> None:
-    """2.1 to 6.3 % off by more than 0.05 dioptres on a scene with edges: here a card of 120 x 160 px, 0.5 dioptres nearer than the wall."""
     scene = wall()
     scene[60:180, 80:240] += 0.5
-    share = np.mean(np.abs(errors(scene, strength)) > 0.05)
-    assert 0.021 * strength < share < 0.063 * strength
+    if strength <= 1.0:
+        share = np.mean(np.abs(errors(scene, strength)) > 0.05)
+        assert 0.021 * strength < share < 0.063 * strength
 
 
-def test_silhouettes_are_off_by_about_a_pixel() -> None:
+def test_silhouettes_are_off_by_about_a_pixel_and_stay_sharp() -> None:
     """A straight edge of 0.5 dioptres: in each row, how many pixels it moved."""
     scene = np.where(np.arange(240) < 120, 1.5, 1.0) * np.ones((320, 1))
     near = (errors(scene, 1.0) + scene)[:, :, 100:140] > 1.25
@@ -55,10 +51,7 @@ def test_silhouettes_are_off_by_about_a_pixel() -> None:
     assert 0.6 < np.abs(moved_px).mean() < 1.6
     assert abs(moved_px.mean()) < 0.5, "near things do not grow on the whole"
     assert np.abs(moved_px).max() <= 7.0, "4 standard deviations of 0.9, and 1"
-
-
-def test_edges_stay_sharp() -> None:
-    """Between 1.5 and 1.0 dioptres nothing appears but what smooth errors and mistakes make: no depth of the air in between."""
+    # Between 1.5 and 1.0 dioptres nothing appears but what smooth errors and mistakes make: no depth of the air in between.
     scene = np.where(np.arange(240) < 120, 1.5, 1.0) * np.ones((160, 1))
     found = errors(scene, 1.0)[:, :, 100:140] + scene[:, 100:140]
     assert np.mean((found > 1.2) & (found < 1.3)) < 1e-3
@@ -76,20 +69,14 @@ def test_nothing_else_changes_and_0_changes_nothing() -> None:
     assert not np.array_equal(worse.coc_px, other.coc_px)
 
 
-def test_weak_noise_is_weak() -> None:
+def test_weak_noise_is_weak_and_strong_noise_stays_within_limits() -> None:
     """A hundredth of the strength moves hardly a pixel of a wall, and none by a hundredth of a dioptre but for 0.03 % of mistakes."""
     assert np.mean(np.abs(errors(wall(), 0.01)) > 0.01) < 1e-3
-
-
-def test_blur_stays_within_what_the_network_serves() -> None:
     pair = pair_at(wall())
     largest_px = float(np.abs(pair.coc_px).max())
     worse = augmented(pair, 3.0, np.random.default_rng(0), largest_px)
     assert np.abs(worse.coc_px).max() == pytest.approx(largest_px)
     assert np.abs(augmented(pair, 3.0, np.random.default_rng(0)).coc_px).max() > largest_px + 1.0
-
-
-def test_nothing_goes_beyond_infinity() -> None:
     sky = np.full((64, 64), 0.01)
     assert augmented(pair_at(sky), 3.0, np.random.default_rng(0)).dioptres.min() > -1e-6
 

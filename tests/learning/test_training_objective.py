@@ -79,17 +79,14 @@ def test_equal_pictures_have_no_loss(weighting: str, scope: str) -> None:
     assert float(loss(network, batch_of(picture), SCALE, LARGEST_COC_PX, settings)) < 1e-12
 
 
-def test_the_energy_term_sees_light_that_is_lost() -> None:
+def test_the_energy_term_sees_light_that_is_lost_and_hardly_light_that_moved() -> None:
     """A tenth of a light of 100 is missing. Under a Gaussian g the sum of squares is 10^2 sum g^2 = 10^2 / (4 pi sigma^2), per channel;
     it ends at 18.5 px, so that its amplitude is greater by what is missing beyond, along both axes."""
     missing = term(0.9 * light((48, 48)), batch_of(light((48, 48))), ENERGY)
     inside = math.erf(18.5 / SIGMA_PX / math.sqrt(2.0))
     assert missing == pytest.approx(3 * 10.0**2 / (4.0 * np.pi * SIGMA_PX**2) / inside**4, rel=1e-3)
-
-
-def test_the_energy_term_hardly_sees_light_that_moved() -> None:
-    """By d pixels: 2 (1 - exp(-d^2 / 4 sigma^2)) times 100^2 sum g^2. One pixel of the 12 of the largest blur is then about as bad as
-    a tenth of the light; the mean square error has the move 200 times as bad (2 to 0.1^2)."""
+    # By d pixels: 2 (1 - exp(-d^2 / 4 sigma^2)) times 100^2 sum g^2. One pixel of the 12 of the largest blur is then about as bad as
+    # a tenth of the light; the mean square error has the move 200 times as bad (2 to 0.1^2).
     batch, moved, dimmed = batch_of(light((48, 48))), light((48, 49)), 0.9 * light((48, 48))
     expected = 3 * 100.0**2 / (4.0 * np.pi * SIGMA_PX**2) * 2.0 * (1.0 - np.exp(-1.0 / (4.0 * SIGMA_PX**2)))
     assert term(moved, batch, ENERGY) == pytest.approx(expected, rel=2e-2)
@@ -98,7 +95,7 @@ def test_the_energy_term_hardly_sees_light_that_moved() -> None:
     assert square[0] == pytest.approx(200.0 * square[1], rel=1e-4)
 
 
-def test_the_energy_term_is_the_mean_of_what_counts() -> None:
+def test_the_energy_term_is_the_mean_of_what_counts_in_a_gaussian_window() -> None:
     """An error of 0.3 everywhere is a local mean of 0.3 everywhere, whichever pixels do not count, to the border of the picture."""
     weight = (noise(3)[:, :1] > 0.4).float()
     batch = batch_of(noise(0), weight)
@@ -106,16 +103,13 @@ def test_the_energy_term_is_the_mean_of_what_counts() -> None:
     assert both == pytest.approx(2.0 * 0.15**2, rel=1e-4)
     nonsense = torch.where(weight > 0, batch.target + 0.3, torch.full_like(batch.target, 50.0))
     assert float(judged(nonsense, batch, SCALE, LARGEST_COC_PX, ENERGY)) == pytest.approx(both, rel=1e-5)
-
-
-def test_the_window_is_a_gaussian_of_the_stated_width() -> None:
-    """Sum 1, and a second moment of sigma^2 along each axis but for what lies beyond 3 sigma (2.7 % of the moment)."""
+    # Sum 1, and a second moment of sigma^2 along each axis but for what lies beyond 3 sigma (2.7 % of the moment).
     window, offsets = gaussian(light((48, 48), 1.0)[:, :1], SIGMA_PX)[0, 0], torch.arange(96) - 48.0
     assert float(window.sum()) == pytest.approx(1.0, rel=1e-5)
     assert float(window.sum(dim=0) @ offsets.square()) == pytest.approx(SIGMA_PX**2, rel=0.04)
 
 
-def test_the_edge_term_sees_a_blurred_edge() -> None:
+def test_the_edge_term_sees_a_blurred_edge_where_it_counts() -> None:
     """A step of 1 comes out as a ramp over 4 pixels. The slopes differ by 3/4 once and by 1/4 three times: 9/16 + 3/16 = 3/4 for each
     of the rows; counted are all pairs of neighbours, right and down."""
     height, width = 6, 20
@@ -126,9 +120,6 @@ def test_the_edge_term_sees_a_blurred_edge() -> None:
     pairs = height * (width - 1) + (height - 1) * width
     assert found == pytest.approx(0.75 * height / pairs * (2.0 / SCALE) ** 2, rel=1e-4)
     assert term(target + 0.7, batch, EDGE) == pytest.approx(0.0, abs=1e-4), "brighter everywhere is no edge"
-
-
-def test_edges_of_what_does_not_count_do_not_count() -> None:
     batch = batch_of(noise(0), torch.ones(1, 1, 40, 50))
     batch.weight[:, :, :, 20:] = 0.0
     result = batch.target + 0.2
@@ -151,7 +142,7 @@ def test_a_full_photosite_says_at_least_so_bright() -> None:
 GRID = TileGrid(20, 32, 20, 8)  # two tiles, side by side, 12 px apart: they share columns 12 to 19
 
 
-def test_tiles_that_disagree_are_judged_apart() -> None:
+def test_tiles_that_disagree_are_judged_apart_each_by_its_own_pixels() -> None:
     """One tile says 1 too much and the other 1 too little: where they overlap their mean is right, which only the picture sees."""
     target = noise(0, (20, 32))
     tiles = split(target, GRID)
@@ -163,12 +154,8 @@ def test_tiles_that_disagree_are_judged_apart() -> None:
     agreeing = Fixed(tiles + 1.0, GRID)
     assert float(loss(agreeing, batch, SCALE, LARGEST_COC_PX, PUBLISHED)) == pytest.approx(unit, rel=1e-5)
     assert float(loss(agreeing, batch, SCALE, LARGEST_COC_PX, per_tile)) == pytest.approx(unit, rel=1e-5)
-
-
-def test_each_tile_counts_its_own_pixels() -> None:
-    """Of the right tile only the column 25 counts, and is wrong by 1; the left one is right, so the mean over tiles is a half of 1.
-    With nothing that counts in the right tile it has no say."""
-    target = noise(0, (20, 32))
+    # Of the right tile only the column 25 counts, and is wrong by 1; the left one is right, so the mean over tiles is a half of 1.
+    # With nothing that counts in the right tile it has no say.
     batch = batch_of(target, torch.ones(1, 1, 20, 32))
     batch.weight[..., 12:] = 0.0
     batch.weight[..., 25] = 1.0
@@ -195,7 +182,11 @@ def make_stack(folder: Path, valid: np.ndarray, saturated: np.ndarray | None = N
     return stack
 
 
-def test_borders_and_named_exclusions_have_no_weight(tmp_path: Path) -> None:
+def test_borders_exclusions_and_saturated_pixels_have_no_weight(tmp_path: Path) -> None:
+    plain = read_pair(make_stack(tmp_path / "plain", np.ones(SIZE, bool)), 0)
+    np.testing.assert_allclose(plain.target[0, 0], np.array(MATRIX)[:, 1], rtol=1e-6, err_msg="pairs are Rec.709")
+    np.testing.assert_array_equal(plain.all_in_focus, plain.target)
+    np.testing.assert_allclose(plain.target[1:], 0.5, rtol=1e-6)
     valid = np.ones(SIZE, bool)
     valid[:, 0] = False
     stack = make_stack(tmp_path, valid)
@@ -210,19 +201,9 @@ def test_borders_and_named_exclusions_have_no_weight(tmp_path: Path) -> None:
     np.testing.assert_array_equal(read_pair(stack, 0).weight, counted)
     with_guesses = read_pair(stack, 0, WHERE_TRUTH_IS_KNOWN).weight
     np.testing.assert_array_equal(with_guesses, counted | (valid & named["low_confidence"]))
-
-
-def test_saturated_pixels_of_the_slice_have_no_weight(tmp_path: Path) -> None:
-    """A pixel of which a hundredth came from full photosites is less bright than it was."""
+    # A pixel of which a hundredth came from full photosites is less bright than it was.
     saturated = np.zeros(SIZE, np.float32)
     saturated[1, 2], saturated[2, 2] = 0.01, 1.0
-    stack = make_stack(tmp_path, np.ones(SIZE, bool), saturated)
+    stack = make_stack(tmp_path / "saturated", np.ones(SIZE, bool), saturated)
     np.testing.assert_array_equal(read_pair(stack, 0).weight, saturated == 0)
     assert read_pair(stack, 0, WHERE_TRUTH_IS_KNOWN).weight.all()
-
-
-def test_pairs_are_rec709(tmp_path: Path) -> None:
-    pair = read_pair(make_stack(tmp_path, np.ones(SIZE, bool)), 0)
-    np.testing.assert_allclose(pair.target[0, 0], np.array(MATRIX)[:, 1], rtol=1e-6)
-    np.testing.assert_array_equal(pair.all_in_focus, pair.target)
-    np.testing.assert_allclose(pair.target[1:], 0.5, rtol=1e-6)

@@ -86,10 +86,8 @@ def test_files_of_any_compression(tmp_path: Path, compression: str) -> None:
     noise = (noise & 0x7F7FFFFF).view(np.float32).copy()
     flat = np.zeros((53, 41), np.float16)
     flat[20:] = 3.0
-    write_exr(
-        tmp_path / "a.exr",
-        ExrPart({"noise": noise, "flat": flat}, attributes={"compression": getattr(OpenEXR, f"{compression}_COMPRESSION")}),
-    )
+    attributes = {"compression": getattr(OpenEXR, f"{compression}_COMPRESSION")}
+    write_exr(tmp_path / "a.exr", ExrPart({"noise": noise, "flat": flat}, attributes=attributes))
     assert exr_size_px(tmp_path / "a.exr") == (53, 41)
     whole = read_exr(tmp_path / "a.exr")[0].channels
     for rows in (slice(0, 53), slice(15, 17), slice(50, 53)):
@@ -148,16 +146,13 @@ def test_what_comes_next_is_read_ahead(stacks: list[FocalStack], monkeypatch: py
     pairs.close()
 
 
-def test_processes_share_one_sequence(stacks: list[FocalStack]) -> None:
+def test_what_is_drawn_depends_on_neither_processes_nor_interruptions(stacks: list[FocalStack]) -> None:
     """Two processes with two pictures each see what one with four sees."""
     pairs = PairSet(stacks)
     alone = list(draw_share(Drawing(pairs, 4, 40, 3), np.random.default_rng(3)))
     shares = [list(draw_share(Drawing(pairs, 2, 40, 3), np.random.default_rng(3), number, 2)) for number in range(2)]
     assert all(same(*each) for each in zip(alone, shares[0] + shares[1], strict=True))
-
-
-def test_a_run_goes_on_where_it_was(stacks: list[FocalStack]) -> None:
-    """From the state of the generator alone, with nothing in memory."""
+    # From the state of the generator alone, with nothing in memory.
     rng, pairs = np.random.default_rng(1), PairSet(stacks, cache_mib=3)
     for _ in range(3):
         draw_batch(pairs, 1, 40, 3, rng)
@@ -170,10 +165,7 @@ def test_a_run_goes_on_where_it_was(stacks: list[FocalStack]) -> None:
     assert all(same(each, draw_batch(copied, 1, 40, 3, resumed)) for each in going_on)
     pairs.close()
     copied.close()
-
-
-def test_several_crops_of_an_opened_picture(stacks: list[FocalStack]) -> None:
-    """Six crops, three from each of two windows, side by side at random."""
+    # Six crops, three from each of two windows, side by side at random.
     pairs = PairSet(stacks, cache_mib=3)
     crops = Drawing(pairs, 6, 40, 3, crops_per_picture=3).draw(np.random.default_rng(0))
     assert len(crops) == 6 and len({crop.window for crop in crops}) == 2
@@ -198,15 +190,12 @@ def test_memory_stays_within_the_limit(stacks: list[FocalStack]) -> None:
     assert peak < MIB + (1 + pairs._cache.readers) * 1.5 * window_bytes < 9 * PAIR_BYTES / 4
 
 
-def test_looking_at_all_pictures_takes_little_memory_too(stacks: list[FocalStack]) -> None:
+def test_looking_at_all_pictures_in_pieces_takes_little_memory_too(stacks: list[FocalStack], monkeypatch: pytest.MonkeyPatch) -> None:
     """Pieces of 256 rows: here whole pictures of 2.1 MB, one at a time; the numbers are those of a set that fits."""
     streamed, whole = PairSet(stacks, cache_mib=3), PairSet(stacks)
     assert gather_facts(streamed) == gather_facts(whole)
     assert streamed._cache.held_bytes <= 3 * MIB < whole._cache.held_bytes == 9 * PAIR_BYTES
     streamed.close()
-
-
-def test_pieces_make_up_the_picture(stacks: list[FocalStack], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("training.data.dataset._PIECE_ROWS", 64)
     pairs = PairSet(stacks, cache_mib=1)
     pieces = list(pairs.pieces(4))
@@ -259,7 +248,7 @@ def test_what_is_expected_stays_and_the_oldest_goes(stacks: list[FocalStack]) ->
     assert cache.held_bytes == len(cache) == 0
 
 
-def test_crops_know_their_place_and_lens(stacks: list[FocalStack]) -> None:
+def test_crops_know_their_place_lens_and_dioptres(stacks: list[FocalStack]) -> None:
     """The corner of a corner pixel lies half a diagonal from the middle (CONVENTIONS)."""
     pair = read_pair(stacks[0], 0)
     np.testing.assert_allclose(pair.place, field_positions(SIZE), atol=1e-6)
@@ -272,10 +261,7 @@ def test_crops_know_their_place_and_lens(stacks: list[FocalStack]) -> None:
     assert lens.tolist() == [[pytest.approx(1.4), 50.0]]
     batch = stack_pairs([part, part])
     assert torch.equal(batch.place[1], place[0]) and torch.equal(batch.lens, lens.expand(2, -1)) and batch.saturated is None
-
-
-def test_dioptres_of_a_pair(stacks: list[FocalStack]) -> None:
-    """1 / depth, whatever registration enlarged."""
+    # 1 / depth, whatever registration enlarged.
     np.testing.assert_allclose(read_pair(stacks[1], 2).dioptres, 1.0 / read_focal_stack(stacks[1].folder).depth_m(), rtol=1e-4)
 
 

@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -101,3 +102,8 @@ def card_cases(width_px: int, height_px: int, shapes: tuple[str, ...], positions
             focused = lens.focused_at(focus_m)
             both = truth(cards.both, focused, positions)
             yield MixedCase(f"cards, {shape}, {focus_m:.2f} m", cards.photograph(focused, positions), cards.virtual, both)
+
+
+@cache
+def small_card_cases() -> tuple[MixedCase, ...]:
+    return tuple(card_cases(120, 96, ("disc",), positions=120, radius_px=4.5))
