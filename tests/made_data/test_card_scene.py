@@ -9,7 +9,7 @@ from scipy.signal import fftconvolve
 
 from datasets_scripts.scenes.textures import fractal_noise
 from mrbokeh.images.image_metrics import energy_ratio, psnr
-from mrbokeh.images.layer import flatten
+from mrbokeh.images.layer import Layer, flatten
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
@@ -47,7 +47,12 @@ def truth_of(scene_cards: list[Card], lamps: tuple[Lamp, ...] = (), aperture: Ap
 
 @pytest.fixture(scope="module", name="scene")
 def fixture_scene() -> cards.CardScene:
-    return cards.card_scene(seed=3, width_px=192, height_px=108)
+    return cards.card_scene(seed=3, width_px=144, height_px=96)
+
+
+@pytest.fixture(scope="module", name="layers")
+def fixture_layers(scene: cards.CardScene) -> list[Layer]:
+    return cards.layers(scene)
 
 
 @pytest.mark.parametrize("coc_px", [9.4, -9.4])
@@ -139,37 +144,35 @@ def test_a_ring_is_weighted_by_its_outlines() -> None:
 
 @pytest.mark.slow
 def test_twice_the_lens_points_change_little(scene: cards.CardScene) -> None:
-    lens = cards.lens_of_radius(12.0, 192)
+    lens = cards.lens_of_radius(12.0, 144)
     once, twice = cards.truth(scene, lens), cards.truth(scene, lens, 3200)
     assert psnr(once, twice) > 55.0
     assert energy_ratio(once, twice) == pytest.approx(1.0, abs=2e-4)
 
 
 def test_equal_seeds_give_equal_truth_and_others_do_not(scene: cards.CardScene) -> None:
-    lens = cards.lens_of_radius(9.0, 192, HEART)
-    again, other = (cards.card_scene(seed, 192, 108) for seed in (3, 4))
+    lens = cards.lens_of_radius(9.0, 144, HEART)
+    again, other = (cards.card_scene(seed, 144, 96) for seed in (3, 4))
     result = cards.truth(scene, lens, 64)
     np.testing.assert_array_equal(result, cards.truth(again, lens, 64))
     assert psnr(result, cards.truth(other, lens, 64)) < 30.0
 
 
-def test_the_scene_is_what_it_says(scene: cards.CardScene) -> None:
+def test_the_scene_is_what_it_says(scene: cards.CardScene, layers: list[Layer]) -> None:
     radiances = [max(lamp.radiance_rgb) for lamp in scene.lamps]
     assert len(scene.lamps) == 60 and min(radiances) >= 14.99 and max(radiances) <= 150.01
-    coc_px = cards.lens_of_radius(12.0, 192).coc_px(cards.depth_m(scene), 192)
+    coc_px = cards.lens_of_radius(12.0, 144).coc_px(cards.depth_m(scene), 144)
     assert np.abs(coc_px).max() == pytest.approx(24.0, rel=1e-5)
-    layers = cards.layers(scene)
     behind_one_another = list(pairwise(layers))
-    assert all(front.depth_m[front.alpha > 0].max() <= back.depth_m[back.alpha > 0].min() for front, back in behind_one_another[3:])
-    assert all(front.depth_m[front.alpha > 0].max() <= back.depth_m[back.alpha > 0].min() for front, back in behind_one_another[:2])
+    for front, back in behind_one_another[:2] + behind_one_another[3:]:
+        assert front.depth_m[front.alpha > 0].max() <= back.depth_m[back.alpha > 0].min()
     board = layers[2]
-    board_coc_px = cards.lens_of_radius(12.0, 192).coc_px(board.depth_m[board.alpha > 0.5], 192)
+    board_coc_px = cards.lens_of_radius(12.0, 144).coc_px(board.depth_m[board.alpha > 0.5], 144)
     assert board_coc_px.min() < -8.0 and board_coc_px.max() > 3.0
 
 
-def test_layers_over_one_another_are_the_sharp_picture(scene: cards.CardScene) -> None:
+def test_layers_over_one_another_are_the_sharp_picture(scene: cards.CardScene, layers: list[Layer]) -> None:
     # Only where two edges share a pixel does "over" differ from the true mean of the pixel.
-    layers = cards.layers(scene)
     flat, sharp = flatten(layers), cards.all_in_focus(scene)
     np.testing.assert_allclose(flat.alpha, 1.0, atol=1e-6)
     one_edge_at_most = sum((layer.alpha > 0.001) & (layer.alpha < 0.999) for layer in layers) <= 1
@@ -181,8 +184,8 @@ def test_layers_over_one_another_are_the_sharp_picture(scene: cards.CardScene) -
 
 def test_too_large_a_blur_and_too_small_a_frame_are_refused(scene: cards.CardScene) -> None:
     with pytest.raises(InputError, match="beyond the frame"):
-        cards.truth(scene, cards.lens_of_radius(60.0, 192), 16)
+        cards.truth(scene, cards.lens_of_radius(60.0, 144), 16)
     with pytest.raises(InputError, match="at least 96"):
         cards.card_scene(0, 64, 64)
     with pytest.raises(InputError, match="plain aperture"):
-        cards.truth(scene, cards.lens_of_radius(9.0, 192, Aperture(HEART.outlines, HEART.weights, cat_eye=0.4)), 16)
+        cards.truth(scene, cards.lens_of_radius(9.0, 144, Aperture(HEART.outlines, HEART.weights, cat_eye=0.4)), 16)
