@@ -1,5 +1,6 @@
 """The models of the zoo against one another, wherever two of them describe the same thing."""
 
+from functools import cache
 from math import inf
 
 import numpy as np
@@ -17,6 +18,7 @@ RAYS = 1 << 18
 DIAMETERS_PX = [0.7, 3.3, 12.0, 45.6, 120.0]
 
 
+@cache
 def disc_picture(size: int = 512) -> Float[np.ndarray, "height width 3"]:
     """A white disc that touches the border, pixels by their coverage (16 x 16 points each)."""
     places = (np.arange(16 * size) + 0.5) / 16.0 - 0.5 * size
@@ -43,17 +45,6 @@ def test_a_combined_blur_without_motion_is_a_simple_lens(diameter_px: float) -> 
     assert apart(simple, combined) < 0.0015 * 2.0
 
 
-def test_over_a_cell_too_by_closed_forms_and_by_rays() -> None:
-    """Rays leave at most the noise of chance, sqrt(n / (2 pi N)) of the light over n pixels (half the L1 distance)."""
-    box = np.array([[20.0, 26.0]])
-    still = np.array([[20.0, 26.0], [0.0, 0.0]])
-    closed = SimpleLens().kernel(box, 0, 0)
-    lit = float((closed > 0.0).sum())
-    assert apart(closed, Combined().kernel(still, 0, 0)) < 0.003
-    for traced in (SimpleLens().kernel(box, RAYS, 1), Combined().kernel(still, RAYS, 2)):
-        assert apart(closed, traced) < 1.2 * np.sqrt(lit / (2.0 * np.pi * RAYS)) + 0.003
-
-
 @pytest.mark.parametrize("diameter_px", DIAMETERS_PX)
 def test_a_stylized_disc_without_colour_errors_is_a_simple_lens(diameter_px: float) -> None:
     """The farthest corner of a lit pixel lies at the circle's radius, that of the disc of 256 px up to a diagonal of a pixel within."""
@@ -61,13 +52,6 @@ def test_a_stylized_disc_without_colour_errors_is_a_simple_lens(diameter_px: flo
     stylized, simple = model.exact(np.array([diameter_px])), SimpleLens().exact(np.array([diameter_px]))
     assert apart(stylized, simple) < rim_share(256.0, 1.42) + 0.003
     np.testing.assert_allclose(stylized[..., 0], stylized[..., 2], atol=1e-7)
-
-
-def test_colour_errors_of_a_stylized_disc_are_larger_and_smaller_simple_lenses() -> None:
-    model = Stylized(disc_picture(), chromatic=(0.2, 0.0, -0.2))
-    kernel = model.exact(np.array([50.0]))
-    for channel, diameter_px in enumerate((60.0, 50.0, 40.0)):
-        assert apart(kernel[..., channel : channel + 1], SimpleLens().exact(np.array([diameter_px]))) < rim_share(256.0, 1.42) + 0.003
 
 
 @pytest.mark.parametrize("depth_m", [0.8, 1.2, 6.0, 50.0])
@@ -90,7 +74,7 @@ def test_a_physical_lens_on_the_axis_at_a_small_aperture_is_a_simple_lens(depth_
 def scattered(density_per_m: float, anisotropy: float = 0.8) -> float:
     """Light beyond the middle pixel at 1 m."""
     model = Volume(density_per_m=density_per_m, anisotropy=anisotropy, albedo=(1.0, 1.0, 1.0), size_px=513)
-    kernel = model.kernel(np.array([[1.0, 1.0]]), 1 << 20, 0)
+    kernel = model.kernel(np.array([[1.0, 1.0]]), 1 << 19, 0)
     middle = len(kernel) // 2
     return float(1.0 - kernel[middle, middle, 1])
 

@@ -7,13 +7,11 @@ kernels are float32.
 import sys
 from collections.abc import Callable, Iterator
 from functools import partial
-from math import inf
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from typer.testing import CliRunner
 
 from mrbokeh.commands.lens import app
 from mrbokeh.optics.aperture import Aperture
@@ -21,11 +19,12 @@ from mrbokeh.optics.psf_bank_file import cell_path, read_bank
 from mrbokeh.psf_models import _volume_numba as compiled
 from mrbokeh.psf_models.base import PsfModel, sobol_blocks
 from mrbokeh.psf_models.build import Combined, bank_head, build_bank
-from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface
 from mrbokeh.psf_models.physical_lens import PhysicalLens
 from mrbokeh.psf_models.simple_lens import SimpleLens, Stylized
 from mrbokeh.psf_models.volume import Volume
 from mrbokeh.system.errors import InputError, MissingExtraError
+from tests.psf_models.test_physical_lens import pair
+from tests.scenes.command_line import printed_by
 
 torch = pytest.importorskip("torch")
 
@@ -47,13 +46,6 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def pair() -> LensPrescription:
-    """Two cemented achromats about a stop, with rims that cut the beam off the axis, and glass that disperses."""
-    half = (Surface(60.0, 6.0, 1.6204, 22.0, 60.3), Surface(-60.0, 2.0, 1.62, 22.0, 36.4), Surface(300.0, 12.0, 1.0, 22.0))
-    behind = (Surface(-300.0, 2.0, 1.62, 22.0, 36.4), Surface(60.0, 6.0, 1.6204, 22.0, 60.3), Surface(-60.0, 0.0, 1.0, 22.0))
-    return LensPrescription("pair", (*half, Surface(inf, 12.0, 1.0, 10.0, is_stop=True), *behind))
-
-
 def picture() -> np.ndarray:
     """Rows without light, at the border and within, and every other pixel at random."""
     light = np.random.default_rng(0).random((24, 37, 3)) ** 3
@@ -66,7 +58,8 @@ def seidel() -> Aperture:
     return Aperture(Aperture.heart().outlines, Aperture.heart().weights, spherical_aberration=0.5, axial_chromatic=(0.1, 0.0, -0.1))
 
 
-physical = partial(PhysicalLens, pair(), image_width_px=1000)
+physical = partial(PhysicalLens, pair(22.0), image_width_px=1000)
+"""Whose rims cut the beam off the axis, of glass that disperses."""
 MODELS: dict[str, tuple[Model, list[list[float]]]] = {
     "physical on the axis": (physical, [[1.0, 1.0], [0.0, 0.0]]),
     "physical, cut by rims": (physical, [[0.7, 0.8], [0.5, 0.9]]),
@@ -189,33 +182,21 @@ def test_a_half_built_bank_goes_on_on_a_device(tmp_path: Path) -> None:
         assert_allclose(second, first, atol=1e-8)
 
 
-def run(*arguments: object) -> None:
-    CliRunner().invoke(app, ["psf", "volume", "--counts", "2", "--rays", "2048", *map(str, arguments)], catch_exceptions=False)
-
-
 def test_the_command_takes_a_device(tmp_path: Path) -> None:
-    run("--out", tmp_path / "compiled")
-    run("--out", tmp_path / "torch", "--device", "cpu")
+    for words in (["compiled"], ["torch", "--device", "cpu"]):
+        printed_by(app, "psf", "volume", "--counts", "2", "--rays", "2048", "--out", tmp_path / words[0], *words[1:])
     for first, second in zip(read_bank(tmp_path / "compiled").kernels, read_bank(tmp_path / "torch").kernels, strict=True):
         assert_allclose(second, first, atol=1e-8)
 
 
-@pytest.mark.parametrize("name", MODELS)
-def test_a_device_that_is_not_there_is_a_mistake(name: str) -> None:
-    model, box = MODELS[name]
-    with pytest.raises(InputError, match=r"expected a device with double precision.*'gpu'"):
-        model(device="gpu").kernel(np.array(box), 1024, 0)
-    with pytest.raises(InputError, match="'cuda:99' is not there"):
-        model(device="cuda:99").kernel(np.array(box), 1024, 0)
-
-
-def test_a_closed_form_has_no_use_for_a_device(tmp_path: Path) -> None:
+def test_a_device_that_is_not_there_is_a_mistake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for model, box in MODELS.values():
+        for name, said in (("gpu", r"expected a device with double precision.*'gpu'"), ("cuda:99", "'cuda:99' is not there")):
+            with pytest.raises(InputError, match=said):
+                model(device=name).kernel(np.array(box), 1024, 0)
     with pytest.raises(InputError, match="closed form of combined is not traced"):
         build_bank(Combined(9.0, 9.0, (3, 3), device="cpu"), tmp_path / "bank", 0)
     assert not (tmp_path / "bank").exists()
-
-
-def test_without_torch_the_missing_package_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     for module in [each for each in sys.modules if each.startswith("mrbokeh.psf_models.torch_tracing")]:
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, "torch", None)
