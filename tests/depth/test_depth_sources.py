@@ -66,16 +66,17 @@ def test_disparity_is_even_in_dioptres_between_near_and_far(tmp_path: Path, dtyp
 
 
 def test_what_does_not_say_its_meaning_is_refused(tmp_path: Path) -> None:
-    path = png(tmp_path / "d.png", np.zeros((24, 32), np.uint16))
-    with pytest.raises(InputError, match="--disparity NEAR:FAR"):
-        open_depth(path, GREY)
-    with pytest.raises(InputError, match="one view"):
-        open_depth(png(tmp_path / "turned.png", np.zeros((32, 24), np.uint16)), GREY, DepthSettings(near_far_m=(1.0, 2.0)))
-    with pytest.raises(InputError, match="no such file"):
-        open_depth(tmp_path / "absent.exr", GREY)
+    level, turned, known = (png(tmp_path / "d.png", np.zeros((24, 32), np.uint16)), tmp_path / "turned.png", DepthSettings((1.0, 2.0)))
+    png(turned, np.zeros((32, 24), np.uint16))
     (tmp_path / "broken.png").write_bytes(b"no picture")
-    with pytest.raises(InputError, match="cannot be read"):
-        open_depth(tmp_path / "broken.png", GREY, DepthSettings(near_far_m=(1.0, 2.0)))
+    for path, settings, said in (
+        (level, DepthSettings(), "--disparity NEAR:FAR"),
+        (turned, known, "one view"),
+        (tmp_path / "absent.exr", DepthSettings(), "no such file"),
+        (tmp_path / "broken.png", known, "cannot be read"),
+    ):
+        with pytest.raises(InputError, match=said):
+            open_depth(path, GREY, settings)
 
 
 def test_settings_from_text() -> None:
@@ -249,19 +250,15 @@ def test_a_phone_held_upright_gives_upright_depth(tmp_path: Path) -> None:
     assert phone.depth.depth_m.shape == phone.depth.valid.shape == phone.original_rgb.shape[:2] == (32, 24)
     np.testing.assert_allclose(phone.depth.depth_m[:, -1], 4.0, rtol=1e-6)
     np.testing.assert_allclose(phone.depth.depth_m[:, :-1], 0.5, rtol=1e-6)
-
-
-def test_the_users_range_takes_the_place_of_the_phones(tmp_path: Path) -> None:
-    path = jpeg_with_depth(tmp_path / "p.jpg", np.zeros((24, 32), np.uint8))
-    assert open_depth(path, GREY, DepthSettings(near_far_m=(2.0, 8.0))).depth_m == pytest.approx(2.0)
+    path = jpeg_with_depth(tmp_path / "q.jpg", np.zeros((24, 32), np.uint8))
+    assert open_depth(path, GREY, DepthSettings(near_far_m=(2.0, 8.0))).depth_m == pytest.approx(2.0), "the user's range comes first"
 
 
 def test_damaged_phone_files_say_so(tmp_path: Path) -> None:
     level = np.zeros((24, 32), np.uint8)
-    with pytest.raises(InputError, match="incomplete"):
-        read_phone_photo(jpeg_with_depth(tmp_path / "a.jpg", level, drop_chunk=True))
-    with pytest.raises(InputError, match="RangeInverse or RangeLinear"):
-        read_phone_photo(jpeg_with_depth(tmp_path / "b.jpg", level, kind="Other"))
+    for changed, said in (({"drop_chunk": True}, "incomplete"), ({"kind": "Other"}, "RangeInverse or RangeLinear")):
+        with pytest.raises(InputError, match=said):
+            read_phone_photo(jpeg_with_depth(tmp_path / "a.jpg", level, **changed))
     plain = tmp_path / "plain.jpg"
     plain.write_bytes(cv2.imencode(".jpg", np.zeros((8, 8, 3), np.uint8))[1].tobytes())
     assert read_phone_photo(plain) is None

@@ -97,7 +97,7 @@ def test_behind_objects_at_one_depth_the_nearest_pixel_of_the_ground_is_the_seed
     assert (distance_px <= least_px[found] + 1.0).all() and (distance_px == least_px[found]).mean() > 0.95
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_parting_does_not_depend_on_threads(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     values, coc_px = cluttered(seed)
     alone = parted(values, coc_px)
@@ -108,14 +108,6 @@ def test_parting_does_not_depend_on_threads(seed: int, monkeypatch: pytest.Monke
     np.testing.assert_array_equal(front.coc_px, alone[0][1].reshape(-1))
     np.testing.assert_array_equal(behind.values, alone[1][0].reshape(-1, 4)[behind.places])
     assert len(behind.places) == (alone[1][0][..., 3] > 0).sum() > 200
-
-
-def test_an_even_surface_hides_nothing_and_stays_as_it_is() -> None:
-    values, coc_px = cluttered(1)[0], np.full(SIZE, 3.0, np.float32)
-    (front, front_coc_px), (behind, _) = parted(values, coc_px)
-    np.testing.assert_array_equal(front, values)
-    np.testing.assert_array_equal(front_coc_px, coc_px)
-    assert not behind.any()
 
 
 def test_antialiased_depth_leaves_nothing_in_the_air() -> None:
@@ -146,22 +138,15 @@ def test_parting_a_picture_loses_no_light() -> None:
     np.testing.assert_array_equal(front_coc_px[front[..., 3] == 1.0], coc_px[front[..., 3] == 1.0])
 
 
-def test_background_is_filled_no_farther_than_the_lens_sees() -> None:
+def test_background_is_filled_no_farther_than_the_lens_sees_and_not_from_lamps() -> None:
     """Half of a difference of 16 px in the circles of confusion, and a rim of 3.5 px for the pixels that are mixed."""
-    values = np.ones((*SIZE, 4), np.float32)
-    coc_px = np.zeros(SIZE, np.float32)
-    coc_px[:, :48] = -16.0
-    _, (behind, behind_coc_px) = parted(values, coc_px)
-    filled = behind[36, :, 3] > 0
-    assert filled[40:48].all() and not filled[:36].any()
-    np.testing.assert_allclose(behind_coc_px[36, 40:48], 0.0)
-
-
-def test_lamps_are_no_source_of_background() -> None:
     values = np.ones((*SIZE, 4), np.float32) * np.float32([0.1, 0.1, 0.1, 1.0])
     coc_px = np.zeros(SIZE, np.float32)
     coc_px[:, :48] = -16.0
     values[36, 50, :3] = 1000.0
     assert find_highlights(values).sum() == 1
-    _, (behind, _) = parted(values, coc_px)
+    _, (behind, behind_coc_px) = parted(values, coc_px)
+    filled = behind[36, :, 3] > 0
+    assert filled[40:48].all() and not filled[:36].any()
+    np.testing.assert_allclose(behind_coc_px[36, 40:48], 0.0)
     assert behind[..., :3].max() < 0.11

@@ -70,17 +70,15 @@ def test_what_cannot_be_is_refused(samples: LightFieldSamples, name: str, value:
     wrong[5] = value
     with pytest.raises(InputError, match=says):
         replace(samples, **{name: wrong})
-
-
-def test_arrays_of_different_length_are_refused(samples: LightFieldSamples) -> None:
     with pytest.raises((InputError, TypeError)):  # jaxtyping's own check, where it runs, comes first
-        replace(samples, time=samples.time[:-1])
-    none = np.zeros((0, 2), np.float32)
+        replace(samples, **{name: wrong[:-1]})
+    none = [np.zeros((0, 2) if width == 2 else (0, 3) if width == 3 else 0, np.float32) for width in (2, 2, 1, 3, 1, 2)]
     with pytest.raises(InputError, match="at least one"):
-        LightFieldSamples(4, 4, none, none, none[:, 0], np.zeros((0, 3), np.float32), none[:, 0], none)
+        LightFieldSamples(4, 4, *none)
 
 
 def test_an_archive_keeps_every_bit(samples: LightFieldSamples, tmp_path: Path) -> None:
+    samples.depth_m[7] = np.inf
     write_samples(tmp_path / "samples.npz", samples)
     read = read_samples(tmp_path / "samples.npz")
     assert (read.width_px, read.height_px) == (SIZE_PX, SIZE_PX)
@@ -90,6 +88,7 @@ def test_an_archive_keeps_every_bit(samples: LightFieldSamples, tmp_path: Path) 
 
 def test_exr_keeps_every_bit_whatever_the_order(samples: LightFieldSamples, tmp_path: Path) -> None:
     """Sorted by pixel; within a pixel in the order in which they came. One pixel has a sample less than the others."""
+    samples.depth_m[7] = np.inf
     order = np.random.default_rng(3).permutation(samples.count)[:-1]
     shuffled = LightFieldSamples(SIZE_PX, SIZE_PX, *(getattr(samples, name)[order] for name in _FIELDS))
     write_samples(tmp_path / "samples.exr", shuffled)
@@ -99,13 +98,6 @@ def test_exr_keeps_every_bit_whatever_the_order(samples: LightFieldSamples, tmp_
     for name in CHANNELS:
         np.testing.assert_array_equal(getattr(read, name), getattr(shuffled, name)[by_pixel])
     assert [part.name for part in read_exr(tmp_path / "samples.exr")] == ["sample00", "sample01", "sample02", "sample03"]
-
-
-def test_background_at_infinity_survives_both_files(samples: LightFieldSamples, tmp_path: Path) -> None:
-    far = replace(samples, depth_m=np.full(samples.count, np.inf, np.float32))
-    for name in ("far.npz", "far.exr"):
-        write_samples(tmp_path / name, far)
-        assert np.isinf(read_samples(tmp_path / name).depth_m).all()
 
 
 def test_files_that_hold_no_samples_say_so(samples: LightFieldSamples, tmp_path: Path) -> None:
@@ -122,10 +114,8 @@ def test_files_that_hold_no_samples_say_so(samples: LightFieldSamples, tmp_path:
     write_exr(tmp_path / "picture.exr", ExrPart({"R": np.zeros((4, 4), np.float32)}))
     with pytest.raises(InputError, match="sample00"):
         read_samples(tmp_path / "picture.exr")
-    write_exr(
-        tmp_path / "half.exr",
-        [ExrPart({"R": np.ones((4, 4), np.float32), "Z": np.ones((4, 4), np.float32)}, f"sample0{k}") for k in (0, 1)],
-    )
+    ones = np.ones((4, 4), np.float32)
+    write_exr(tmp_path / "half.exr", [ExrPart({"R": ones, "Z": ones}, f"sample0{k}") for k in (0, 1)])
     with pytest.raises(InputError, match=r"missing"):
         read_samples(tmp_path / "half.exr")
 
@@ -147,15 +137,8 @@ _FIELDS = ("xy_px", "lens_uv", "time", "rgb", "depth_m", "motion_px")
 
 def test_motion_points_up_in_files(tmp_path: Path) -> None:
     """forward.v counts upwards in EXR files, as in those of renderers; here y goes down."""
-    one = {
-        "xy_px": [[0.5, 0.5]],
-        "lens_uv": [[0.0, 0.0]],
-        "time": [0.5],
-        "rgb": [[1.0, 1.0, 1.0]],
-        "depth_m": [2.0],
-        "motion_px": [[3.0, 4.0]],
-    }
-    samples = LightFieldSamples(1, 1, **{name: np.array(values, np.float32) for name, values in one.items()})
+    one = ([[0.5, 0.5]], [[0.0, 0.0]], [0.5], [[1.0, 1.0, 1.0]], [2.0], [[3.0, 4.0]])
+    samples = LightFieldSamples(1, 1, *(np.array(values, np.float32) for values in one))
     write_samples(tmp_path / "one.exr", samples)
     channels = read_exr(tmp_path / "one.exr")[0].channels
     assert (channels["forward.u"][0, 0], channels["forward.v"][0, 0]) == (3.0, -4.0)

@@ -49,13 +49,6 @@ def test_what_does_not_move_stays_bit_for_bit() -> None:
     np.testing.assert_array_equal(still_coc_px, coc_px)
 
 
-def test_an_even_surface_in_even_motion_stays_even() -> None:
-    values, motion = np.full((40, 60, 4), 0.5, np.float32), np.empty((40, 60, 2), np.float32)
-    motion[:] = (7.7, -3.1)
-    inside = drawn_out(values, np.full((40, 60), 3.0, np.float32), motion)[0][6:-6, 6:-6]
-    np.testing.assert_allclose(inside, 0.5, rtol=1e-6)
-
-
 def test_diameters_are_averaged_by_coverage() -> None:
     values, coc_px, motion = np.zeros((9, 21, 4), np.float32), np.zeros((9, 21), np.float32), np.zeros((9, 21, 2), np.float32)
     values[4, 9], values[4, 11], coc_px[4, 9], coc_px[4, 11] = 0.25, 0.75, 4.0, 8.0

@@ -18,7 +18,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.resources import CallingThread, ZeroedMemory
 
-SIZE, MARGIN = (40, 52), 7
+SIZE, MARGIN = (34, 42), 7
 FRAME = Frame(SIZE[1] - 2 * MARGIN, SIZE[0] - 2 * MARGIN, -MARGIN, -MARGIN)
 SPREAD = ScatterReference().sum_kernels
 DISC = Aperture.disc(16)
@@ -93,19 +93,17 @@ def test_slices_against_a_plain_composition(aperture: Aperture, extra: int) -> N
     """A whole sheet and two sparse ones behind it; the exact spread, so that only float32 rounding may differ."""
     front = sheet(1, 1.0, extra)
     front.values[::3, 3] = 0.6
-    sheets = [front, sheet(2, 0.2, extra), sheet(3, 0.5, extra)]
-    for found, expected in zip(
-        composited(sheets, slicing(aperture), by_depth=False), plainly_composited(sheets, aperture, 6, by_depth=False), strict=True
-    ):
-        np.testing.assert_allclose(found, expected, atol=3e-6)
+    check_composition([front, sheet(2, 0.2, extra), sheet(3, 0.5, extra)], aperture, by_depth=False)
+
+
+def check_composition(sheets: list[Pixels], aperture: Aperture, by_depth: bool) -> None:
+    found = composited(sheets, slicing(aperture), by_depth=by_depth)
+    for one, expected in zip(found, plainly_composited(sheets, aperture, 6, by_depth=by_depth), strict=True):
+        np.testing.assert_allclose(one, expected, atol=3e-6)
 
 
 def test_sheets_by_depth_against_a_plain_composition() -> None:
-    sheets = [sheet(4, 0.6), sheet(5, 0.4), sheet(4, 0.3)]
-    for found, expected in zip(
-        composited(sheets, slicing(DISC), by_depth=True), plainly_composited(sheets, DISC, 6, by_depth=True), strict=True
-    ):
-        np.testing.assert_allclose(found, expected, atol=3e-6)
+    check_composition([sheet(4, 0.6), sheet(5, 0.4), sheet(4, 0.3)], DISC, by_depth=True)
 
 
 def test_a_slice_holds_the_pixels_nearest_to_its_multiple_of_the_step() -> None:

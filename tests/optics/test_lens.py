@@ -21,28 +21,12 @@ def test_coc_is_eq_1_of_neural_bokeh_with_its_sign(focus_m: float, depth_m: floa
     np.testing.assert_allclose(lens.coc_px(depth_m, 1920), eq_1, rtol=1e-9, atol=1e-9)
 
 
-def test_coc_equals_the_thin_lens_traced_by_hand() -> None:
-    """Similar triangles: the cone from the aperture to the image point, cut by the sensor."""
-    depth_m, px_per_mm = 2.5, 6000 / NIKKOR.sensor_width_mm
-    image_of_point_mm = 1 / (1 / 35.0 - 1 / (depth_m * 1000))
-    cut_mm = 35.0 / 1.8 * (NIKKOR.image_distance_mm - image_of_point_mm) / image_of_point_mm
-    np.testing.assert_allclose(NIKKOR.coc_px(depth_m, 6000), cut_mm * px_per_mm, rtol=1e-12)
-
-
 def test_sign_zero_and_infinity() -> None:
     assert NIKKOR.coc_px(0.5, 1000) < 0 < NIKKOR.coc_px(1.5, 1000)
     assert NIKKOR.coc_px(0.8, 1000) == 0
     assert np.isfinite(NIKKOR.coc_px(np.inf, 1000))
     assert NIKKOR.focused_at(np.inf).coc_px(np.inf, 1000) == 0
-
-
-def test_infinity_focus_has_the_focal_length_as_image_distance() -> None:
     assert NIKKOR.focused_at(np.inf).image_distance_mm == pytest.approx(35.0)
-
-
-def test_a_focus_in_millimetres_is_caught_only_when_it_cannot_be() -> None:
-    with pytest.raises(InputError, match="is the distance in metres"):
-        NIKKOR.focused_at(0.02)
 
 
 @pytest.mark.parametrize("field", ["focal_length_mm", "f_number", "sensor_width_mm"])
@@ -51,6 +35,21 @@ def test_nothing_but_positive_numbers(field: str) -> None:
         values = {"focal_length_mm": 35.0, "f_number": 2.0, "focus_distance_m": 1.0, "sensor_width_mm": 36.0} | {field: wrong}
         with pytest.raises(InputError, match="positive"):
             Lens(**values)
+
+
+def test_what_no_lens_can_do_is_refused() -> None:
+    tilted, far = replace(NIKKOR, tilt_rad=(0.1, 0.0)), np.full((20, 30), 50.0)
+    for wrong, said in (
+        (lambda: NIKKOR.focused_at(0.02), "is the distance in metres"),
+        (lambda: tilted.coc_px(np.ones((4, 8)), 16), "whole picture"),
+        (lambda: replace(NIKKOR, tilt_rad=(0.0, 0.3)).focused_on(far, 15.0, 19.5), "cannot pass through"),
+        *((lambda place=place: NIKKOR.focused_on(far, *place), "30 x 20 pixels") for place in OUTSIDE),
+    ):
+        with pytest.raises(InputError, match=said):
+            wrong()
+
+
+OUTSIDE = ((30.0, 5.0), (-0.1, 5.0), (5.0, 20.0), (float("nan"), 5.0))
 
 
 def depths_in_focus(lens: Lens, width_px: int, height_px: int) -> np.ndarray:
@@ -141,11 +140,6 @@ def test_the_curvature_of_the_field_is_petzvals(radius_mm: float) -> None:
     assert image_mm - lens.image_distance_mm == pytest.approx(height_mm**2 / (2 * radius_mm), rel=1e-3)
 
 
-def test_part_of_a_picture_has_no_place_in_a_tilted_frame() -> None:
-    with pytest.raises(InputError, match="whole picture"):
-        replace(NIKKOR, tilt_rad=(0.1, 0.0)).coc_px(np.ones((4, 8)), 16)
-
-
 @pytest.mark.parametrize(
     "wrong", [{"tilt_rad": (0.0, 0.8)}, {"tilt_rad": (0.1, float("nan"))}, {"petzval_radius_mm": 0.0}, {"petzval_radius_mm": float("nan")}]
 )
@@ -172,21 +166,9 @@ def test_autofocus_on_a_pixel_and_on_a_region() -> None:
         NIKKOR.focused_on(depth_m, 10.5, 10.5)
 
 
-@pytest.mark.parametrize(("x_px", "y_px"), [(30.0, 5.0), (-0.1, 5.0), (5.0, 20.0), (float("nan"), 5.0)])
-def test_autofocus_outside_the_picture_is_refused(x_px: float, y_px: float) -> None:
-    with pytest.raises(InputError, match="30 x 20 pixels"):
-        NIKKOR.focused_on(two_planes(), x_px, y_px)
-
-
 @pytest.mark.parametrize(("tilt_rad", "radius_mm"), [((0.02, -0.03), np.inf), ((0.0, 0.0), 500.0), ((0.01, 0.02), -800.0)])
 def test_autofocus_through_a_tilted_or_curved_field_makes_that_very_pixel_sharp(tilt_rad: tuple[float, float], radius_mm: float) -> None:
     depth_m = two_planes()
     lens = replace(NIKKOR, tilt_rad=tilt_rad, petzval_radius_mm=float(radius_mm)).focused_on(depth_m, 22.5, 6.5)
     assert lens.coc_px(depth_m.astype(np.float64), 30)[6, 22] == pytest.approx(0.0, abs=1e-9)
     assert lens.focus_distance_m != 2.0
-
-
-def test_autofocus_that_a_tilt_makes_impossible_is_an_error() -> None:
-    depth_m = np.full((20, 30), 50.0)
-    with pytest.raises(InputError, match="cannot pass through"):
-        replace(NIKKOR, tilt_rad=(0.0, 0.3)).focused_on(depth_m, 15.0, 19.5)
