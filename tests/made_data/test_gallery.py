@@ -79,11 +79,8 @@ def test_what_a_check_finds_is_its_result(tmp_path: Path) -> None:
     write_image(tmp_path / "out" / "out.png", plate)
     write_layer(tmp_path / "out" / "layer.exr", Layer(plate * 0.0, plate[..., 0] * 0.0, np.full((16, 24), np.inf, np.float32)))
     commands = ("mrbokeh demo --out demo_out", "mrbokeh check out.png --against plate.png --virtual layer.exr --map leaks.png")
-    build(
-        tmp_path / "out",
-        [Entry(title="check", commands=commands, caption="", picture=Path("check.jpg"), shows="out.png leaks.png")],
-        tmp_path,
-    )
+    entry = Entry(title="check", commands=commands, caption="", picture=Path("check.jpg"), shows="out.png leaks.png")
+    build(tmp_path / "out", [entry], tmp_path)
     assert decoded((tmp_path / "out" / "check.jpg").read_bytes()).shape == (16, 48, 3)
     assert sorted(each.name for each in tmp_path.iterdir()) == ["out", "report.html"]
 

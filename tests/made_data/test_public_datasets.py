@@ -13,7 +13,6 @@ from datasets_scripts.public_datasets import KINDS, Conversion, DepthMaps, conve
 from datasets_scripts.public_sets.adapters import f_number_of
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.image_io import write_image
-from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset, read_focal_stack_dataset
@@ -99,12 +98,13 @@ def test_8_bit_is_linearised_as_srgb(tmp_path: Path) -> None:
 
 def test_pairs_without_depth_say_what_to_do(tmp_path: Path) -> None:
     ebb_folder(tmp_path / "ebb", tmp_path / "maps")
-    with pytest.raises(InputError, match=r"without depth.*--depth"):
-        converted("ebb", tmp_path / "ebb", tmp_path / "out")
-    with pytest.raises(InputError, match="--near-m and --far-m"):
-        converted("ebb", tmp_path / "ebb", tmp_path / "out", DepthMaps(tmp_path / "maps"))
-    with pytest.raises(InputError, match=r"7\.exr"):
-        converted("ebb", tmp_path / "ebb", tmp_path / "out", DepthMaps(tmp_path))
+    for maps, said in (
+        (None, r"without depth.*--depth"),
+        (DepthMaps(tmp_path / "maps"), "--near-m and --far-m"),
+        (DepthMaps(tmp_path), r"7\.exr"),
+    ):
+        with pytest.raises(InputError, match=said):
+            converted("ebb", tmp_path / "ebb", tmp_path / "out", maps)
     assert not (tmp_path / "out").exists()
 
 
@@ -115,30 +115,26 @@ def test_a_folder_of_something_else_is_refused_in_one_sentence(tmp_path: Path, k
 
 
 def test_dpdd_pairs_by_order_and_wants_a_lens(tmp_path: Path) -> None:
-    sharp = texture()
-    for folder, names in (
-        ("train_c/source", ("1P0A01", "1P0A03")),
-        ("train_c/target", ("1P0A02", "1P0A04")),
-        ("test_c/source", ("a",)),
-        ("test_c/target", ("b",)),
+    for name in (
+        "train_c/source/1P0A01",
+        "train_c/source/1P0A03",
+        "train_c/target/1P0A02",
+        "train_c/target/1P0A04",
+        "test_c/source/a",
+        "test_c/target/b",
     ):
-        (tmp_path / "dpdd" / folder).mkdir(parents=True)
-        for name in names:
-            write_image(tmp_path / "dpdd" / folder / f"{name}.png", sharp)
+        (tmp_path / "dpdd" / name).parent.mkdir(parents=True, exist_ok=True)
+        write_image(tmp_path / "dpdd" / f"{name}.png", texture())
     stacks = KINDS["dpdd"].stacks(tmp_path / "dpdd")
-    assert [(each.key, each.slices[0].path.stem, each.part) for each in stacks] == [
-        ("1P0A02", "1P0A01", "train"),
-        ("1P0A04", "1P0A03", "train"),
-        ("b", "a", "test"),
-    ]
+    found = [(each.key, each.slices[0].path.stem, each.part) for each in stacks]
+    assert found == [("1P0A02", "1P0A01", "train"), ("1P0A04", "1P0A03", "train"), ("b", "a", "test")]
     for each in stacks:
         disparity_map(tmp_path / "maps" / f"{each.key}.png")
     maps = DepthMaps(tmp_path / "maps", NEAR_M, FAR_M)
     with pytest.raises(InputError, match="--focal-length-mm"):
         converted("dpdd", tmp_path / "dpdd", tmp_path / "out", maps)
-    dataset = converted(
-        "dpdd", tmp_path / "dpdd", tmp_path / "out", maps, lens=replace(KINDS["dpdd"].lens, focal_length_mm=50.0), focus_m=2.0
-    )
+    lens = replace(KINDS["dpdd"].lens, focal_length_mm=50.0)
+    dataset = converted("dpdd", tmp_path / "dpdd", tmp_path / "out", maps, lens=lens, focus_m=2.0)
     assert [each.part for each in dataset.stacks] == ["train", "train", "test"]
     (tmp_path / "dpdd" / "train_c" / "source" / "1P0A05.png").write_bytes(b"")
     with pytest.raises(InputError, match="as many pictures"):
@@ -161,16 +157,8 @@ def test_realbokeh_takes_blur_from_its_metadata(tmp_path: Path) -> None:
     for name in ("in/5_f22", "gt/5/5_f2.0", "gt/5/5_f4.0"):
         (root / name).parent.mkdir(parents=True, exist_ok=True)
         write_image(root / f"{name}.JPG", sharp)
-    facts = {
-        "id": 5,
-        "source_image": "in/5_f22.JPG",
-        "source_av": 22.0,
-        "target_images": ["gt/5/5_f2.0.JPG", "gt/5/5_f4.0.JPG"],
-        "target_avs": [2.0, 4.0],
-        "focal_length": 32,
-        "focus_plane_distance": 0.8,
-        "focus_plane_uncertainty": 0.01,
-    }
+    facts = {"id": 5, "source_image": "in/5_f22.JPG", "source_av": 22.0, "target_avs": [2.0, 4.0], "focal_length": 32}
+    facts |= {"target_images": ["gt/5/5_f2.0.JPG", "gt/5/5_f4.0.JPG"], "focus_plane_distance": 0.8, "focus_plane_uncertainty": 0.01}
     (root / "metadata").mkdir()
     (root / "metadata" / "5.json").write_text(json.dumps(facts))
     write_exr(tmp_path / "maps" / "5.exr", ExrPart({"Z": depth_m()}))
@@ -235,11 +223,7 @@ def test_cropping_keeps_the_size_of_blur(tmp_path: Path) -> None:
 @pytest.mark.parametrize("focus_m", [NEAR_M, FAR_M])
 def test_the_focus_is_found_where_detail_is_kept(focus_m: float) -> None:
     sharp = texture()
-    assert sharpest_depth_m(
-        sharp,
-        blurred(sharp, Lens(focal_length_mm=50.0, f_number=2.0, focus_distance_m=focus_m, sensor_width_mm=22.3, aperture=Aperture.disc())),
-        depth_m(),
-    ) == pytest.approx(focus_m)
+    assert sharpest_depth_m(sharp, blurred(sharp, Lens(50.0, 2.0, focus_m, 22.3)), depth_m()) == pytest.approx(focus_m)
     flat = np.full_like(sharp, 0.5)
     with pytest.raises(InputError, match="no detail"):
         sharpest_depth_m(flat, flat, depth_m())

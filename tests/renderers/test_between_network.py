@@ -5,7 +5,6 @@ is known from the exact renderer.
 """
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,19 +15,15 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.renderers.onnx_network import OnnxNetwork
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from tests.renderers.test_onnx_network import FACTS, LENS, SIZE, depth_for
-from training.export.onnx_export import export_network
-from training.fitting.run_folder import build_network
-from training.fitting.settings import TrainSettings, demo_settings
+from tests.renderers.test_onnx_network import LENS, SIZE, depth_for, exported
+from training.fitting.settings import demo_settings
 
 POST = np.s_[:, 40:56]
 
 
-@pytest.fixture(scope="module")
-def network(tmp_path_factory: pytest.TempPathFactory) -> OnnxNetwork:
-    settings, path = demo_settings().network, Path(tmp_path_factory.mktemp("gated")) / "lens.onnx"
-    export_network(build_network(TrainSettings(network=settings), FACTS).eval(), settings, FACTS, path)
-    return OnnxNetwork(path, threads=1)
+@pytest.fixture
+def network() -> OnnxNetwork:
+    return exported(demo_settings().network)
 
 
 def plate() -> tuple[Plate, np.ndarray]:

@@ -4,7 +4,9 @@ So expected numbers are those of light itself (coverage, support, linearity); wh
 """
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
@@ -12,7 +14,6 @@ import torch
 
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.onnx_network import OnnxNetwork
 from mrbokeh.system.errors import InputError
 from training.export.onnx_export import export_network
@@ -26,24 +27,27 @@ LARGEST_COC_PX = 7.0
 FACTS = RunFacts(LENS, SIZE[1], SIZE[0], LARGEST_COC_PX, 4.0, ("a/view_0",), (), None)
 
 
-def _exported(settings: NetworkSettings, folder: Path, jitter: float = 0.0) -> OnnxNetwork:
+@cache
+def exported(settings: NetworkSettings, jitter: float = 0.0) -> OnnxNetwork:
     network = build_network(TrainSettings(network=settings), FACTS).eval()
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.add_(jitter * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(0)))
-    export_network(network, settings, FACTS, folder / "lens.onnx")
-    return OnnxNetwork(folder / "lens.onnx", threads=1)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "lens.onnx"
+        export_network(network, settings, FACTS, path)
+        return OnnxNetwork(path, threads=1)
 
 
-@pytest.fixture(scope="module")
-def network(tmp_path_factory: pytest.TempPathFactory) -> OnnxNetwork:
-    return _exported(demo_settings().network, tmp_path_factory.mktemp("gated"))
+@pytest.fixture
+def network() -> OnnxNetwork:
+    return exported(demo_settings().network)
 
 
-@pytest.fixture(scope="module")
-def published(tmp_path_factory: pytest.TempPathFactory) -> OnnxNetwork:
+@pytest.fixture
+def published() -> OnnxNetwork:
     """The published form, which has a range (tanh), jittered so that black does not come out black."""
-    return _exported(NetworkSettings(tile_px=0, overlap_px=0), tmp_path_factory.mktemp("published"), jitter=0.02)
+    return exported(NetworkSettings(tile_px=0, overlap_px=0), jitter=0.02)
 
 
 def depth_for(coc_px: float) -> float:
@@ -59,17 +63,13 @@ def card(coc_px: float, rgb: tuple[float, float, float] = (0.5, 0.25, 1.0), half
     return Layer(colour, alpha, np.where(alpha > 0, depth_for(coc_px), np.inf).astype(np.float32))
 
 
-def test_it_is_a_renderer_and_knows_its_lens(network: OnnxNetwork) -> None:
-    assert isinstance(network, Renderer)
-    assert network.lens.focal_length_mm == 35.0
-
-
 @pytest.mark.parametrize("coc_px", [-6.5, -3.0, 0.5, 4.0, 6.9])
 def test_light_and_coverage_are_kept_and_agree(network: OnnxNetwork, coc_px: float) -> None:
     """A card of one depth loses nothing but the corners of the square that the floor of an untrained kernel fills, where light is not
     allowed to reach: less than 1 %. Colour and coverage go through the same weights, so their ratio is the card's colour."""
     layer = card(coc_px)
     result = network.render([layer], LENS)
+    assert network.lens.focal_length_mm == 35.0
     assert result.alpha.sum() == pytest.approx(layer.alpha.sum(), rel=0.01)
     assert result.rgb.sum() == pytest.approx(layer.rgb.sum(), rel=0.01)
     assert np.allclose(result.rgb, result.alpha[..., None] * np.float32((0.5, 0.25, 1.0)), atol=1e-4)
@@ -182,8 +182,8 @@ def test_other_widths_work_while_the_blur_fits(network: OnnxNetwork) -> None:
 
 
 @pytest.mark.slow
-def test_tiles_belong_to_one_size(tmp_path: Path) -> None:
-    tiled = _exported(replace(demo_settings().network, tile_px=40, overlap_px=10), tmp_path)
+def test_tiles_belong_to_one_size() -> None:
+    tiled = exported(replace(demo_settings().network, tile_px=40, overlap_px=10))
     assert tiled.render([card(3.0)], LENS).alpha.sum() == pytest.approx(400.0, rel=0.01)
     with pytest.raises(InputError, match="resize the picture, or train with tile_px 0"):
         tiled.blur(np.zeros((32, 32, 3), np.float32), np.zeros((32, 32), np.float32))

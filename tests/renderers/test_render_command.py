@@ -19,13 +19,8 @@ from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 
 WIDTH, HEIGHT = 48, 32
-LENS = {
-    "focal_length_mm": 50,
-    "f_number": 1.8,
-    "focus_distance_m": 2.0,
-    "sensor_width_mm": 12,
-    "aperture": {"shape": "polygon", "blades": 7, "curvature": 0.3, "rotation_deg": 10},
-}
+LENS = {"focal_length_mm": 50, "f_number": 1.8, "focus_distance_m": 2.0, "sensor_width_mm": 12}
+LENS["aperture"] = {"shape": "polygon", "blades": 7, "curvature": 0.3, "rotation_deg": 10}
 
 
 @pytest.fixture(name="folder")
@@ -201,17 +196,14 @@ def test_a_device_gives_the_same_picture_or_one_sentence(folder: Path, method: s
     assert not (folder / "none.exr").exists()
 
 
-def test_half_a_picture_and_alpha_in_a_png_are_refused(folder: Path) -> None:
-    with pytest.raises(InputError, match="belong together"):
-        run(folder, "--rgb", "aif.exr", "--lens", "lens.json")
-    with pytest.raises(InputError, match="nothing to blur"):
-        run(folder, "--lens", "lens.json")
-    with pytest.raises(InputError, match="needs an \\.exr"):
-        run(folder, *PICTURE, "--alpha-out", out="out.png")
-
-
-def test_an_existing_file_is_kept(folder: Path) -> None:
+def test_half_a_picture_alpha_in_a_png_and_existing_files_are_refused(folder: Path) -> None:
     (folder / "out.exr").write_text("mine")
-    with pytest.raises(InputError, match="--overwrite"):
-        run(folder, *PICTURE)
+    for words, out, said in (
+        (("--rgb", "aif.exr", "--lens", "lens.json"), "new.exr", "belong together"),
+        (("--lens", "lens.json"), "new.exr", "nothing to blur"),
+        ((*PICTURE, "--alpha-out"), "out.png", "needs an \\.exr"),
+        (PICTURE, "out.exr", "--overwrite"),
+    ):
+        with pytest.raises(InputError, match=said):
+            run(folder, *words, out=out)
     assert (folder / "out.exr").read_text() == "mine"
