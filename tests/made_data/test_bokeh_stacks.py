@@ -79,13 +79,6 @@ def require_likeness(shape: str, place: str, depth_m: float, focus_m: float) -> 
 # --- Discs of lights ------------------------------------------------------------------------------------------------------------------
 
 
-def test_a_round_disc_has_the_diameter_of_the_lens() -> None:
-    """A disc of diameter D has the variance D^2 / 16 along each axis; collecting in pixels adds 1/12."""
-    picture, _, diameter_px = disc_and_psf("round", "middle", 3.0, NEAR_FOCUS_M)
-    assert diameter_px > 9.0
-    assert 4.0 * np.sqrt(moments(picture)[2:] - 1.0 / 12.0) == pytest.approx(diameter_px, abs=0.05)
-
-
 @pytest.mark.parametrize("place", ["left", "right"])
 def test_the_ring_changes_over_the_frame_as_its_stop_says(place: str) -> None:
     require_likeness("ring", place, 4.0, NEAR_FOCUS_M)

@@ -64,24 +64,7 @@ def lamp(z_m: float, x_m: float = 0.0, y_m: float = 0.0, radius_m: float = 1e-5)
     return Lamp((x_m, y_m, z_m), radius_m, (1e6, 2e6, 3e6))
 
 
-def centroid_px(plane: np.ndarray) -> np.ndarray:
-    y, x = np.mgrid[: plane.shape[0], : plane.shape[1]] + 0.5
-    return np.array([(plane * x).sum(), (plane * y).sum()]) / plane.sum()
-
-
 # --- Proofs of the truth -------------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("z_m", "focus_m"), [(2.0, 1.0), (0.8, 1.0), (6.0, 1.2)])
-def test_the_disc_of_a_point_is_as_wide_as_the_thin_lens_says(z_m: float, focus_m: float) -> None:
-    """A uniform disc of diameter D has the variance D^2/16 along each axis, and collecting it in pixels adds 1/12."""
-    picture = tracer(lamps=(lamp(z_m),)).lamp_light(opening(focus_m), 1 << 20)[..., 0].astype(np.float64)
-    x_px, y_px = centroid_px(picture)
-    y, x = np.mgrid[:SIZE_PX, :SIZE_PX] + 0.5
-    for variance in (((x - x_px) ** 2 * picture).sum() / picture.sum(), ((y - y_px) ** 2 * picture).sum() / picture.sum()):
-        assert 4.0 * np.sqrt(variance - 1.0 / 12.0) == pytest.approx(abs(coc_px(z_m, focus_m)), abs=0.05)
-    assert [x_px, y_px] == pytest.approx([SIZE_PX / 2, SIZE_PX / 2], abs=0.01)
 
 
 @pytest.mark.slow

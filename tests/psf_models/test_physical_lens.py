@@ -345,12 +345,6 @@ def test_rays_are_spread_more_evenly_than_chance_would() -> None:
     assert missed < by_chance / 3.0
 
 
-def test_same_seed_same_kernel_other_seed_another() -> None:
-    box = np.array([[3.0, 4.0], [0.3, 0.5]])
-    first, again, other = (lens().kernel(box, RAYS, seed) for seed in (7, 7, 8))
-    assert np.array_equal(first, again) and not np.array_equal(first, other)
-
-
 def test_more_rays_than_a_chunk_are_no_seam() -> None:
     """Rays come in chunks of 65,536; a kernel of 100,000 differs from one of 65,536 by noise only."""
     few, many = lens().kernel(at(6.0), 65536, 0), lens().kernel(at(6.0), 100000, 0)

@@ -1,6 +1,5 @@
 """`mrbokeh lens psf`, `export` and `show` as a user meets them: real files, builds that stopped half way, and mistakes."""
 
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,6 @@ from mrbokeh.psf_models.simple_lens import SimpleLens
 from mrbokeh.renderers.bank.kernel_files import build_spreadlets, spreadlets_beside
 from mrbokeh.renderers.kernels.spreadlets import Sparsification, Spreadlet, sparsify
 from mrbokeh.system.errors import InputError
-from tests.scenes.command_line import mrbokeh
 
 SMALL = ["--diameter", "12", "--counts", "4"]
 
@@ -259,14 +257,3 @@ def test_mistakes_are_one_sentence_and_leave_nothing(mistake: str, tmp_path: Pat
     with pytest.raises(InputError, match=message):
         run(*arguments, "--out", "out")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_exit_codes_of_real_processes(tmp_path: Path) -> None:
-    done = mrbokeh("lens", "psf", "simple", "--out", tmp_path / "bank", *SMALL)
-    assert done.returncode == 0 and "wrote" in done.stdout, done.stderr
-    shutil.rmtree(tmp_path / "bank" / "cells")
-    for arguments in (["show", tmp_path / "bank"], ["export", tmp_path / "bank"]):
-        done = mrbokeh("lens", *arguments, "--out", tmp_path / "sheet.png")
-        assert done.returncode == 2 and "Traceback" not in done.stderr
-        assert done.stderr.startswith("error: ") and "only 0 of its 4 kernels are built" in done.stderr
-        assert len(done.stderr.strip().splitlines()) == 1 and not (tmp_path / "sheet.png").exists()

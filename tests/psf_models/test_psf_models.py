@@ -11,7 +11,7 @@ from mrbokeh.psf_models.build import PAPER_COUNTS, Combined
 from mrbokeh.psf_models.simple_lens import SimpleLens, Stylized, banded_edges
 from mrbokeh.system.errors import InputError
 
-RAYS = 1 << 20
+RAYS = 1 << 18
 ODD_LENS = Aperture(Aperture.heart().outlines, (1.0,), spherical_aberration=0.6, axial_chromatic=(0.1, 0.0, -0.1))
 
 
@@ -55,7 +55,7 @@ def centroid(kernel: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("name", MODELS)
 def test_rays_agree_with_the_closed_form(name: str) -> None:
-    """A million rays over n pixels miss by the noise of chance or less: independent rays would leave sqrt(2 n / (pi N)) of the light.
+    """Many rays over n pixels miss by the noise of chance or less: independent rays would leave sqrt(2 n / (pi N)) of the light.
 
     (Mean absolute deviation of n counts of mean N / n, summed, over N.) Of a quarter of them, the rest is less by a factor
     between 2, that of chance, and 4. The closed form averages steps of up to a pixel over a box: 0.3 % more is allowed.
@@ -140,7 +140,7 @@ def test_limits_of_the_capsule() -> None:
 @pytest.mark.parametrize("name", ["disc", "ring", "capsule over a cell"])
 @pytest.mark.parametrize("rays", [0, RAYS])
 def test_the_centroid_stays_in_place(name: str, rays: int) -> None:
-    """Of a million rays the centroid is off by less than chance would: 3 times the radius over the root of their number."""
+    """Of many rays the centroid is off by less than chance would: 3 times the radius over the root of their number."""
     kernel, box = kernel_of(name, rays)
     assert np.abs(centroid(kernel)).max() < (1e-5 if rays == 0 else 3.0 * 0.5 * box.sum(axis=0).max() / np.sqrt(RAYS))
 
@@ -213,14 +213,6 @@ def test_a_stylized_psf_is_the_picture() -> None:
     row, column = (np.round(len(kernel) / 2 + 4.0 * (corner - place)).astype(int) for corner, place in ((10, origin[1]), (20, origin[0])))
     seen = kernel[row : row + 120, column : column + 200].reshape(30, 4, 50, 4).sum(axis=(1, 3))
     assert np.corrcoef(seen.ravel(), light[10:40, 20:70].ravel())[0, 1] > 0.9
-
-
-def test_the_same_seed_gives_the_same_bits() -> None:
-    for name in ("disc over a cell", "capsule over a cell", "logo over a cell"):
-        model, ends = MODELS[name]
-        first, again, other = (model.kernel(np.array(ends), 5000, seed) for seed in (1, 1, 2))
-        np.testing.assert_array_equal(first, again)
-        assert (first != other).any()
 
 
 @pytest.mark.parametrize("dimensions", [2, 3, 5])

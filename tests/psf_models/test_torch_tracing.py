@@ -16,7 +16,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from mrbokeh.commands.lens import app
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.psf_bank_file import cell_path, read_bank
-from mrbokeh.psf_models import _volume_numba as compiled
 from mrbokeh.psf_models.base import PsfModel, sobol_blocks
 from mrbokeh.psf_models.build import Combined, bank_head, build_bank
 from mrbokeh.psf_models.physical_lens import PhysicalLens
@@ -28,9 +27,7 @@ from tests.scenes.command_line import printed_by
 
 torch = pytest.importorskip("torch")
 
-from mrbokeh.psf_models.torch_tracing import LandedRays, photons_in_rings, trace_photons  # noqa: E402
 from mrbokeh.psf_models.torch_tracing._rays import summed  # noqa: E402
-from mrbokeh.psf_models.torch_tracing._volume import first_states, uniform  # noqa: E402
 
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 RAYS = 1 << 15
@@ -91,24 +88,6 @@ def test_kernels_are_those_of_the_compiled_loops(name: str, device: str) -> None
 
 
 @pytest.mark.parametrize("device", DEVICES)
-def test_every_ray_of_a_lens_lands_where_the_compiled_one_does(device: str) -> None:
-    """Off the axis, where rims take a good part of the rays; the same rays are lost."""
-    model = physical()
-    (shares,) = sobol_blocks(5, 1 << 13, 0)
-    chiefs = model.beam.chief_rays(0.6, 0.8)
-    window = model.beam.window(np.array([1e-3]), np.array([0.6, 0.8]))
-    through = (chiefs, window, shares[:, :3], 0.001 / (1.0 + shares[:, 3]), shares[:, 4] * (len(chiefs) - 1))
-    landings, weights = model.beam.trace(*through)
-    rays = LandedRays(device, model.beam, *through, np.ones(len(shares)))
-    there = weights.T > 0.0
-    assert 0.2 < there.mean() < 0.9
-    assert_array_equal(rays.weights.cpu().numpy() > 0.0, there)
-    assert_allclose(rays.weights.cpu().numpy(), weights.T, rtol=1e-13)
-    for axis in range(2):
-        assert_allclose(rays.landings[axis].cpu().numpy()[there], landings[..., axis].T[there], rtol=0.0, atol=1e-12)
-
-
-@pytest.mark.parametrize("device", DEVICES)
 def test_blocks_are_no_matter(device: str) -> None:
     """A GPU takes more points at once: they are the same points, and the light is the same."""
     rays, box = 1 << 13, np.array([[0.7, 0.8], [0.5, 0.9]])
@@ -131,41 +110,6 @@ def test_sums_are_the_same_bits_in_any_order(device: str) -> None:
     )
     assert_array_equal(first, second)
     assert_allclose(first, np.bincount(bins, weights, 50), atol=1e-11)
-
-
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize(("seed", "first"), [(0, 0), (7, 1 << 20), (2**40 + 3, 12345)])
-def test_photons_have_the_random_numbers_of_the_compiled_ones(seed: int, first: int, device: str) -> None:
-    states, state = first_states(first, 3, seed, torch.device(device)), np.zeros(1, np.uint64)
-    numbers = []
-    for _ in range(50):
-        states, number = uniform(states)
-        numbers.append(number.cpu().numpy())
-    for photon in range(3):
-        compiled.start_photon(state, seed, first + photon)
-        assert_array_equal([each[photon] for each in numbers], [compiled.uniform(state) for _ in range(50)])
-
-
-@pytest.mark.parametrize("device", DEVICES)
-@pytest.mark.parametrize("majorant_per_m", [0.9, 2.0])
-def test_photons_go_the_way_of_the_compiled_ones(majorant_per_m: float, device: str) -> None:
-    """And as many as exp(-depth) go straight on (within 4 standard deviations of chance)."""
-    radii_m, medium = np.linspace(1e-3, 8.0, RAYS), (0.9, majorant_per_m, 0.8)
-    expected_cosines, expected_collisions = np.empty(RAYS), np.empty(RAYS, np.int64)
-    compiled.trace_photons(5, 1, radii_m, *medium, expected_cosines, expected_collisions)
-    cosines, collisions = (each.cpu().numpy() for each in trace_photons(device, 5, 1, radii_m, *medium))
-    assert expected_collisions.max() > 15
-    assert_array_equal(collisions, expected_collisions)
-    assert_allclose(cosines, expected_cosines, atol=1e-9)  # each collision may multiply a rounding by a few
-    straight = np.exp(-0.9 * radii_m)
-    assert abs((collisions == 0).sum() - straight.sum()) < 4.0 * np.sqrt((straight * (1.0 - straight)).sum())
-
-
-@pytest.mark.parametrize("device", DEVICES)
-def test_without_a_medium_all_light_comes_straight(device: str) -> None:
-    cosines, collisions = trace_photons(device, 0, 0, np.array([0.0, 1.0, 9.0]), 0.0, 1.0, 0.8)
-    rings = photons_in_rings(cosines, collisions, np.array([0.5, 1.0]), 1000.0, 0.125, 8)
-    assert_array_equal(rings, [[3.0, 3.0], *[[0.0, 0.0]] * 7])
 
 
 def test_a_half_built_bank_goes_on_on_a_device(tmp_path: Path) -> None:

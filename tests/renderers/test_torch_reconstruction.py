@@ -1,10 +1,9 @@
-"""Layered reconstruction by torch agrees with the compiled one, step by step and in its pictures."""
+"""Layered reconstruction by torch agrees with the compiled one in its pictures and partitions, whatever the settings."""
 
 import importlib
 import os
 import subprocess
 import sys
-from collections import defaultdict
 from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
@@ -15,44 +14,17 @@ import pytest
 
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.layering.light_field_samples import LightFieldSamples
-from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
-from mrbokeh.renderers.layered_reconstruction._filter_numba import extents as extents_compiled
-from mrbokeh.renderers.layered_reconstruction._filter_numba import morton as morton_compiled
-from mrbokeh.renderers.layered_reconstruction._filter_numba import sheared_axes as sheared_axes_compiled
-from mrbokeh.renderers.layered_reconstruction._filter_numba import sheared_slopes as sheared_slopes_compiled
-from mrbokeh.renderers.layered_reconstruction._filter_numba import slope_distance as slope_distance_compiled
-from mrbokeh.renderers.layered_reconstruction._partitions_numba import seeded, xorshift
 from mrbokeh.stacks.light_field_samples_file import read_samples
 from mrbokeh.system.errors import InputError, MissingExtraError
 from tests.scenes.sampled_planes import LENS, fence_scene, sample_planes
 
 torch = pytest.importorskip("torch")
 
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import DeviceSamples, TorchReconstruction, _picture  # noqa: E402
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._light import TileLight, morton, tile_light  # noqa: E402
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._screen import (  # noqa: E402
-    PupilTables,
-    line_kernels,
-    pupil_kernels,
-    transform_size,
-)
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._statistics import (  # noqa: E402  # noqa: E402
-    Slopes,
-    chance,
-    chosen_samples,
-    extents,
-    features,
-    sheared_axes,
-    sheared_slopes,
-    slope_distance,
-    tile_rows,
-)
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import TorchReconstruction, _picture  # noqa: E402
 
-CPU = torch.device("cpu")
 SIZE_PX = 45
-WINDOW = (0.25, 0.02, 0.21, 1.0 / 12.0)
 SHIPPED = Path(__file__).parents[1] / "data" / "samples"
 
 
@@ -69,10 +41,6 @@ def one_thread() -> Iterator[None]:
 def fence_samples(per_pixel: int = 4) -> LightFieldSamples:
     """No multiple of a tile: the last tiles are cut."""
     return sample_planes(fence_scene(SIZE_PX), SIZE_PX, per_pixel)
-
-
-def device_samples(samples: LightFieldSamples) -> DeviceSamples:
-    return DeviceSamples.of(samples, samples.rgb, samples.coc_px(LENS), CPU)
 
 
 def by_torch(samples: LightFieldSamples, settings: Settings | None = None, seed: int = 0) -> np.ndarray:
@@ -182,108 +150,6 @@ def test_how_much_is_done_at_a_time_changes_nothing(monkeypatch: pytest.MonkeyPa
     whole = by_torch(fence_samples())
     monkeypatch.setitem(_picture.AT_ONCE, "cpu", (3000, 6000, 2000))
     np.testing.assert_allclose(by_torch(fence_samples()), whole, atol=2e-6)
-
-
-# Steps.
-
-
-def test_the_order_of_pixels_and_chance_are_those_of_the_compiled_renderer() -> None:
-    y, x = np.indices((256, 256))
-    some = np.random.default_rng(0).integers(0, 256, (200, 2))
-    codes = morton(torch.from_numpy(x), torch.from_numpy(y)).numpy()
-    assert sorted(codes.ravel().tolist()) == list(range(256 * 256))
-    assert all(codes[b, a] == morton_compiled(a, b) for a, b in some.tolist())
-    numbers = chance(7, 3, 5, CPU)
-    for tile in range(3):
-        state = seeded(7, tile)
-        for k in range(5):
-            state = xorshift(state)
-            assert numbers[tile, k] == state
-
-
-def random_sums(count: int) -> np.ndarray:
-    """Sums over 40 samples each: slopes of both signs, some all alike, some still."""
-    rng = np.random.default_rng(2)
-    slopes = rng.normal(rng.normal(0.0, 6.0, (count, 1, 3)), rng.choice([0.0, 0.3, 4.0], (count, 1, 3)), (count, 40, 3))
-    slopes[:3] = 0.0
-    slopes[3:6, :, 1:] = 0.0
-    return features(torch.from_numpy(slopes)).sum(dim=1).numpy()
-
-
-def test_filters_of_partitions_are_those_of_the_compiled_renderer() -> None:
-    sums, window = random_sums(60), np.array(WINDOW)
-    for bandwidth in (0.0, 1.0):
-        arguments = torch.from_numpy(sums), torch.from_numpy(window), 0.33, bandwidth
-        expected = np.array([sheared_slopes_compiled(row, window, 0.33, bandwidth) for row in sums])
-        np.testing.assert_allclose(torch.stack(sheared_slopes(*arguments), dim=1).numpy(), expected, rtol=1e-9, atol=1e-12)
-        expected = np.array([extents_compiled(row, window, 0.33, bandwidth) for row in sums])
-        np.testing.assert_allclose(torch.stack(extents(*arguments), dim=1).numpy(), expected, rtol=1e-9)
-    found = slope_distance(torch.from_numpy(sums), torch.from_numpy(sums[::-1].copy()), torch.from_numpy(window), 0.33)
-    expected = np.array([slope_distance_compiled(a, b, window, 0.33) for a, b in zip(sums, sums[::-1], strict=True)])
-    np.testing.assert_allclose(found.numpy(), expected, rtol=1e-9)
-    shapes = np.array([(3.0, 1.0, 0.4), (2.0, 2.0, 0.0), (5.0, 0.0, 0.0), (0.0, 0.0, 0.0), (4.0, 0.5, -1.5)])
-    found = torch.stack(sheared_axes(*torch.from_numpy(shapes).unbind(dim=1)), dim=1).numpy()
-    np.testing.assert_allclose(found, [sheared_axes_compiled(*each) for each in shapes], rtol=1e-12, atol=1e-12)
-
-
-def plain_rows(light: TileLight) -> dict[tuple[int, int], np.ndarray]:
-    """Sums of what each tile holds, and of what only the ring of blocks around it holds, one sample after the other."""
-    sums: dict[tuple[int, int], np.ndarray] = defaultdict(lambda: np.zeros(8))
-    around: dict[tuple[int, int], np.ndarray] = defaultdict(lambda: np.zeros(8))
-    block_px = light.tile_px // 4
-    for (x, y, *_), (r, m_x, m_y), bucket in zip(light.geometry.tolist(), light.slopes.tolist(), light.bucket.tolist(), strict=True):
-        row = np.array([1.0, r, r * r, m_x, m_y, m_x * m_x, m_x * m_y, m_y * m_y])
-        for tile in range(light.rows * light.columns):
-            left, top = tile % light.columns * light.tile_px, tile // light.columns * light.tile_px
-            in_x, in_y = (low <= at < low + light.tile_px for at, low in ((x, left), (y, top)))
-            by_x, by_y = (low - block_px <= at < low + light.tile_px + block_px for at, low in ((x, left), (y, top)))
-            if in_x and in_y:
-                sums[tile, bucket] += row
-            elif by_x and by_y:
-                around[tile, bucket] += row
-    return {**around, **sums}
-
-
-def test_statistics_are_plain_sums_over_a_tile_and_of_what_only_its_surroundings_hold() -> None:
-    light = tile_light(device_samples(fence_samples(2)), replace(Settings(), tile_px=16))
-    rows, expected = tile_rows(light, 1, 0), plain_rows(light)
-    keys = list(zip(rows.tile.tolist(), rows.bucket.tolist(), strict=True))
-    assert keys == sorted(expected)
-    np.testing.assert_allclose(rows.sums.numpy(), [expected[key] for key in keys], rtol=1e-9, atol=1e-9)
-
-
-def test_sparse_statistics_take_one_of_every_so_many_and_miss_nothing() -> None:
-    light = tile_light(device_samples(fence_samples(8)), Settings())
-    every = 24
-    whole, sparse = tile_rows(light, 1, 0), tile_rows(light, every, 0)
-    assert torch.equal(whole.place >= 0, sparse.place >= 0), "a bucket that holds anything is there"
-    chosen = chosen_samples(light, every, 0)
-    tile_of = light.block // 16
-    within = chosen - light.starts[:-1:16][tile_of[chosen]]
-    for tile, held in enumerate(torch.bincount(tile_of).tolist()):
-        own = within[tile_of[chosen] == tile] // every
-        assert own.tolist() == list(range(-(-held // every))), "stratified: one from each run of so many"
-
-
-def test_kernels_of_pupil_and_shutter_keep_light_and_have_their_variance() -> None:
-    """Sum 1. A disc of radius R has R^2 / 4 along an axis, and shared out among pixels by area 1/12 more (in strips, 2 %). A segment
-    of odd length m is m pixels of 1 / m each, which have (m^2 - 1) / 12."""
-    size = transform_size(67)
-    offset = torch.arange(size)
-    offset = torch.where(offset > size // 2, offset - size, offset)
-    radius, across, down = torch.tensor([[-9.3, 3.7, 20.0], [9.0, -15.0, 1.0], [0.0, 5.0, -7.0]], dtype=torch.float64)
-    slopes = Slopes(radius, across, down, torch.ones_like(radius), torch.ones_like(radius))
-    tables = PupilTables.of(Aperture.disc(), CPU)
-    for kernels, variances in (
-        (pupil_kernels(slopes, tables, offset), radius**2 / 4.0 + 1.0 / 12.0),
-        (line_kernels(slopes, offset), (across**2 - 1.0) / 12.0),
-    ):
-        assert (kernels >= 0.0).all()
-        np.testing.assert_allclose(kernels.sum(dim=(1, 2)), 1.0, atol=1e-9)
-        np.testing.assert_allclose((kernels.sum(dim=1) * offset**2).sum(dim=1), variances, rtol=0.02)
-
-
-# Mistakes, and what is not there.
 
 
 def test_devices_and_filters_that_are_not_there_are_refused() -> None:

@@ -23,7 +23,6 @@ from mrbokeh.compositing.plate import Plate, plate_of
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
-from mrbokeh.system.errors import InputError
 from tests.scenes.card_tracer import PINHOLE, PackedCards, card_coverage, trace
 from tests.scenes.cards import Card, Lamp, TexelGrid, cards_of, lamps_of
 
@@ -59,8 +58,7 @@ class CardScene:
 
 def card_scene(seed: int = 0, width_px: int = 640, height_px: int = 360) -> CardScene:
     """Build the scene of that seed; equal seeds and sizes give equal scenes. Wires and lamps keep their size in pixels."""
-    if min(width_px, height_px) < 96:
-        raise InputError(f"a card scene needs at least 96 x 96 px for its cards, got {width_px} x {height_px}")
+    assert min(width_px, height_px) >= 96, "else its cards find no place"
     grid = TexelGrid(height_px, width_px, _MARGIN_PX)
     rng = np.random.default_rng(seed)
     cards = cards_of(grid, 1.0 / FOCUS_DISTANCE_M, FARTHEST_DIOPTRES_OFF, rng)
@@ -78,23 +76,14 @@ def lens_of_radius(radius_px: float, width_px: int, aperture: Aperture | None = 
     wanted_px_per_dioptre = 2.0 * radius_px / FARTHEST_DIOPTRES_OFF
     at_f1 = Lens(_FOCAL_LENGTH_MM, 1.0, FOCUS_DISTANCE_M, _SENSOR_WIDTH_MM)
     f_number = at_f1.coc_px_per_dioptre(width_px) / wanted_px_per_dioptre
-    return Lens(
-        focal_length_mm=_FOCAL_LENGTH_MM,
-        f_number=f_number,
-        focus_distance_m=FOCUS_DISTANCE_M,
-        sensor_width_mm=_SENSOR_WIDTH_MM,
-        aperture=aperture or Aperture.disc(),
-    )
+    return Lens(_FOCAL_LENGTH_MM, f_number, FOCUS_DISTANCE_M, _SENSOR_WIDTH_MM, aperture or Aperture.disc())
 
 
 def truth(scene: CardScene, lens: Lens, positions: int = 1600) -> Float32[np.ndarray, "height width 3"]:
     """Return what the lens sees: the mean over at least `positions` lens points per pixel, linear RGB."""
     planes = _planes(scene, lens)
     reach_px = 0.5 * float(np.abs(lens.coc_px(_nearest_and_farthest_m(scene), scene.width_px)).max()) * lens.aperture.unit_radius
-    if reach_px > scene.grid.margin_px - 2:
-        raise InputError(
-            f"the cards end {scene.grid.margin_px} px beyond the frame, but the lens sees {reach_px:.0f} px beyond: a smaller blur"
-        )
+    assert reach_px <= scene.grid.margin_px - 2, "the lens would see where no cards are"
     return trace(scene.packed, scene.grid, planes, lens.aperture, positions)[..., :3]
 
 
@@ -130,8 +119,7 @@ def _nearest_and_farthest_m(scene: CardScene) -> Float32[np.ndarray, " two"]:
 
 def _planes(scene: CardScene, lens: Lens) -> Float64[np.ndarray, "cards 3"]:
     """Return the signed CoC diameter of every card as a + bx x + by y; the lens law is affine in 1/depth, and so is a plane."""
-    if not (lens.has_flat_focus and lens.aperture.is_plain):
-        raise InputError("the truth of cards is for a flat focus plane and a plain aperture: leave out tilt, field curvature and modifiers")
+    assert lens.has_flat_focus and lens.aperture.is_plain
     per_dioptre = lens.coc_px_per_dioptre(scene.width_px)
     dioptres = np.array([card.dioptres for card in scene.cards], np.float64)
     return per_dioptre * (np.array([1.0 / lens.focus_distance_m, 0.0, 0.0]) - dioptres)
