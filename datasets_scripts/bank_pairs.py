@@ -18,13 +18,23 @@ import numpy as np
 import typer
 from jaxtyping import Bool, Float32
 
-from datasets_scripts.made_sets.set_files import LICENCE, focus_index, slice_name, stack_record
+from datasets_scripts.made_sets.set_files import (
+    LICENCE,
+    Overwrite,
+    claim_set,
+    distant_camera,
+    even_in_dioptres,
+    focus_index,
+    mistakes_told,
+    slice_name,
+    stack_record,
+    write_dataset,
+)
 from datasets_scripts.scenes.textures import checks, mottled, wood
 from datasets_scripts.tracers.traced_scene import Texture
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.images.layer import Layer, flatten, opaque
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import read_lens, write_lens
 from mrbokeh.optics.psf_bank import PsfBank
@@ -32,9 +42,7 @@ from mrbokeh.optics.psf_bank_file import read_bank
 from mrbokeh.renderers.bank.kernel_files import fingerprint
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, Slice, write_focal_stack, write_merged
-from mrbokeh.stacks.focal_stack_dataset import FILE_NAME as MANIFEST
-from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset, write_focal_stack_dataset
-from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 
@@ -42,7 +50,6 @@ NEAREST_M, FARTHEST_M = 0.9, 6.5
 _TEXTURES: tuple[Callable[..., Texture], ...] = (mottled, wood, checks)
 _LAMPS, _LAMP_RADIANCE = 12, (20.0, 60.0)
 _SHAPES = (3, 7)  # least and most, exclusive
-PLAN_NAME = "plan.json"
 _TEST_SHARE = 0.2
 _MOST_BLUR = 0.98  # of what the bank holds
 _SOME_LENS = Lens(focal_length_mm=50.0, f_number=1.0, focus_distance_m=NEAREST_M, sensor_width_mm=36.0, aperture=Aperture.disc())
@@ -75,8 +82,7 @@ class PairsPlan:
 
     @property
     def focus_distances_m(self) -> tuple[float, ...]:
-        """Focus distances evenly in dioptres, near to far."""
-        return tuple(float(each) for each in 1.0 / np.linspace(1.0 / NEAREST_M, 1.0 / FARTHEST_M, self.focuses))
+        return even_in_dioptres(NEAREST_M, FARTHEST_M, self.focuses)
 
 
 def make_bank_pairs(bank: PsfBank, out: Path, plan: PairsPlan, lens: Lens | None = None, *, overwrite: bool = False) -> FocalStackDataset:
@@ -85,19 +91,16 @@ def make_bank_pairs(bank: PsfBank, out: Path, plan: PairsPlan, lens: Lens | None
     Raises InputError where `out` holds something else, unless `overwrite` says to replace its files.
     """
     used = lens or _fitting_lens(bank, plan)
-    _claim(out, {"plan": asdict(plan), "bank": fingerprint(bank.kernels), "f_number": used.f_number}, overwrite)
+    document = {"plan": asdict(plan), "bank": fingerprint(bank.kernels), "f_number": used.f_number}
+    claim_set(out, document, [out / name / FILE_NAME for name in plan.names], overwrite)
     write_lens(out / "lens.json", used)
     renderer = ScatterReference(bank=bank)
     for number, name in enumerate(track(plan.names, "blurring scenes")):
-        if overwrite or not (out / name / FILE_NAME).is_file():
+        if not (out / name / FILE_NAME).is_file():
             _make_stack(out / name, plan, number, used, renderer)
     records = tuple(stack_record(out, name, "test" if name in plan.tested else "train") for name in plan.names)
     metadata = {"made_by": "datasets_scripts.bank_pairs", "plan": asdict(plan), "bank": fingerprint(bank.kernels), "model": bank.model}
-    dataset = FocalStackDataset(
-        folder=out, licence=LICENCE, radiance_scale=max(each.radiance.largest for each in records), stacks=records, metadata=metadata
-    )
-    write_focal_stack_dataset(dataset)
-    return dataset
+    return write_dataset(out, LICENCE, records, metadata)
 
 
 def _make_stack(folder: Path, plan: PairsPlan, number: int, lens: Lens, renderer: ScatterReference) -> None:
@@ -107,8 +110,7 @@ def _make_stack(folder: Path, plan: PairsPlan, number: int, lens: Lens, renderer
         blurred = renderer.render(layers, lens.focused_at(distance_m))
         write_camera_rgb(folder / slice_name(index), blurred.rgb, None)
     write_merged(folder, sharp.rgb, focus_index(sharp.depth_m, distances_m), np.ones_like(sharp.depth_m), sharp.depth_m)
-    focal_px = lens.focal_length_mm * plan.width_px / lens.sensor_width_mm
-    camera = Camera(plan.width_px, plan.height_px, (focal_px, focal_px), (0.5 * plan.width_px, 0.5 * plan.height_px))
+    camera = distant_camera(lens, plan.width_px, plan.height_px)
     slices = tuple(Slice(slice_name(index), distance_m) for index, distance_m in enumerate(distances_m))
     write_focal_stack(FocalStack(folder, slices, lens.focused_at(distances_m[0]), camera, registered=True, merged=True))
 
@@ -121,17 +123,6 @@ def _fitting_lens(bank: PsfBank, plan: PairsPlan) -> Lens:
     ends_m = np.array([NEAREST_M, FARTHEST_M])
     largest = max(float(np.abs(_SOME_LENS.focused_at(each).coc_px(ends_m, plan.width_px)).max()) for each in plan.focus_distances_m)
     return replace(_SOME_LENS, f_number=_SOME_LENS.f_number * largest / (_MOST_BLUR * high_px))
-
-
-def _claim(out: Path, document: dict[str, object], overwrite: bool) -> None:
-    """Go on only in a folder that is empty or was begun with the same plan: plan.json, written first, says which."""
-    path = out / PLAN_NAME
-    if path.exists() and not overwrite and read_json(path, "the plan of a set") != document:
-        raise InputError(f"{out} was begun with other settings: choose another folder, or --overwrite to replace its files")
-    if not path.exists() and out.exists() and any(out.iterdir()):
-        raise InputError(f"{out} holds something else than a set of pairs: give the name of a new folder")
-    (out / MANIFEST).unlink(missing_ok=True)
-    write_json(path, document)
 
 
 def random_layers(size_px: tuple[int, int], rng: np.random.Generator) -> list[Layer]:
@@ -186,15 +177,12 @@ def main(
     height: Annotated[int, typer.Option(help="Of the pictures, px.", min=16)] = 112,
     lens: Annotated[Path | None, typer.Option(help="Lens file whose blur the bank describes; without it one that fits it.")] = None,
     seed: Annotated[int, typer.Option(help="Of the scenes.")] = 1,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a set made with other settings.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Render the missing stacks of a set by a bank of kernels."""
-    try:
+    with mistakes_told():
         plan = PairsPlan(scenes=scenes, focuses=focuses, width_px=width, height_px=height, seed=seed)
         dataset = make_bank_pairs(read_bank(bank), out, plan, None if lens is None else read_lens(lens), overwrite=overwrite)
-    except InputError as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from None
     typer.echo(f"{out}: {len(dataset.stacks)} stacks, largest circle of confusion {dataset.largest_coc_px:.1f} px")
 
 

@@ -19,7 +19,18 @@ import numpy as np
 import typer
 
 from datasets_scripts.made_sets.bokeh_plan import SHAPES, SIZES, StacksPlan
-from datasets_scripts.made_sets.set_files import LICENCE, Job, claim_folder, focus_index, slice_name, stack_record
+from datasets_scripts.made_sets.set_files import (
+    LICENCE,
+    Job,
+    Overwrite,
+    claim_set,
+    focus_index,
+    make_missing,
+    mistakes_told,
+    slice_name,
+    stack_record,
+    write_dataset,
+)
 from datasets_scripts.scenes.bokeh_scenes import bokeh_scene
 from datasets_scripts.tracers.truth import Opening, Picture, TruthTracer
 from datasets_scripts.tracers.truth_layer import make_tracer, sharp_layer
@@ -30,15 +41,12 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.scene.mitsuba.mitsuba_tracer import load
 from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
-from mrbokeh.stacks.focal_stack_dataset import FILE_NAME as MANIFEST
-from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset, write_focal_stack_dataset
-from mrbokeh.system.console import track
+from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset
 from mrbokeh.system.errors import InputError
 
 NOISE_FLOOR = "noiseFloorDb"
 # Two halves differ by twice the variance of one, their mean has half of it: a quarter, 6.02 dB.
 _MEAN_OVER_DIFFERENCE_DB = 20.0 * np.log10(2.0)
-PLAN_NAME = "plan.json"
 
 
 class StackView:
@@ -113,15 +121,13 @@ def make_bokeh_stacks(out: Path, plan: StacksPlan, only: tuple[str, ...] = (), *
     _require_scenes(plan, only)
     load()
     views = [StackView(out / name, plan, *_place(name)) for name in plan.names]
-    claim(out, plan, views, overwrite)
+    _claim(out, plan, views, overwrite)
     write_lens(out / "lens.json", plan.lens(plan.focus_distances_m[0]))
-    _make_missing([view for view, name in zip(views, plan.names, strict=True) if not only or _place(name)[0] in only], "tracing stacks")
+    chosen = [view for view, name in zip(views, plan.names, strict=True) if not only or _place(name)[0] in only]
+    make_missing((job for view in chosen for job in view.jobs()), "tracing stacks")
     if not all(job.done for view in views for job in view.jobs()):
         return None
-    dataset = dataset_of(out, plan)
-    (out / "LICENCE.txt").write_text(LICENCE + "\n", encoding="utf-8")
-    write_focal_stack_dataset(dataset)
-    return dataset
+    return _dataset(out, plan)
 
 
 def make_pull(out: Path, plan: StacksPlan, frames: int, *, overwrite: bool = False) -> Path:
@@ -132,24 +138,17 @@ def make_pull(out: Path, plan: StacksPlan, frames: int, *, overwrite: bool = Fal
     inner = plan.focus_distances_m[1:-1] or plan.focus_distances_m
     distances_m = tuple(float(each) for each in 1.0 / np.linspace(1.0 / inner[0], 1.0 / inner[-1], frames))
     view = StackView(out / name, plan, *_place(name), distances_m)
-    claim(out, plan, [view], overwrite, {"pull_frames": frames})
-    _make_missing([view], "tracing a focus pull")
+    _claim(out, plan, [view], overwrite, {"pull_frames": frames})
+    make_missing(view.jobs(), "tracing a focus pull")
     return out / name
 
 
-def claim(out: Path, plan: StacksPlan, views: list[StackView], overwrite: bool, more: dict[str, int] | None = None) -> None:
-    """Go on only in a folder that is empty or was begun with the same plan: plan.json, written first, says which."""
-    path = out / PLAN_NAME
-    if not overwrite and not path.exists() and out.exists() and any(out.iterdir()):
-        raise InputError(f"{out} holds something else than a set of bokeh stacks: give the name of a new folder")
-    files = [each for view in views for job in view.jobs() for each in job.paths]
-    claim_folder(path, _plan_document(plan) | (more or {}), files, overwrite)
-    if overwrite:
-        (out / MANIFEST).unlink(missing_ok=True)
+def _claim(out: Path, plan: StacksPlan, views: list[StackView], overwrite: bool, more: dict[str, int] | None = None) -> None:
+    document = asdict(plan) | {"size": asdict(plan.size) | {"scenes": list(plan.size.scenes)}} | (more or {})
+    claim_set(out, document, [each for view in views for job in view.jobs() for each in job.paths], overwrite)
 
 
-def dataset_of(out: Path, plan: StacksPlan) -> FocalStackDataset:
-    """Return the data set of finished stacks. Its radiance scale is the largest radiance: nothing is cut off."""
+def _dataset(out: Path, plan: StacksPlan) -> FocalStackDataset:
     records = tuple(stack_record(out, name, part) for name, part in plan.parts().items())
     floors_db = {record.name: noise_floors_db(read_focal_stack(out / record.name)) for record in records}
     every_db = [each for floors in floors_db.values() for each in floors]
@@ -161,23 +160,11 @@ def dataset_of(out: Path, plan: StacksPlan) -> FocalStackDataset:
         "noise_floor_is": "PSNR of a slice against one without noise, linear radiance clipped to [0, 1], from two halves of the samples",
         "split_by": "whole scenes, and the last viewpoints of the others",
     }
-    return FocalStackDataset(
-        folder=out, licence=LICENCE, radiance_scale=max(each.radiance.largest for each in records), stacks=records, metadata=metadata
-    )
+    return write_dataset(out, LICENCE, records, metadata)
 
 
 def noise_floors_db(stack: FocalStack) -> list[float]:
     return [round(float(read_exr(stack.folder / each.path)[0].attributes[NOISE_FLOOR]), 2) for each in stack.slices]
-
-
-def _make_missing(views: list[StackView], description: str) -> None:
-    for job in track([job for view in views for job in view.jobs() if not job.done], description):
-        job.make()
-
-
-def _plan_document(plan: StacksPlan) -> dict[str, object]:
-    document = asdict(plan)
-    return document | {"size": document["size"] | {"scenes": list(plan.size.scenes)}}
 
 
 def _place(name: str) -> tuple[str, int]:
@@ -207,10 +194,10 @@ def main(
     samples: Annotated[int, typer.Option(help="Camera rays per pixel, 0 for those of the size.")] = 0,
     pull: Annotated[int, typer.Option(help="Also OUT.pull: one test view at so many focus distances.")] = 0,
     seed: Annotated[int, typer.Option(help="Viewpoints and sampling; scenes are numbered.")] = 1,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a set made with other settings.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Trace the missing pictures of a set of focal stacks."""
-    try:
+    with mistakes_told():
         if size not in SIZES:
             raise InputError(f"expected a size out of {', '.join(SIZES)}, got {size!r}")
         chosen = replace(SIZES[size], samples=samples) if samples else SIZES[size]
@@ -218,9 +205,6 @@ def main(
         dataset = make_bokeh_stacks(out, plan, tuple(scenes.split(",")) if scenes else (), overwrite=overwrite)
         if pull:
             typer.echo(f"{make_pull(out.with_name(out.name + '.pull'), plan, pull, overwrite=overwrite)}: focus pull complete")
-    except InputError as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from None
     typer.echo(f"{out}: " + ("other scenes are missing still" if dataset is None else _summary(dataset)))
 
 

@@ -9,7 +9,7 @@ z < 0. A ray leaves a pixel through a point of the round pupil and the focus pla
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Annotated
@@ -19,9 +19,10 @@ import typer
 from jaxtyping import Float, Float32, Float64
 from scipy.spatial.transform import Rotation
 
+from datasets_scripts.made_sets.set_files import Overwrite, mistakes_told
 from datasets_scripts.scenes.textures import mottled
 from datasets_scripts.tracers._sheet_numba import PackedLens, PackedTable, shade
-from mrbokeh.optics.camera import Camera, camera_from_json, camera_to_json
+from mrbokeh.optics.camera import Camera, camera_from_json, camera_of_lens, camera_to_json
 from mrbokeh.optics.lens import MM_PER_M, Lens
 from mrbokeh.system.atomic_files import read_json, refuse_existing, write_json
 from mrbokeh.system.console import track
@@ -148,15 +149,8 @@ class BoardClip:
     samples: int = 16
 
     def camera(self, frame: int) -> Camera:
-        focal_px = self.lens.focal_px(self.width_px)
-        pose = self.motion.camera_from_world(frame / self.fps)
-        return Camera(
-            width_px=self.width_px,
-            height_px=self.height_px,
-            focal_px=(focal_px, focal_px),
-            principal_px=(self.width_px / 2, self.height_px / 2),
-            camera_from_world=pose,
-        )
+        ahead = camera_of_lens(self.lens, self.width_px, self.height_px)
+        return replace(ahead, camera_from_world=self.motion.camera_from_world(frame / self.fps))
 
     def pictures(self) -> Iterator[Float32[np.ndarray, "height width 3"]]:
         """Yield scene-linear RGB, frame by frame; the same numbers at every call."""
@@ -209,33 +203,19 @@ def main(
     noise: Annotated[float, typer.Option(help="Standard deviation of the light at white.")] = 0.01,
     samples: Annotated[int, typer.Option(help="Rays per pixel.", min=1)] = 16,
     seed: Annotated[int, typer.Option(help="Motion, table and noise.")] = 0,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing clip.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Trace a hand-held clip of a board, with exact poses."""
-    try:
+    with mistakes_told():
         sheet = read_sheet(board)
         middle = sheet.middle_m
         target = (float(middle[0]), float(middle[1]), 0.0)
         motion = HandHeld(target, distance_m, elevation_deg, sway_m=0.1 * distance_m, seed=seed)
         lens = Lens(_FOCAL_LENGTH_MM, f_number, focus_m, _SENSOR_WIDTH_MM)
-        write_clip(
-            out,
-            BoardClip(
-                sheet=sheet,
-                motion=motion,
-                lens=lens,
-                width_px=width,
-                height_px=height,
-                frames=frames,
-                fps=fps,
-                noise=noise,
-                samples=samples,
-            ),
-            overwrite=overwrite,
+        clip = BoardClip(
+            sheet=sheet, motion=motion, lens=lens, width_px=width, height_px=height, frames=frames, fps=fps, noise=noise, samples=samples
         )
-    except InputError as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from None
+        write_clip(out, clip, overwrite=overwrite)
     typer.echo(f"{out}: {frames} frames, their cameras in {out.with_suffix('.json')}")
 
 

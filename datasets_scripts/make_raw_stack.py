@@ -19,7 +19,7 @@ import numpy as np
 import typer
 from jaxtyping import Float
 
-from datasets_scripts.made_sets.set_files import Job, claim_folder
+from datasets_scripts.made_sets.set_files import Job, claim_folder, make_missing, mistakes_told
 from datasets_scripts.made_sets.simulated_camera import SensorModel, ShotMetadata, write_dng
 from datasets_scripts.scenes.stack_scenes import STACK_SCENES, StackScene
 from datasets_scripts.tracers.thin_lens import trace, trace_pinhole
@@ -29,7 +29,6 @@ from mrbokeh.images.image_io import write_image
 from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.optics.lens import Lens, film_plane_m
 from mrbokeh.optics.lens_file import lens_to_json
-from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 
 FORMAT = "mrbokeh-raw-stack-truth"
@@ -98,8 +97,7 @@ class StackPlan:
         """Return the camera of one slice: breathed, shifted and rolled."""
         camera = self.stage.camera(view, self.width_px, self.height_px, self.lens_at(slice_index))
         shift_px, roll_rad = self.jitter_of(view, slice_index)
-        turn = np.eye(4)
-        turn[:2, :2] = [[np.cos(roll_rad), -np.sin(roll_rad)], [np.sin(roll_rad), np.cos(roll_rad)]]
+        turn = _turn(roll_rad, 4)
         x_px, y_px = (float(middle + shift) for middle, shift in zip(camera.principal_px, shift_px, strict=True))
         return replace(camera, principal_px=(x_px, y_px), camera_from_world=turn @ camera.camera_from_world)
 
@@ -116,9 +114,7 @@ class StackPlan:
         """Return the similarity that takes pixel positions of a slice to those of the reference, exactly."""
         slice_px, reference_px = (_pixels_from_plane(camera) for camera in (self.camera_at(view, slice_index), self.reference_camera(view)))
         _, roll_rad = self.jitter_of(view, slice_index)
-        turn = np.eye(3)
-        turn[:2, :2] = [[np.cos(roll_rad), -np.sin(roll_rad)], [np.sin(roll_rad), np.cos(roll_rad)]]
-        return (reference_px @ np.linalg.inv(slice_px @ turn))[:2]
+        return (reference_px @ np.linalg.inv(slice_px @ _turn(roll_rad, 3)))[:2]
 
 
 def make_raw_stack(out: Path, plan: StackPlan, *, overwrite: bool = False) -> int:
@@ -131,10 +127,7 @@ def make_raw_stack(out: Path, plan: StackPlan, *, overwrite: bool = False) -> in
         raise InputError(f"expected 1 to {most} viewpoints and at least 1 slice, got {plan.viewpoints} and {plan.slices}")
     jobs = list(_jobs(out, plan, cache(partial(plan.stage.build, plan.seed))))
     claim_folder(out / "truth.json", truth_document(plan), [path for job in jobs for path in job.paths], overwrite)
-    waiting = [job for job in jobs if not job.done]
-    for job in track(waiting, "tracing"):
-        job.make()
-    return len(waiting)
+    return make_missing(jobs, "tracing")
 
 
 def _jobs(out: Path, plan: StackPlan, scene: Callable[[], Scene]) -> Iterator[Job]:
@@ -164,14 +157,14 @@ def _make_slice(scene: Callable[[], Scene], plan: StackPlan, view: int, index: i
 
 def traced_slice(scene: Scene, plan: StackPlan, view: int, index: int) -> np.ndarray:
     """Trace one slice as (H, W, 3) scene-linear Rec.709: what the sensor is given, before its colour filters and noise."""
-    return trace(
-        scene,
-        plan.camera_at(view, index),
-        plan.lens_at(index),
-        plan.samples,
-        plan.seed * 1000 + view * 100 + index,
-        plan.sensor.footprint_px,
-    )
+    camera, seed = plan.camera_at(view, index), plan.seed * 1000 + view * 100 + index
+    return trace(scene, camera, plan.lens_at(index), plan.samples, seed, plan.sensor.footprint_px)
+
+
+def _turn(roll_rad: float, size: int) -> Float[np.ndarray, "size size"]:
+    turn = np.eye(size)
+    turn[:2, :2] = [[np.cos(roll_rad), -np.sin(roll_rad)], [np.sin(roll_rad), np.cos(roll_rad)]]
+    return turn
 
 
 def _pixels_from_plane(camera: Camera) -> Float[np.ndarray, "3 3"]:
@@ -247,24 +240,10 @@ def main(
     """Make DNG focal stacks of a still life with their all-in-focus image, depth and camera as truth."""
     # The black level keeps its share of the range at every bit depth.
     sensor = SensorModel(bits=bits, black_level=1008 * 2**bits // 2**14, full_well_electrons=full_well)
-    plan = StackPlan(
-        viewpoints=viewpoints,
-        slices=slices,
-        width_px=width,
-        height_px=height,
-        seed=seed,
-        samples=samples,
-        sensor=sensor,
-        scene=scene,
-        stacks=stacks,
-        jitter_px=jitter_px,
-        jitter_deg=jitter_deg,
-    )
-    try:
+    size: dict[str, Any] = {"viewpoints": viewpoints, "stacks": stacks, "slices": slices, "width_px": width, "height_px": height}
+    plan = StackPlan(**size, seed=seed, samples=samples, sensor=sensor, scene=scene, jitter_px=jitter_px, jitter_deg=jitter_deg)
+    with mistakes_told():
         ran = make_raw_stack(out, plan, overwrite=overwrite)
-    except InputError as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from None
     typer.echo(f"{out}: {'complete' if ran else 'nothing to do, all files were there'}")
 
 

@@ -12,22 +12,20 @@ from collections.abc import Iterator
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import typer
 from jaxtyping import Float
 
 from datasets_scripts.made_sets.set_files import Job
-from datasets_scripts.made_sets.truth_set import TruthPlan, ViewFiles, make_missing, truth_command, truth_name, view_document
+from datasets_scripts.made_sets.truth_set import TruthPlan, ViewFiles, grey, make_views, truth_command, truth_name, view_document
 from datasets_scripts.scenes.textures import checks, spots
 from datasets_scripts.scenes.truth_scenes import colour, fine, make_scene
 from datasets_scripts.tracers.truth import TruthTracer
-from datasets_scripts.tracers.truth_layer import make_tracer, sharp_layer
+from datasets_scripts.tracers.truth_layer import make_tracer
 from datasets_scripts.tracers.truth_scene import Body, PackedScene, TruthScene, ball, box, leaf, pack, wire
-from mrbokeh.images.exr_io import ExrPart, write_exr
-from mrbokeh.images.image_io import SheetRow, read_image, read_layer, write_contact_sheet, write_image, write_layer
-from mrbokeh.system.atomic_files import read_json
+from mrbokeh.images.image_io import SheetRow, read_image, read_layer
 from mrbokeh.system.errors import InputError
 
 _HOOP_POINTS = 96
@@ -121,9 +119,12 @@ class MixedView(ViewFiles):
 
     @cached_property
     def _tracers(self) -> dict[What, TruthTracer]:
-        return {"scene": self._tracer(self.scene), "both": self._tracer(with_object(self.scene, self.virtual))}
+        return {"scene": self._tracer_of(self.scene), "both": self._tracer_of(with_object(self.scene, self.virtual))}
 
-    def _tracer(self, scene: TruthScene, part: Literal["all", "thin"] = "all") -> TruthTracer:
+    def _tracer_for(self, what: What) -> TruthTracer:
+        return self._tracers[what]
+
+    def _tracer_of(self, scene: TruthScene, part: Literal["all", "thin"] = "all") -> TruthTracer:
         camera = self._plan.camera(self._number)
         return make_tracer(without_shadows(pack(scene, camera)), camera, part, self._plan.seed)
 
@@ -141,52 +142,29 @@ class MixedView(ViewFiles):
         }
 
     def jobs(self) -> Iterator[Job]:
-        folder = self.folder
-        yield Job((folder / "scene" / "all_in_focus.exr", folder / "scene" / "depth.exr"), self._make_sharp)
-        yield Job((folder / "object.exr",), self._make_object)
+        yield self.sharp_job(self.folder / "scene", partial(self._tracer_for, "scene"))
+        yield self.layer_job(self.folder / "object.exr", lambda: self._tracer_of(self.virtual, "thin"))
+        both: tuple[What, What] = ("scene", "both")
         for shape in self._plan.shapes:
             for index, distance_m in enumerate(self.scene.focus_distances_m):
-                both: tuple[What, What] = ("scene", "both")
                 for what in both:
-                    path = folder / what / truth_name(shape, index)
-                    yield Job((path,), partial(self._make_defocused, what, shape, distance_m, path))
+                    path = self.folder / what / truth_name(shape, index)
+                    yield self.defocused_job(path, partial(self._tracer_for, what), shape, distance_m)
 
-    def write_sheet(self) -> None:
-        """Write sharp scene and object, then per opening the photographs, and under them both traced together."""
-        folder = self.folder
-        meta = read_json(folder / "meta.json", "the description of a view (meta.json)")
-        virtual, scene_rgb = read_layer(folder / "object.exr"), read_image(folder / "scene" / "all_in_focus.exr")
-        coverage = np.repeat(virtual.alpha[..., None], 3, axis=2)
-        rows = [SheetRow("sharp", {"all in focus": scene_rgb, "the object": virtual.rgb, "its coverage": coverage})]
+    def sheet_rows(self, meta: dict[str, Any]) -> Iterator[SheetRow]:
+        """Yield sharp scene and object, then per opening the photographs, and under them both traced together."""
+        virtual, scene_rgb = read_layer(self.folder / "object.exr"), read_image(self.folder / "scene" / "all_in_focus.exr")
+        yield SheetRow("sharp", {"all in focus": scene_rgb, "the object": virtual.rgb, "its coverage": grey(virtual.alpha)})
         for shape, names in meta["truth"].items():
             for what in ("scene", "both"):
-                captions = [f"focus {distance_m:.2f} m" for distance_m in meta["focus_distances_m"]]
-                pictures = {caption: read_image(folder / what / name) for caption, name in zip(captions, names, strict=True)}
-                rows.append(SheetRow(f"{shape}, {what}", pictures))
-        write_contact_sheet(folder / "sheet.png", rows)
-
-    def _make_sharp(self) -> None:
-        layer = self._sharp(self._tracers["scene"])
-        comment = "metres along the optical axis, not antialiased"
-        write_exr(self.folder / "scene" / "depth.exr", ExrPart({"Z": layer.depth_m}, attributes={"comments": comment}))
-        write_image(self.folder / "scene" / "all_in_focus.exr", layer.rgb)
-
-    def _make_object(self) -> None:
-        write_layer(self.folder / "object.exr", self._sharp(self._tracer(self.virtual, "thin")))
-
-    def _sharp(self, tracer: TruthTracer):  # type: ignore[no-untyped-def]
-        return sharp_layer(tracer, self._plan.samples, self._plan.lamp_rays)
-
-    def _make_defocused(self, what: What, shape: str, focus_distance_m: float, path: Path) -> None:
-        opening, tracer = self._plan.opening(shape, focus_distance_m), self._tracers[what]
-        write_image(path, tracer.traced(opening, self._plan.samples).rgb + tracer.lamp_light(opening, self._plan.lamp_rays))
+                yield self.focus_row(f"{shape}, {what}", [self.folder / what / name for name in names], meta)
 
 
 def mixed_reality(out: Path, plan: TruthPlan, *, overwrite: bool = False) -> int:
-    """Make the missing files of a set, as `truth_set.make_missing` does; raises InputError for scenes without an object too."""
+    """Make the missing files of a set, as `truth_set.make_views` does; raises InputError for scenes without an object too."""
     if set(plan.scenes) - set(OBJECT_DISTANCES_M):
         raise InputError(f"expected scenes out of {','.join(OBJECT_DISTANCES_M)}, got {','.join(plan.scenes)}")
-    return make_missing(MixedView, out, plan, overwrite=overwrite)
+    return make_views(MixedView, out, plan, overwrite=overwrite)
 
 
 main = truth_command(mixed_reality, tuple(OBJECT_DISTANCES_M), DEFAULT_SHAPES)

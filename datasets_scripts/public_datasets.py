@@ -20,7 +20,7 @@ import typer
 from jaxtyping import Bool, Float32
 from scipy import ndimage
 
-from datasets_scripts.made_sets.set_files import focus_index, slice_name, stack_record
+from datasets_scripts.made_sets.set_files import Overwrite, focus_index, mistakes_told, slice_name, stack_record, write_dataset
 from datasets_scripts.public_sets.adapters import (
     APERTURE_LENS,
     BLB_LENS,
@@ -39,11 +39,10 @@ from datasets_scripts.public_sets.adapters import (
 from mrbokeh.images.camera_rgb import write_camera_rgb, write_masks
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import read_depth, read_image
-from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_FILE
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from mrbokeh.stacks.focal_stack_dataset import FILE_NAME, FocalStackDataset, write_focal_stack_dataset
+from mrbokeh.stacks.focal_stack_dataset import FILE_NAME, FocalStackDataset
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 
@@ -123,16 +122,7 @@ def convert(stacks: Sequence[PublicStack], out: Path, conversion: Conversion, *,
         "depth": "of the set" if stacks[0].depth else "given",
         "clipped": "8-bit and 16-bit pictures are clipped at white: lights have lost light, in the sharp picture too",
     }
-    dataset = FocalStackDataset(
-        folder=out,
-        licence=conversion.licence,
-        radiance_scale=max(each.radiance.largest for each in records),
-        stacks=records,
-        metadata=metadata,
-    )
-    (out / "LICENCE.txt").write_text(conversion.licence + "\n", encoding="utf-8")
-    write_focal_stack_dataset(dataset)
-    return dataset
+    return write_dataset(out, conversion.licence, records, metadata)
 
 
 def _write_stack(stack: PublicStack, folder: Path, conversion: Conversion) -> None:
@@ -147,7 +137,7 @@ def _write_stack(stack: PublicStack, folder: Path, conversion: Conversion) -> No
     distances_m = [each.focus_distance_m for each in slices if each.focus_distance_m is not None]
     write_merged(folder, sharp, focus_index(depth_m, distances_m), confidence, depth_m)
     write_masks(folder / "exclusion.exr", {"saturated": clipped})
-    lens = _stated(conversion, distances_m[0])
+    lens = _stated(conversion.lens, distances_m[0])
     metadata = {"public": conversion.kind, "clipped": stack.sharp.suffix.lower() not in _LINEAR, **stack.facts}
     write_focal_stack(FocalStack(folder, slices, lens, None, registered=True, merged=True, metadata=metadata))
 
@@ -180,16 +170,9 @@ def _px_per_dioptre(source: PublicSlice, lens: PublicLens, distance_m: float, wi
     return Lens(focal_length_mm, source.f_number or lens.f_number, distance_m, lens.sensor_width_mm).coc_px_per_dioptre(width_px)
 
 
-def _stated(conversion: Conversion, distance_m: float) -> Lens:
-    lens = conversion.lens
+def _stated(lens: PublicLens, distance_m: float) -> Lens:
     assert lens.focal_length_mm is not None
-    return Lens(
-        focal_length_mm=lens.focal_length_mm,
-        f_number=lens.f_number,
-        focus_distance_m=distance_m,
-        sensor_width_mm=lens.sensor_width_mm,
-        aperture=Aperture.disc(),
-    )
+    return Lens(lens.focal_length_mm, lens.f_number, distance_m, lens.sensor_width_mm)
 
 
 def _linear(path: Path, power: float | None) -> tuple[Rgb, Mask]:
@@ -283,10 +266,10 @@ def main(
     sensor_width_mm: Annotated[float | None, typer.Option(help="The same.")] = None,
     crop: Annotated[str, typer.Option(help="WIDTHxHEIGHT of the middle, where pictures differ in size.")] = "",
     only: Annotated[int, typer.Option(help="The first so many stacks; 0: all.")] = 0,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a finished set.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Convert a public set."""
-    try:
+    with mistakes_told():
         if kind not in KINDS:
             raise InputError(f"expected a kind out of {', '.join(KINDS)}, got {kind!r}")
         if (out / FILE_NAME).exists() and not overwrite:
@@ -298,9 +281,6 @@ def main(
             kind=kind, lens=lens, licence=chosen.licence, depth=DepthMaps(depth, near_m, far_m), focus_m=focus_m, crop_px=crop_of(crop)
         )
         dataset = convert(chosen.stacks(source)[: only or None], out, conversion, overwrite=overwrite)
-    except InputError as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from None
     typer.echo(f"{out}: {len(dataset.stacks)} stacks, largest circle of confusion {dataset.largest_coc_px:.1f} px. {chosen.licence}")
 
 

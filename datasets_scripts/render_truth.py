@@ -11,10 +11,10 @@ from functools import partial
 
 import typer
 
-from datasets_scripts.made_sets.truth_set import SHAPE_NAMES, View, make_missing, truth_command
+from datasets_scripts.made_sets.truth_set import SHAPE_NAMES, View, make_views, truth_command
 from datasets_scripts.scenes.truth_scenes import SCENES
 
-render_truth = partial(make_missing, View)
+render_truth = partial(make_views, View)
 
 main = truth_command(render_truth, tuple(SCENES), SHAPE_NAMES)
 

@@ -14,10 +14,10 @@ import numpy as np
 import typer
 from jaxtyping import Float64, UInt8
 
+from datasets_scripts.made_sets.set_files import Overwrite, mistakes_told
 from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.atomic_files import atomic_path, refuse_existing
-from mrbokeh.system.errors import InputError
 from mrbokeh.system.typed_numbers import numbers_in
 from mrbokeh.tracking.camera_track.formats import read_track
 from mrbokeh.tracking.camera_track.track import CameraTrack
@@ -75,17 +75,14 @@ def main(
     out: Annotated[Path, typer.Argument(help="Picture to write (.png, .jpg).")],
     at: Annotated[str, typer.Option(help="X,Y,Z in metres where the axes begin.")] = "0,0,0",
     size_m: Annotated[float, typer.Option(help="Length of an axis.")] = 0.1,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing picture.")] = False,
+    overwrite: Overwrite = False,
 ) -> None:
     """Draw the axes of a track's world into three frames of its clip."""
-    try:
+    with mistakes_told():
         refuse_existing(out, overwrite)
         sheet = track_sheet(clip, read_track(track), _vector(at), size_m)
         with atomic_path(out) as temporary:
             temporary.write_bytes(cv2.imencode(out.suffix, np.ascontiguousarray(sheet[..., ::-1]))[1].tobytes())
-    except InputError as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from None
     typer.echo(f"wrote {out}")
 
 

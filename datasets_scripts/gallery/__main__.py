@@ -22,6 +22,7 @@ from typing import Annotated
 import typer
 
 from datasets_scripts.gallery.pictures import page_jpeg, result_jpeg
+from datasets_scripts.made_sets.set_files import mistakes_told
 from mrbokeh.system.atomic_files import atomic_path
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
@@ -142,13 +143,10 @@ def main(
     update: Annotated[bool, typer.Option("--update", help="Copy the pictures to docs/pictures.")] = False,
 ) -> None:
     """Run the examples of docs/examples.md and show what they made."""
-    try:
+    with mistakes_told():
         entries = read_entries(EXAMPLES.read_text(encoding="utf-8"))
         chosen = [entry for entry in entries if not only or entry.picture.stem in only.split(",")]
         build(out, chosen, demo)
-    except InputError as error:
-        typer.echo(f"error: {error}", err=True)
-        raise typer.Exit(2) from None
     if update:
         for entry in chosen:
             shutil.copyfile(out / entry.picture.name, EXAMPLES.parent / entry.picture)

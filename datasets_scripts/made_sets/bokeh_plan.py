@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from datasets_scripts.made_sets.set_files import distant_camera, even_in_dioptres
 from datasets_scripts.scenes.bokeh_scenes import KINDS
 from datasets_scripts.tracers.pupil import FieldStop
 from datasets_scripts.tracers.truth import Opening
@@ -20,8 +21,8 @@ from mrbokeh.system.errors import InputError
 
 _RING = FieldStop()
 _ROUND_WITH_RIM = replace(Aperture.disc(), cat_eye=0.35)
-FOCAL_LENGTH_MM, SENSOR_WIDTH_MM = 50.0, 36.0
 NEAREST_FOCUS_M, FARTHEST_FOCUS_M = 0.9, 6.5
+_LENS = Lens(focal_length_mm=50.0, f_number=2.0, focus_distance_m=NEAREST_FOCUS_M, sensor_width_mm=36.0)
 TEST_SHARE = 0.2
 _MOST_ASIDE_M = (0.16, 0.08, 0.04)
 _SMALLEST_PX = 16
@@ -146,9 +147,7 @@ class StacksPlan:
 
     @property
     def focus_distances_m(self) -> tuple[float, ...]:
-        """Focus distances evenly in dioptres, near to far: the steps of blur are equal."""
-        dioptres = np.linspace(1.0 / NEAREST_FOCUS_M, 1.0 / FARTHEST_FOCUS_M, self.size.focuses)
-        return tuple(float(each) for each in 1.0 / dioptres)
+        return even_in_dioptres(NEAREST_FOCUS_M, FARTHEST_FOCUS_M, self.size.focuses)
 
     def parts(self) -> dict[str, Part]:
         """Tell which fifth of the stacks is for testing: a tenth of the scenes (at least one of several) as a whole, and of the others the
@@ -165,32 +164,20 @@ class StacksPlan:
         """Return the first view straight ahead from the middle, others from random places beside it; all look along the axis, since lamps
         are discs that face it. The field of view is that of the lens focused at infinity.
         """
-        focal_px = FOCAL_LENGTH_MM * self.size.width_px / SENSOR_WIDTH_MM
         rng = np.random.default_rng([self.seed, view, *scene.encode()])
         camera_from_world = np.eye(4)
         camera_from_world[:3, 3] = rng.uniform(-1.0, 1.0, 3) * _MOST_ASIDE_M * min(view, 1)
-        middle_px = (0.5 * self.size.width_px, 0.5 * self.size.height_px)
-        return Camera(
-            width_px=self.size.width_px,
-            height_px=self.size.height_px,
-            focal_px=(focal_px, focal_px),
-            principal_px=middle_px,
-            camera_from_world=camera_from_world,
-        )
+        return replace(self._ahead, camera_from_world=camera_from_world)
+
+    @property
+    def _ahead(self) -> Camera:
+        return distant_camera(self.lens(NEAREST_FOCUS_M), self.size.width_px, self.size.height_px)
 
     def lens(self, focus_distance_m: float) -> Lens:
         """Return the lens that the lens file states."""
-        return Lens(
-            focal_length_mm=FOCAL_LENGTH_MM,
-            f_number=self.size.f_number,
-            focus_distance_m=focus_distance_m,
-            sensor_width_mm=SENSOR_WIDTH_MM,
-            aperture=self.opening.stated,
-        )
+        return replace(_LENS, f_number=self.size.f_number, focus_distance_m=focus_distance_m, aperture=self.opening.stated)
 
     def traced_opening(self, focus_distance_m: float) -> Opening:
         """Return the pupil that gives the fixed camera the blur of `Lens.coc_px`: it grows as the lens moves out to focus nearer."""
-        focal_px = FOCAL_LENGTH_MM * self.size.width_px / SENSOR_WIDTH_MM
         per_dioptre_px = self.lens(focus_distance_m).coc_px_per_dioptre(self.size.width_px)
-        shape = self.opening
-        return Opening(shape.aperture, per_dioptre_px / focal_px, focus_distance_m, shape.stop)
+        return Opening(self.opening.aperture, per_dioptre_px / self._ahead.focal_px[0], focus_distance_m, self.opening.stop)

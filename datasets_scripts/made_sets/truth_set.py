@@ -8,24 +8,24 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import typer
 
-from datasets_scripts.made_sets.set_files import Job, claim_folder
+from datasets_scripts.made_sets.set_files import Job, Overwrite, claim_folder, distant_camera, make_missing, mistakes_told
 from datasets_scripts.scenes.truth_scenes import SCENES, make_scene
 from datasets_scripts.tracers.truth import Opening, Part, Picture, TruthTracer
 from datasets_scripts.tracers.truth_layer import make_tracer, sharp_layer
 from datasets_scripts.tracers.truth_scene import PackedScene, TruthScene, pack
 from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
 from mrbokeh.images.image_io import SheetRow, read_image, read_layer, write_contact_sheet, write_image, write_layer
+from mrbokeh.images.layer import Layer
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.scene.mitsuba.mitsuba_tracer import load
 from mrbokeh.system.atomic_files import read_json
-from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 
 _MAKERS: dict[str, Callable[[], Aperture]] = {
@@ -44,7 +44,7 @@ def lens_shape(name: str) -> Aperture:
     return _MAKERS[name]()
 
 
-FOCAL_LENGTH_MM, F_NUMBER, SENSOR_WIDTH_MM = 50.0, 1.2, 36.0
+LENS = Lens(focal_length_mm=50.0, f_number=1.2, focus_distance_m=1.0, sensor_width_mm=36.0)
 CONVENTIONS = {
     "blur": "a point at depth z is moved by u * coc / 2 for the lens point u of the unit pupil (x right, y down), with "
     "coc = coc_px_per_dioptre * (1 / focus - 1 / z), which is what Lens.coc_px of this project gives; the camera never changes",
@@ -93,26 +93,13 @@ class TruthPlan:
 
     def camera(self, view: int) -> Camera:
         """Return a view: the first straight ahead, others from beside it; the field of view is that of the lens focused at infinity."""
-        focal_px = FOCAL_LENGTH_MM * self.width_px / SENSOR_WIDTH_MM
         angle_rad, aside_m = 2.4 * view, _STEP_ASIDE_M * min(view, 1)
         camera_from_world = np.eye(4)
         camera_from_world[:2, 3] = -aside_m * np.array([np.cos(angle_rad), 0.5 * np.sin(angle_rad)])
-        return Camera(
-            width_px=self.width_px,
-            height_px=self.height_px,
-            focal_px=(focal_px, focal_px),
-            principal_px=(0.5 * self.width_px, 0.5 * self.height_px),
-            camera_from_world=camera_from_world,
-        )
+        return replace(distant_camera(LENS, self.width_px, self.height_px), camera_from_world=camera_from_world)
 
     def lens(self, shape: str, focus_distance_m: float) -> Lens:
-        return Lens(
-            focal_length_mm=FOCAL_LENGTH_MM,
-            f_number=F_NUMBER,
-            focus_distance_m=focus_distance_m,
-            sensor_width_mm=SENSOR_WIDTH_MM,
-            aperture=lens_shape(shape),
-        )
+        return replace(LENS, focus_distance_m=focus_distance_m, aperture=lens_shape(shape))
 
     def opening(self, shape: str, focus_distance_m: float) -> Opening:
         """Return the pupil that gives the fixed camera exactly the blur of `Lens.coc_px`.
@@ -130,7 +117,7 @@ def truth_name(shape: str, focus_index: int) -> str:
 
 def view_document(plan: TruthPlan, name: str, scene: TruthScene, view: int) -> dict[str, object]:
     """Return meta.json of one view."""
-    camera, distances_m = plan.camera(view), list(scene.focus_distances_m)
+    distances_m = list(scene.focus_distances_m)
     return {
         "format": "mrbokeh-truth",
         "version": 1,
@@ -141,17 +128,11 @@ def view_document(plan: TruthPlan, name: str, scene: TruthScene, view: int) -> d
         "samples": plan.samples,
         "lamp_rays": plan.lamp_rays,
         "lamps": len(scene.lamps),
-        "lens": {"focal_length_mm": FOCAL_LENGTH_MM, "f_number": F_NUMBER, "sensor_width_mm": SENSOR_WIDTH_MM},
+        "lens": {key: getattr(LENS, key) for key in ("focal_length_mm", "f_number", "sensor_width_mm")},
         "focus_distances_m": distances_m,
         "coc_px_per_dioptre": [plan.lens("disc", each).coc_px_per_dioptre(plan.width_px) for each in distances_m],
         "pupil_diameters_m": [plan.opening("disc", each).diameter_m for each in distances_m],
-        "camera": {
-            "width_px": camera.width_px,
-            "height_px": camera.height_px,
-            "focal_px": list(camera.focal_px),
-            "principal_px": list(camera.principal_px),
-            "camera_from_world": camera.camera_from_world.tolist(),
-        },
+        "camera": camera_to_json(plan.camera(view)),
         "apertures": {shape: _aperture_document(shape) for shape in plan.shapes},
         "truth": {shape: [f"truth/{truth_name(shape, index)}" for index in range(len(distances_m))] for shape in plan.shapes},
         "layers": ["layers/00.exr", "layers/01.exr"] if scene.kind == "thin" else [],
@@ -166,7 +147,7 @@ def _aperture_document(shape: str) -> dict[str, object]:
 
 
 class ViewFiles(ABC):
-    """One camera's look at one scene, in OUT/SCENE_SEED/view_NN."""
+    """One camera's look at one scene, in OUT/SCENE_SEED/view_NN; what is costly is made when it is first needed."""
 
     def __init__(self, out: Path, plan: TruthPlan, name: str, number: int) -> None:
         self.folder = out / f"{name}_{plan.seed}" / f"view_{number:02d}"
@@ -181,15 +162,47 @@ class ViewFiles(ABC):
         """Yield the files of the view, in the order in which they are made."""
 
     @abstractmethod
-    def write_sheet(self) -> None:
-        """Write sheet.png, a contact sheet of the finished files."""
+    def sheet_rows(self, meta: dict[str, Any]) -> Iterator[SheetRow]:
+        """Return the rows of the contact sheet of the finished files, which meta.json names."""
 
     def claim(self, overwrite: bool) -> None:
         files = (path for job in self.jobs() for path in job.paths)
         claim_folder(self.folder / "meta.json", self.document(), files, overwrite)
 
+    def write_sheet(self) -> None:
+        meta = read_json(self.folder / "meta.json", "the description of a view (meta.json)")
+        write_contact_sheet(self.folder / "sheet.png", list(self.sheet_rows(meta)))
 
-def make_missing(make_view: type[ViewFiles], out: Path, plan: TruthPlan, *, overwrite: bool = False) -> int:
+    def focus_row(self, title: str, paths: Sequence[Path], meta: dict[str, Any]) -> SheetRow:
+        captions = [f"focus {distance_m:.2f} m" for distance_m in meta["focus_distances_m"]]
+        return SheetRow(title, {caption: read_image(path) for caption, path in zip(captions, paths, strict=True)})
+
+    def sharp_job(self, folder: Path, tracer: Callable[[], TruthTracer]) -> Job:
+        """Return all_in_focus.exr and depth.exr in a folder."""
+
+        def make() -> None:
+            layer = self._sharp(tracer())
+            comment = "metres along the optical axis, not antialiased"
+            write_exr(folder / "depth.exr", ExrPart({"Z": layer.depth_m}, attributes={"comments": comment}))
+            write_image(folder / "all_in_focus.exr", layer.rgb)
+
+        return Job((folder / "all_in_focus.exr", folder / "depth.exr"), make)
+
+    def layer_job(self, path: Path, tracer: Callable[[], TruthTracer]) -> Job:
+        return Job((path,), lambda: write_layer(path, self._sharp(tracer())))
+
+    def defocused_job(self, path: Path, tracer: Callable[[], TruthTracer], shape: str, focus_distance_m: float) -> Job:
+        return Job((path,), lambda: write_image(path, self.defocused(tracer(), shape, focus_distance_m)))
+
+    def defocused(self, tracer: TruthTracer, shape: str, focus_distance_m: float) -> Picture:
+        opening = self._plan.opening(shape, focus_distance_m)
+        return tracer.traced(opening, self._plan.samples).rgb + tracer.lamp_light(opening, self._plan.lamp_rays)
+
+    def _sharp(self, tracer: TruthTracer) -> Layer:
+        return sharp_layer(tracer, self._plan.samples, self._plan.lamp_rays)
+
+
+def make_views(make_view: type[ViewFiles], out: Path, plan: TruthPlan, *, overwrite: bool = False) -> int:
     """Write all that is missing of the plan into `out` and return how many files or pairs of files were made.
 
     Raises InputError where `out` holds something else, unless `overwrite` says to replace it.
@@ -198,14 +211,12 @@ def make_missing(make_view: type[ViewFiles], out: Path, plan: TruthPlan, *, over
     views = [make_view(out, plan, name, number) for name in plan.scenes for number in range(plan.views)]
     for view in views:
         view.claim(overwrite)
-    waiting = [(view, job) for view in views for job in view.jobs() if not job.done]
-    for _, job in track(waiting, "rendering truth"):
-        job.make()
-    changed = [view for view, _ in waiting]
+    changed = [view for view in views if not all(job.done for job in view.jobs())]
+    made = make_missing((job for view in views for job in view.jobs()), "rendering truth")
     for view in views:
         if view in changed or not (view.folder / "sheet.png").is_file():
             view.write_sheet()
-    return len(waiting)
+    return made
 
 
 def truth_command(make_set: Callable[..., int], scene_names: Sequence[str], shape_names: Sequence[str]) -> Callable[..., None]:
@@ -220,30 +231,20 @@ def truth_command(make_set: Callable[..., int], scene_names: Sequence[str], shap
         samples: Annotated[int, typer.Option(help="Rays per pixel, best a power of two; 256 gives a noise floor of about 50 dB.")] = 256,
         seed: Annotated[int, typer.Option(help="Chooses the scenes' contents and the sampling.")] = 1,
         views: Annotated[int, typer.Option(help="Cameras per scene.")] = 1,
-        overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace a set made with other settings.")] = False,
+        overwrite: Overwrite = False,
     ) -> None:
         """Render the missing files of a truth set."""
-        try:
-            plan = TruthPlan(
-                width_px=width,
-                height_px=height,
-                samples=samples,
-                seed=seed,
-                views=views,
-                scenes=tuple(scenes.split(",")),
-                shapes=tuple(shapes.split(",")),
-            )
+        with mistakes_told():
+            wanted: dict[str, Any] = {"scenes": tuple(scenes.split(",")), "shapes": tuple(shapes.split(","))}
+            plan = TruthPlan(width_px=width, height_px=height, samples=samples, seed=seed, views=views, **wanted)
             made = make_set(out, plan, overwrite=overwrite)
-        except InputError as error:
-            typer.echo(f"error: {error}", err=True)
-            raise typer.Exit(2) from None
         typer.echo(f"{out}: {'complete' if made else 'nothing to do, all files were there'}")
 
     return main
 
 
 class View(ViewFiles):
-    """One camera's look at one scene; what is costly is made when it is first needed."""
+    """All of a scene: sharp, in layers, and through every opening."""
 
     @cached_property
     def scene(self) -> TruthScene:
@@ -255,61 +256,38 @@ class View(ViewFiles):
 
     @cached_property
     def tracer(self) -> TruthTracer:
-        return self._tracer("all")
+        return self._tracer_of("all")
 
-    def _tracer(self, part: Part) -> TruthTracer:
+    def _tracer_of(self, part: Part) -> TruthTracer:
         return make_tracer(self._packed, self._plan.camera(self._number), part, self._plan.seed)
 
     def document(self) -> dict[str, object]:
         return view_document(self._plan, self._name, self.scene, self._number)
 
-    def write_sheet(self) -> None:
-        """Write what is sharp, its depth and layers, then every opening at every focus, three pictures to a row."""
+    def sheet_rows(self, meta: dict[str, Any]) -> Iterator[SheetRow]:
+        """Yield what is sharp, its depth and layers, then every opening at every focus."""
         folder = self.folder
-        meta = read_json(folder / "meta.json", "the description of a view (meta.json)")
         sharp, depth_m = read_image(folder / "all_in_focus.exr"), read_exr(folder / "depth.exr")[0].channels["Z"]
-        lamps = np.maximum(sharp - 1.0, 0.0)
-        dioptres = _grey(1.0 / depth_m / 1.5)
-        rows = [SheetRow("sharp", {"all in focus": sharp, "dioptres, 1.5 is white": dioptres, "what is brighter than 1": lamps})]
+        lamps, dioptres = np.maximum(sharp - 1.0, 0.0), grey(1.0 / depth_m / 1.5)
+        yield SheetRow("sharp", {"all in focus": sharp, "dioptres, 1.5 is white": dioptres, "what is brighter than 1": lamps})
         if meta["layers"]:
             front, rest = (read_layer(folder / name) for name in meta["layers"])
-            rows.append(SheetRow("layers", {"foreground": front.rgb, "its coverage": _grey(front.alpha), "the rest without it": rest.rgb}))
-        captions = [f"focus {distance_m:.2f} m" for distance_m in meta["focus_distances_m"]]
+            yield SheetRow("layers", {"foreground": front.rgb, "its coverage": grey(front.alpha), "the rest without it": rest.rgb})
         for shape, names in meta["truth"].items():
-            rows.append(SheetRow(shape, {caption: read_image(folder / name) for caption, name in zip(captions, names, strict=True)}))
-        write_contact_sheet(folder / "sheet.png", rows)
+            yield self.focus_row(shape, [folder / name for name in names], meta)
 
     def jobs(self) -> Iterator[Job]:
         folder = self.folder
-        yield Job((folder / "all_in_focus.exr", folder / "depth.exr"), self._make_sharp)
-        if self.scene.kind == "thin":
-            parts: tuple[Part, ...] = ("thin", "rest")
-            for index, part in enumerate(parts):
-                path = folder / "layers" / f"{index:02d}.exr"
-                yield Job((path,), partial(self._make_layer, part, path))
+        yield self.sharp_job(folder, lambda: self.tracer)
+        parts: tuple[Part, ...] = ("thin", "rest") if self.scene.kind == "thin" else ()
+        for index, part in enumerate(parts):
+            yield self.layer_job(folder / "layers" / f"{index:02d}.exr", partial(self._tracer_of, part))
         for shape in self._plan.shapes:
             for index, distance_m in enumerate(self.scene.focus_distances_m):
-                path = folder / "truth" / truth_name(shape, index)
-                yield Job((path,), partial(self._make_truth, shape, distance_m, path))
+                yield self.defocused_job(folder / "truth" / truth_name(shape, index), lambda: self.tracer, shape, distance_m)
         if "cat_eye" in self._plan.shapes:
             share = folder / "truth" / "cat_eye_open_share.exr"
             yield Job((share,), partial(self._make_open_share, share))
-
-    def defocused(self, shape: str, focus_distance_m: float) -> Picture:
-        opening = self._plan.opening(shape, focus_distance_m)
-        return self.tracer.traced(opening, self._plan.samples).rgb + self.tracer.lamp_light(opening, self._plan.lamp_rays)
-
-    def _make_sharp(self) -> None:
-        layer = sharp_layer(self.tracer, self._plan.samples, self._plan.lamp_rays)
-        comment = "metres along the optical axis, not antialiased"
-        write_exr(self.folder / "depth.exr", ExrPart({"Z": layer.depth_m}, attributes={"comments": comment}))
-        write_image(self.folder / "all_in_focus.exr", layer.rgb)
-
-    def _make_layer(self, part: Part, path: Path) -> None:
-        write_layer(path, sharp_layer(self._tracer(part), self._plan.samples, self._plan.lamp_rays))
-
-    def _make_truth(self, shape: str, focus_distance_m: float, path: Path) -> None:
-        write_image(path, self.defocused(shape, focus_distance_m))
 
     def _make_open_share(self, path: Path) -> None:
         """Write the share of the light that the cat-eye's rim passes, focused on the farthest distance: the truth leaves it out."""
@@ -318,5 +296,5 @@ class View(ViewFiles):
         write_exr(path, ExrPart({"Y": share.astype(np.float16)}, attributes={"comments": "share of the pupil that is open"}))
 
 
-def _grey(plane: np.ndarray) -> Picture:
+def grey(plane: np.ndarray) -> Picture:
     return np.repeat(plane[..., None], 3, axis=-1).astype(np.float32)

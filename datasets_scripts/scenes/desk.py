@@ -11,7 +11,7 @@ from datasets_scripts.scenes.textures import bricks, checks, mottled, page_of_te
 from datasets_scripts.tracers.baked_lighting import bake_lighting
 from datasets_scripts.tracers.thin_lens import trace_pinhole
 from datasets_scripts.tracers.traced_scene import DiscLight, Quad, Scene, Sphere, Texture, Vector, vector
-from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.camera import Camera, camera_of_lens
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 
@@ -64,14 +64,7 @@ def camera_at(view: Viewpoint, width_px: int, height_px: int, lens: Lens) -> Cam
     camera_from_world = np.eye(4)
     camera_from_world[:3, :3] = pitch @ yaw
     camera_from_world[:3, 3] = -pitch @ yaw @ np.asarray(view.position_m)
-    focal_px = lens.focal_px(width_px)
-    return Camera(
-        width_px=width_px,
-        height_px=height_px,
-        focal_px=(focal_px, focal_px),
-        principal_px=(0.5 * width_px, 0.5 * height_px),
-        camera_from_world=camera_from_world,
-    )
+    return replace(camera_of_lens(lens, width_px, height_px), camera_from_world=camera_from_world)
 
 
 def desk_scene(seed: int) -> Scene:
