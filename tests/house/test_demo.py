@@ -7,12 +7,14 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
 
+from mrbokeh.demo import stages
 from mrbokeh.demo.plan import VIEWS, demo_stages
 from mrbokeh.demo.report import (
     camera_measurements,
@@ -29,6 +31,14 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.camera import Camera
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
 from mrbokeh.system.errors import InputError
+from tests.scenes.command_line import mrbokeh
+
+
+@pytest.fixture(autouse=True)
+def commands_run_in_this_process(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """But in the slow tests: a process takes a second to start."""
+    if "slow" not in request.keywords:
+        monkeypatch.setattr(stages, "_exit_code", lambda command: mrbokeh(*command[3:]).returncode)
 
 
 def lens_stage(path: Path, focus_m: float = 1.0) -> Stage:
@@ -42,37 +52,24 @@ def draw_stage(lens: Path, picture: Path) -> Stage:
 
 def test_finished_stages_are_skipped_and_stale_ones_are_not(tmp_path: Path) -> None:
     lens, picture, console = tmp_path / "lens.json", tmp_path / "lens.png", Console(quiet=True)
-    first = run_stages([lens_stage(lens), draw_stage(lens, picture)], tmp_path, console)
-    assert [done.skipped for done in first] == [False, False]
-    again = run_stages([lens_stage(lens), draw_stage(lens, picture)], tmp_path, console)
-    assert [done.skipped for done in again] == [True, True]
+    first, again = (run_stages([lens_stage(lens), draw_stage(lens, picture)], tmp_path, console) for _ in range(2))
+    assert [done.skipped for done in first] == [False, False] and [done.skipped for done in again] == [True, True]
     assert again[0].seconds == pytest.approx(first[0].seconds), "the report keeps the time of the run that did the work"
     drawn = picture.stat().st_mtime_ns
     changed = run_stages([lens_stage(lens, focus_m=2.0), draw_stage(lens, picture)], tmp_path, console)
-    assert [done.skipped for done in changed] == [False, False]
-    assert picture.stat().st_mtime_ns > drawn
-
-
-def test_a_lost_output_is_made_again(tmp_path: Path) -> None:
-    lens, console = tmp_path / "lens.json", Console(quiet=True)
+    assert [done.skipped for done in changed] == [False, False] and picture.stat().st_mtime_ns > drawn
+    # A result is stale where its input was made anew by a run that got no further.
     run_stages([lens_stage(lens)], tmp_path, console)
+    later = run_stages([lens_stage(lens), draw_stage(lens, picture)], tmp_path, console)
+    assert [done.skipped for done in later] == [True, False]
+    # A lost output is made again.
     lens.unlink()
-    assert not run_stages([lens_stage(lens)], tmp_path, console)[0].skipped
-    assert lens.exists()
+    assert not run_stages([lens_stage(lens)], tmp_path, console)[0].skipped and lens.exists()
 
 
 def test_a_failing_stage_names_its_command(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="mrbokeh lens show"):
         run_stages([draw_stage(tmp_path / "none.json", tmp_path / "a.png")], tmp_path, Console(quiet=True))
-
-
-@pytest.mark.slow
-def test_a_result_is_stale_where_its_input_was_made_anew_by_a_run_that_got_no_further(tmp_path: Path) -> None:
-    lens, picture, console = tmp_path / "lens.json", tmp_path / "lens.png", Console(quiet=True)
-    run_stages([lens_stage(lens), draw_stage(lens, picture)], tmp_path, console)
-    run_stages([lens_stage(lens, focus_m=2.0)], tmp_path, console)
-    later = run_stages([lens_stage(lens, focus_m=2.0), draw_stage(lens, picture)], tmp_path, console)
-    assert [done.skipped for done in later] == [True, False]
 
 
 def test_what_was_interrupted_goes_on_and_what_replaced_something_starts_over(tmp_path: Path) -> None:
@@ -82,31 +79,27 @@ def test_what_was_interrupted_goes_on_and_what_replaced_something_starts_over(tm
     assert not must_be_anew(begun, arguments, inputs), "interrupted in its first run: it goes on"
     assert must_be_anew(begun, arguments, {"lens": "run 3"}), "what it left is of an older input"
     assert must_be_anew(begun, ("draw", "large"), inputs)
-    assert must_be_anew(Record("run 2", arguments, inputs, anew=True), arguments, inputs), "it may have left parts of both"
-    assert must_be_anew(Record("run 2", arguments, inputs, seconds=1.0), arguments, inputs), "finished, but something was lost"
+    assert must_be_anew(replace(begun, anew=True), arguments, inputs), "it may have left parts of both"
+    assert must_be_anew(replace(begun, seconds=1.0), arguments, inputs), "finished, but something was lost"
     write_record(tmp_path / "draw.json", begun)
     assert read_record(tmp_path / "draw.json") == begun
 
 
 def test_records_of_earlier_versions_hold_for_nothing(tmp_path: Path) -> None:
-    path = tmp_path / "lens.json"
-    path.write_text(json.dumps({"arguments": ["lens"], "seconds": 2.0}))
-    record = read_record(path)
+    (tmp_path / "lens.json").write_text(json.dumps({"arguments": ["lens"], "seconds": 2.0}))
+    record = read_record(tmp_path / "lens.json")
     assert record is not None and not record.still_holds(("lens",), {"plan": "run 1"})
 
 
-@pytest.mark.slow
 def test_the_demo_goes_on_without_an_optional_stage_and_finds_it_later(tmp_path: Path) -> None:
     lens, console = tmp_path / "found" / "lens.json", Console(quiet=True)
     picture, sheet = tmp_path / "found" / "lens.png", tmp_path / "sheet.png"
-    poses = Stage("poses", "Fails while there is no lens", ("lens", "show", str(lens), "--out", str(picture)), (picture,), optional=True)
-    depth = Stage(
-        "depth", "Needs the poses", ("lens", "show", str(lens), "--out", str(sheet), str(picture.parent)), (sheet,), optional=True
-    )
+    poses = replace(draw_stage(lens, picture), name="poses", when_stale=(), optional=True)
+    arguments = ("lens", "show", str(lens), "--out", str(sheet), str(picture.parent))
+    depth = Stage("depth", "Needs the poses", arguments, (sheet,), optional=True)
     report = lens_stage(tmp_path / "own.json")
-    first = run_stages([poses, depth, report], tmp_path, console)
+    first, again = (run_stages([poses, depth, report], tmp_path, console) for _ in range(2))
     assert [done.failed for done in first] == [True, True, False]
-    again = run_stages([poses, depth, report], tmp_path, console)
     assert [(done.failed, done.skipped) for done in again] == [(True, False), (True, True), (False, True)], "tried again, report stays"
     lens.parent.mkdir()
     run_stages([lens_stage(lens)], tmp_path, console)
@@ -114,42 +107,36 @@ def test_the_demo_goes_on_without_an_optional_stage_and_finds_it_later(tmp_path:
 
 
 def test_every_stage_of_the_plan_names_its_outputs(tmp_path: Path) -> None:
-    stages = demo_stages(tmp_path, 1.0)
-    assert len({stage.name for stage in stages}) == len(stages)
-    assert all(stage.outputs and str(tmp_path) in stage.command_line for stage in stages)
-    commands = {stage.arguments[:2] for stage in stages}
+    planned = demo_stages(tmp_path, 1.0)
+    assert len({stage.name for stage in planned}) == len(planned)
+    assert all(stage.outputs and str(tmp_path) in stage.command_line for stage in planned)
     capture = {("capture", name) for name in ("ingest", "merge", "poses", "scale", "depth", "report")}
-    assert capture | {("train", "fit"), ("train", "export"), ("train", "evaluate")} <= commands
+    assert capture | {("train", "fit"), ("train", "export"), ("train", "evaluate")} <= {stage.arguments[:2] for stage in planned}
 
 
 def test_merging_again_takes_everything_after_it_again(tmp_path: Path) -> None:
     """`merge` overwrites the pictures that `depth` made, so that no later stage may be skipped."""
-    stages = {stage.name: stage for stage in demo_stages(tmp_path, 1.0)}
-    fed = {name for name, stage in stages.items() if stages["desk_merge"].feeds(stage)}
+    planned = {stage.name: stage for stage in demo_stages(tmp_path, 1.0)}
+    fed = {name for name, stage in planned.items() if planned["desk_merge"].feeds(stage)}
     assert {"desk_poses", "desk_scale", "desk_depth", "desk_report", "desk_fit", "desk_evaluate", "desk_cake_sharp_network"} <= fed
     assert not any(name.startswith("board") for name in fed)
     replacing = ("desk_merge", "desk_poses", "desk_scale", "desk_depth", "desk_fit")
-    assert all("--overwrite" in stages[name].arguments + stages[name].when_stale for name in replacing)
+    assert all("--overwrite" in planned[name].arguments + planned[name].when_stale for name in replacing)
 
 
-def moved_camera(x_m: float, focal_px: float) -> Camera:
+def stack_at(x_m: float, focal_px: float) -> FocalStack:
+    """A stack whose camera was moved to the right."""
     pose = np.eye(4)
     pose[0, 3] = -x_m
-    return Camera(8, 6, (focal_px, focal_px), (4.0, 3.0), pose)
-
-
-def posed_stack(camera: Camera) -> FocalStack:
-    return FocalStack(Path("view"), (), camera=camera)
+    return FocalStack(Path("view"), (), camera=Camera(8, 6, (focal_px, focal_px), (4.0, 3.0), pose))
 
 
 def test_cameras_too_far_apart_are_found_out() -> None:
     """Placed 1.5 % too far apart, with a focal length 0.4 % too short."""
-    true = [moved_camera(x_m, 100.0) for x_m in (0.0, 0.1, 0.3)]
-    stacks = [posed_stack(moved_camera(0.5 + 1.015 * x_m, 99.6)) for x_m in (0.0, 0.1, 0.3)]
-    scale, focal = camera_measurements(stacks, true)
-    assert (scale.text, scale.met) == ("+1.50%", False)
-    assert (focal.text, focal.met) == ("-0.40%", True)
-    lost = camera_measurements([posed_stack(moved_camera(0.0, 100.0))] * 3, true)
+    true = [stack_at(x_m, 100.0).camera for x_m in (0.0, 0.1, 0.3)]
+    scale, focal = camera_measurements([stack_at(0.5 + 1.015 * x_m, 99.6) for x_m in (0.0, 0.1, 0.3)], true)
+    assert (scale.text, scale.met) == ("+1.50%", False) and (focal.text, focal.met) == ("-0.40%", True)
+    lost = camera_measurements([stack_at(0.0, 100.0)] * 3, true)
     assert [(each.text, each.met) for each in lost] == [("not found", False)]
 
 

@@ -19,14 +19,25 @@ CALLER = (
 CALLER += "\n@njit(cache=True)\ndef scaled(x):\n    return x * factor()\n"
 OTHER = "VALUE = 1\n"
 CALL = """
-import json
+import json, sys
+from pathlib import Path
 from numba.core import event
-with event.install_recorder("numba:compile") as compiled:
-    from room.caller_numba import scaled
-    value = scaled(2.0)
-ours = [e for _, e in compiled.buffer if e.is_start and e.data["dispatcher"].py_func.__module__.startswith("room")]
-print(json.dumps({"value": value, "compiled": len(ours), "hits": sum(scaled.stats.cache_hits.values())}))
+cache, *folders = sys.argv[1:]
+for folder in folders:
+    if folder == "damage":
+        for path in Path(cache).rglob("*.nb[ci]"):
+            path.write_bytes(b"")
+        continue
+    sys.path.insert(0, folder)
+    for name in [each for each in sys.modules if each.partition(".")[0] == "room"]:
+        del sys.modules[name]
+    with event.install_recorder("numba:compile") as compiled:
+        from room.caller_numba import scaled
+        value = scaled(2.0)
+    ours = [e for _, e in compiled.buffer if e.is_start and e.data["dispatcher"].py_func.__module__.startswith("room")]
+    print(json.dumps({"value": value, "compiled": len(ours), "hits": sum(scaled.stats.cache_hits.values())}))
 """
+"""What became of the kernel of each folder, one after the other; at the word damage, all that is kept is emptied."""
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -38,34 +49,32 @@ def checkout(folder: Path, factor: int = 3) -> Path:
     return folder
 
 
-def start(folder: Path, cache: Path) -> "subprocess.Popen[str]":
+def start(cache: Path, *folders: Path | str) -> "subprocess.Popen[str]":
     environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join([str(folder), str(ROOT)]),
+        "PYTHONPATH": str(ROOT),
         "XDG_CACHE_HOME": str(cache),
         "NUMBA_CACHE_DIR": "",
+        "PYTHONDONTWRITEBYTECODE": "1",
     }
-    return subprocess.Popen([sys.executable, "-c", CALL], env=environment, stdout=subprocess.PIPE, text=True)
+    return subprocess.Popen([sys.executable, "-c", CALL, cache, *folders], env=environment, stdout=subprocess.PIPE, text=True)
 
 
-def answer(process: "subprocess.Popen[str]") -> dict[str, float]:
+def answers(process: "subprocess.Popen[str]") -> list[dict[str, float]]:
     out, _ = process.communicate(timeout=120)
     assert process.returncode == 0
-    return json.loads(out)
+    return [json.loads(line) for line in out.splitlines()]
 
 
 def test_a_second_checkout_finds_what_the_first_compiled_and_a_changed_callee_is_never_stale(tmp_path: Path) -> None:
     first, second, cache = checkout(tmp_path / "a"), checkout(tmp_path / "b"), tmp_path / "cache"
+    found, compiled = {"value": 6.0, "compiled": 0, "hits": 1}, {"value": 6.0, "compiled": 2, "hits": 0}
     # Two at once: one compiles both functions, the other waits for it and loads what it called.
-    both = sorted((answer(process) for process in [start(first, cache), start(second, cache)]), key=lambda each: each["compiled"])
-    assert both == [{"value": 6.0, "compiled": 0, "hits": 1}, {"value": 6.0, "compiled": 2, "hits": 0}]
+    both = [answers(process)[0] for process in [start(cache, first), start(cache, second)]]
+    assert sorted(both, key=lambda each: each["compiled"]) == [found, compiled]
     checkout(tmp_path / "b", factor=5)
-    assert answer(start(second, cache))["value"] == 10.0
-    assert answer(start(first, cache)) == {"value": 6.0, "compiled": 0, "hits": 1}
     # A damaged file costs time: everything is compiled anew, once.
-    for path in cache.rglob("*.nb[ci]"):
-        path.write_bytes(b"")
-    assert answer(start(first, cache))["value"] == 6.0
-    assert answer(start(first, cache)) == {"value": 6.0, "compiled": 0, "hits": 1}
+    changed, *later = answers(start(cache, second, first, "damage", first, first))
+    assert changed == {"value": 10.0, "compiled": 2, "hits": 0} and later == [found, compiled, found]
 
 
 def test_sources_changed_since_the_process_began_are_not_kept(tmp_path: Path) -> None:
@@ -149,22 +158,21 @@ def test_what_kernels_call_becomes_machine_code_only_where_python_calls_it() -> 
         next_of_fibonacci(-1)
 
 
-def test_kernels_unused_for_long_are_removed(tmp_path: Path) -> None:
+def test_kernels_unused_for_long_and_beyond_the_most_bytes_are_removed_the_oldest_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     for name, days in {"old": kernels.KEPT_UNUSED_DAYS + 1, "new": kernels.KEPT_UNUSED_DAYS - 1}.items():
         (tmp_path / name).mkdir()
         os.utime(tmp_path / name, (time.time() - 86400 * days,) * 2)
     kernels.forget_unused(tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["new"]
-
-
-def test_kernels_beyond_the_most_bytes_are_removed_the_oldest_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(kernels, "MOST_BYTES", 250)
     for hours, name in enumerate(("newest", "middle", "oldest")):
         (tmp_path / name).mkdir()
         (tmp_path / name / "kernel.nbc").write_bytes(bytes(100))
         os.utime(tmp_path / name, (time.time() - 3600 * hours,) * 2)
     kernels.forget_unused(tmp_path)
-    assert {path.name for path in tmp_path.iterdir()} == {"newest", "middle"}
+    assert {path.name for path in tmp_path.iterdir()} >= {"newest", "middle"} and not (tmp_path / "oldest").exists()
 
 
 def test_every_kernel_of_the_product_is_kept_this_way() -> None:

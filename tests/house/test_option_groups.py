@@ -5,7 +5,6 @@ from importlib import import_module
 from typing import Annotated, Any
 
 import click
-import pytest
 import typer
 from typer.main import get_command
 from typer.testing import CliRunner
@@ -43,29 +42,22 @@ def said(*words: str, of: type = Size) -> str:
     return CliRunner().invoke(made_app(of=of), list(words)).output.strip()
 
 
-def test_a_group_comes_whole() -> None:
+def test_a_group_comes_whole_and_a_command_may_add_to_it_and_change_its_defaults() -> None:
     assert said("there") == "there Size(width=3, height_=None) False"
     assert said("there", "--height", "7", "--loud", "--width", "2") == "there Size(width=2, height_=7) True"
-
-
-def test_a_command_may_add_to_a_group_and_change_its_defaults() -> None:
     assert said("there", "--height", "7", of=Named) == "there Named(width=5, height_=7, name='nobody') False"
-
-
-def test_what_an_option_asks_is_checked() -> None:
-    assert CliRunner().invoke(made_app(of=Size), ["there", "--width", "0"]).exit_code == 2
+    assert CliRunner().invoke(made_app(of=Size), ["there", "--width", "0"]).exit_code == 2, "what an option asks is checked"
     assert "Says what came" in said("--help")
 
 
-@pytest.mark.parametrize("module", [check, composite, refocus, render, transfer, video])
-def test_every_option_says_what_it_is(module: object) -> None:
-    command = typer.main.get_command(module.app)  # type: ignore[attr-defined]
-    assert all(getattr(each, "help", None) for each in command.params)
+def test_every_option_says_what_it_is() -> None:
+    for module in (check, composite, refocus, render, transfer, video):
+        assert all(getattr(each, "help", None) for each in get_command(module.app).params), module
 
 
 def test_composite_and_video_share_what_they_can() -> None:
     """Same names, same words, same defaults but for the renderer of scenes: of a photograph the exact one."""
-    one, other = ({each.name: each for each in typer.main.get_command(each.app).params} for each in (composite, video))
+    one, other = ({each.name: each for each in get_command(each.app).params} for each in (composite, video))
     shared = {"layer", "objects", "scene", "camera", "mode", "matte", "near_distance", "scene_renderer", "samples", "catch", "distortion"}
     shared |= {"match_grey", "match_exposure", "match_white", "match_black", "vignetting", "grain", "light_wrap", "seed", "grey_value"}
     shared |= {"input_space", "output_space", "ocio", "overwrite", "plate_exposure"}

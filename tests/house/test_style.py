@@ -7,8 +7,6 @@ from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).resolve().parents[2]
 PACKAGES = ("mrbokeh", "capture", "training", "viewfinder", "datasets_scripts")
 FILES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
@@ -53,18 +51,13 @@ def test_constructors_with_many_arguments_are_called_by_keyword() -> None:
 
 def test_functions_take_few_parameters() -> None:
     """Commands declare their options as parameters, and Triton's kernels take no tuples."""
-    decorated = ((path, node, " ".join(ast.unparse(each) for each in node.decorator_list)) for path, node in functions())
-    counted = (
-        (
-            path,
-            node,
-            len([*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs]),
-            MOST_OF_KERNELS if "njit" in by else MOST_PARAMETERS,
-        )
-        for path, node, by in decorated
-        if "triton" not in by and not COMMANDS.search(by) and not COMMANDS.search(node.name)
-    )
-    assert not [place(path, node, node.name) for path, node, count, most in counted if count > most]
+    wrong = []
+    for path, node in functions():
+        by = " ".join(ast.unparse(each) for each in node.decorator_list)
+        count = len([*node.args.posonlyargs, *node.args.args, *node.args.kwonlyargs])
+        if "triton" not in by and not COMMANDS.search(by) and not COMMANDS.search(node.name):
+            wrong += [place(path, node, node.name)] if count > (MOST_OF_KERNELS if "njit" in by else MOST_PARAMETERS) else []
+    assert not wrong
 
 
 def messages() -> list[tuple[str, str]]:
@@ -96,20 +89,17 @@ def test_messages_to_people_are_sentences_of_the_house() -> None:
 PAGES = [*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_pages_name_files_that_exist(page: Path) -> None:
-    """Paths in backquotes, with suffix or without: `mrbokeh/images/color.py`, `capture/merging/lights`."""
-    packages = "|".join((*PACKAGES, "tests"))
-    found = re.findall(rf"`((?:{packages})/[\w/.]+)`", page.read_text(encoding="utf-8"))
-    assert not [each for each in found if not (ROOT / each).exists() and not (ROOT / f"{each}.py").exists()]
-
-
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_pages_name_modules_that_exist(page: Path) -> None:
-    """Dotted names, such as mrbokeh.layering.motion or `python -m tests.bench.bench_real`; the last word may be a name in the module."""
-    packages = "|".join((*PACKAGES, "tests"))
-    found = set(re.findall(rf"(?<![\w/.\[-])(?:{packages})(?:\.[A-Za-z_]\w*)+\b(?!<|_)", page.read_text(encoding="utf-8")))
-    assert not sorted(each for each in found if not is_module(each) and not is_module(each.rpartition(".")[0]))
+def test_pages_name_files_and_modules_that_exist() -> None:
+    """Paths in backquotes, with suffix or without: `mrbokeh/images/color.py`, `capture/merging/lights`. Dotted names, such as
+    mrbokeh.layering.motion or `python -m tests.bench.bench_real`; the last word may be a name in the module."""
+    packages, missing = "|".join((*PACKAGES, "tests")), list[str]()
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        paths = re.findall(rf"`((?:{packages})/[\w/.]+)`", text)
+        missing += [f"{page.name}: {each}" for each in paths if not (ROOT / each).exists() and not (ROOT / f"{each}.py").exists()]
+        dotted = set(re.findall(rf"(?<![\w/.\[-])(?:{packages})(?:\.[A-Za-z_]\w*)+\b(?!<|_)", text))
+        missing += [f"{page.name}: {each}" for each in dotted if not is_module(each) and not is_module(each.rpartition(".")[0])]
+    assert not missing
 
 
 def is_module(name: str) -> bool:

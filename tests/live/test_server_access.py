@@ -1,7 +1,12 @@
-"""Who may ask the viewfinder for what: real requests to a real server on loopback."""
+"""Who may ask the viewfinder for what: real requests to a real server on loopback; the built page is all that a browser needs."""
 
 import asyncio
 import contextlib
+import hashlib
+import re
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
 from typing import Any
 
 import aiohttp
@@ -10,6 +15,7 @@ import pytest
 from tests.scenes.made_viewfinder import Made, made_viewfinder
 from viewfinder.server.access import Access, host_name, is_loopback, needed_role, objection
 from viewfinder.server.sessions import RateLimit, Role, Sessions
+from viewfinder.server.site import PAGE
 
 FOCUS = {"focus": {"distance_m": 1.0}}
 
@@ -29,26 +35,30 @@ async def status_of(client: aiohttp.ClientSession, method: str, url: str, **opti
         return answer.status
 
 
+@asynccontextmanager
+async def visited(access: Access | None = None) -> AsyncIterator[tuple[Made, aiohttp.ClientSession]]:
+    """A viewfinder and its first guest."""
+    async with made_viewfinder(access) as made, guest() as client:
+        yield made, client
+
+
 async def test_without_sessions_loopback_needs_no_token() -> None:
-    async with made_viewfinder() as made, guest() as client:
+    async with visited() as (made, client):
         async with client.get(made.url + "state") as answer:
-            assert (await answer.json())["role"] == "control"
-            assert answer.headers["Cache-Control"] == "no-store"
+            assert (await answer.json())["role"] == "control" and answer.headers["Cache-Control"] == "no-store"
         assert await status_of(client, "POST", made.url + "control", json=FOCUS) == 200
     assert made.controls.values["focus"] == 1.0
 
 
 async def test_a_stranger_gets_the_page_and_nothing_else() -> None:
-    async with made_viewfinder(Access(sessions=Sessions())) as made, guest() as client:
+    async with visited(Access(sessions=Sessions())) as (made, client):
         async with client.get(made.url) as page:
-            assert page.status == 200
-            assert "vf-picture" in await page.text()
             policy = page.headers["Content-Security-Policy"]
+            assert page.status == 200 and "vf-picture" in await page.text()
             assert "default-src 'self'" in policy and "frame-ancestors 'none'" in policy
-        for path in ("state", "matte", "stream"):
-            assert await status_of(client, "GET", made.url + path) == 401
-        for path in ("control", "whip", "nothing"):
-            assert await status_of(client, "POST", made.url + path, json=FOCUS) == 401
+        for method, paths in {"GET": ("state", "matte", "stream"), "POST": ("control", "whip", "nothing")}.items():
+            for path in paths:
+                assert await status_of(client, method, made.url + path, json=FOCUS) == 401
         with pytest.raises(aiohttp.WSServerHandshakeError, match="401"):
             await client.ws_connect(made.url + "stream")
         assert made.controls.asked == []
@@ -73,22 +83,21 @@ async def test_a_token_is_exchanged_once_for_a_cookie_that_scripts_cannot_read()
         assert (await entered(made, second, sessions.invitation(Role.CONTROL)))[0] == 200
 
 
-@pytest.mark.parametrize("token", ["", "wrong", None, 3, ["x"], "\ud800", "é" * 100])
-async def test_wrong_tokens_let_nobody_in(token: Any) -> None:
-    async with made_viewfinder(Access(sessions=Sessions())) as made, guest() as client:
-        assert (await entered(made, client, token))[0] == 403
+async def test_wrong_tokens_let_nobody_in() -> None:
+    async with visited(Access(sessions=Sessions())) as (made, client):
+        for token in ("", "wrong", None, 3, ["x"], "\ud800", "é" * 100):
+            assert (await entered(made, client, token))[0] == 403, token
         assert await status_of(client, "GET", made.url + "state", headers={"Cookie": "mrbokeh=x; mrbokeh_1=y"}) == 401
 
 
 async def test_who_may_only_view_cannot_control() -> None:
     sessions = Sessions()
-    async with made_viewfinder(Access(sessions=sessions)) as made, guest() as client:
+    async with visited(Access(sessions=sessions)) as (made, client):
         assert await entered(made, client, sessions.invitation(Role.VIEW)) == (200, {"role": "view"})
         async with client.get(made.url + "state") as answer:
             assert (await answer.json())["role"] == "view"
         async with client.post(made.url + "control", json=FOCUS) as answer:
-            assert answer.status == 403
-            assert "watch but not control" in (await answer.json())["error"]
+            assert answer.status == 403 and "watch but not control" in (await answer.json())["error"]
         assert await status_of(client, "POST", made.url + "whip", data="v=0") == 403
         async with client.ws_connect(made.url + "stream") as stream:
             assert (await stream.receive(timeout=5)).type is aiohttp.WSMsgType.BINARY
@@ -100,23 +109,19 @@ async def test_who_may_only_view_cannot_control() -> None:
 async def test_a_program_may_come_again_and_again_with_a_standing_token() -> None:
     sessions = Sessions()
     async with made_viewfinder(Access(sessions=sessions)) as made:
-        for token, status in (
-            (sessions.standing_token(Role.CONTROL), 200),
-            (sessions.standing_token(Role.VIEW), 403),
-            (sessions.invitation(Role.CONTROL), 401),
-            ("", 401),
-        ):
+        standing, viewing = sessions.standing_token(Role.CONTROL), sessions.standing_token(Role.VIEW)
+        for token, status in ((standing, 200), (viewing, 403), (sessions.invitation(Role.CONTROL), 401), ("", 401)):
             async with guest() as client:
                 headers = {"Authorization": f"Bearer {token}"}
                 assert await status_of(client, "POST", made.url + "control", json=FOCUS, headers=headers) == status
         for _ in range(2):
             async with guest() as client:
-                assert await entered(made, client, sessions.standing_token(Role.VIEW)) == (200, {"role": "view"})
+                assert await entered(made, client, viewing) == (200, {"role": "view"})
                 assert await status_of(client, "GET", made.url + "state") == 200
 
 
 async def test_names_that_turn_into_our_address_and_other_pages_are_refused() -> None:
-    async with made_viewfinder() as made, guest() as client:
+    async with visited() as (made, client):
         port = made.url.rsplit(":", 1)[1].strip("/")
         for host in ("evil.example", f"evil.example:{port}", "127.0.0.1.evil.example", "[::1", "localhost@evil.example", ""):
             assert await status_of(client, "GET", made.url, headers={"Host": host}) in (400, 403), host
@@ -143,14 +148,9 @@ async def raw_answer(made: Made, request: str) -> bytes:
     return answer
 
 
-async def test_a_request_without_a_host_is_refused() -> None:
-    async with made_viewfinder() as made:
-        assert (await raw_answer(made, "GET /state HTTP/1.0\r\n\r\n")).split(b" ")[1] == b"403"
-
-
 async def test_too_many_requests_and_too_many_guesses_are_refused() -> None:
     access = Access(sessions=Sessions(), requests=RateLimit(0.0, 20.0), entries=RateLimit(0.0, 4.0))
-    async with made_viewfinder(access) as made, guest() as client:
+    async with visited(access) as (made, client):
         statuses = [(await entered(made, client, "guess"))[0] for _ in range(6)]
         assert statuses == [403] * 4 + [429] * 2
         # Not even the right one now.
@@ -171,7 +171,7 @@ def test_a_bucket_fills_with_time_and_each_address_has_its_own() -> None:
 
 
 async def test_large_bodies_are_refused_before_they_are_read() -> None:
-    async with made_viewfinder() as made, guest() as client:
+    async with visited() as (made, client):
         assert await status_of(client, "POST", made.url + "control", data=b"x" * 1025) == 413
         assert await status_of(client, "POST", made.url + "control", data=b" " * 900 + b'{"f_number": 4}') == 200
 
@@ -190,27 +190,21 @@ async def test_large_bodies_are_refused_before_they_are_read() -> None:
         assert made.controls.asked == [("f_number", 4.0)]
 
 
-@pytest.mark.parametrize(
-    "path", ["/../pyproject.toml", "/%2e%2e/app.py", "/page/index.html", "//etc/passwd", "/style.css/../../frames.py", "/..%5cx"]
-)
-async def test_no_path_reaches_the_file_system(path: str) -> None:
+async def test_no_path_reaches_the_file_system_and_a_request_without_a_host_is_refused() -> None:
+    paths = ("/../pyproject.toml", "/%2e%2e/app.py", "/page/index.html", "//etc/passwd", "/style.css/../../frames.py", "/..%5cx")
     async with made_viewfinder() as made:
-        answer = await raw_answer(made, f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
-        assert answer.split(b" ")[1] in (b"404", b"400"), answer[:200]
+        for path in paths:
+            answer = await raw_answer(made, f"GET {path} HTTP/1.1\r\nHost: localhost\r\nConnection: close\r\n\r\n")
+            assert answer.split(b" ")[1] in (b"404", b"400"), answer[:200]
+        assert (await raw_answer(made, "GET /state HTTP/1.0\r\n\r\n")).split(b" ")[1] == b"403"
 
 
 def test_roles_of_paths() -> None:
-    expected = {"/": None, "/style.css": None, "/enter": None, "/state": Role.VIEW, "/stream": Role.VIEW, "/whep/{viewer}": Role.VIEW}
-    expected |= {
-        "/obs": None,
-        "/obs/whep": Role.VIEW,
-        "/matte": Role.VIEW,
-        "/control": Role.CONTROL,
-        "/whip": Role.CONTROL,
-        "/whip/{token}": Role.CONTROL,
-        "": Role.CONTROL,
-    }
-    assert {path: needed_role(path) for path in expected} == expected
+    expected = {
+        None: ("/", "/style.css", "/enter", "/obs"), Role.VIEW: ("/state", "/stream", "/whep/{viewer}", "/obs/whep", "/matte"),
+        Role.CONTROL: ("/control", "/whip", "/whip/{token}", ""),
+    }  # fmt: skip
+    assert {role: tuple(path for path in paths if needed_role(path) is role) for role, paths in expected.items()} == expected
 
 
 def test_hosts_and_origins() -> None:
@@ -230,3 +224,36 @@ def test_the_oldest_guest_leaves_when_too_many_came() -> None:
     cookies = [sessions.enter(sessions.invitation(Role.VIEW))[0] for _ in range(65)]
     assert sessions.role_of(cookies[0], None) is None
     assert sessions.role_of(cookies[1], None) is Role.VIEW
+
+
+ROOT = Path(__file__).resolve().parents[2] / "viewfinder"
+SOURCES, BUILT = ROOT / "page_source", ROOT / "page"
+
+
+def hash_of_sources() -> str:
+    """As build.mjs makes it: name and text of each file of src and static, in order."""
+    hashed = hashlib.sha256()
+    for folder in ("src", "static"):
+        for path in sorted((SOURCES / folder).iterdir(), key=lambda path: path.name):
+            text = path.read_bytes().decode().replace("\r\n", "\n")
+            hashed.update(f"{folder}/{path.name}\0{text}\0".encode())
+    return hashed.hexdigest()
+
+
+def test_the_built_page_belongs_to_its_sources_and_loads_nothing_from_elsewhere() -> None:
+    for name in ("viewfinder.js", "camera.js"):
+        first = (BUILT / name).read_text(encoding="utf-8").splitlines()[0]
+        assert re.search(r"sources: ([0-9a-f]{64})$", first), first
+        assert first.endswith(hash_of_sources()), f"{name} is older than its sources: `npm ci && npm run build` in viewfinder/page_source"
+    for path in (SOURCES / "static").iterdir():
+        assert (BUILT / path.name).read_text(encoding="utf-8") == path.read_text(encoding="utf-8")
+    for path in BUILT.iterdir():
+        assert not re.findall(r"(?:https?|wss?):(?://)[\w.-]+", path.read_text(encoding="utf-8")), path.name
+
+
+def test_every_file_that_the_page_names_is_served_to_everybody() -> None:
+    assert {name for name, _ in PAGE.values()} == {path.name for path in BUILT.iterdir()} - {"README.md"}
+    assert all(needed_role(path) is None for path in PAGE)
+    for html in BUILT.glob("*.html"):
+        named = re.findall(r'(?:src|href)="([^"]+)"', html.read_text(encoding="utf-8"))
+        assert all(f"/{name}" in PAGE for name in named if not name.startswith("data:"))

@@ -1,5 +1,8 @@
 """One interface, its URL as a QR code that a camera can read, and TLS with certificates made here, good and bad ones."""
 
+import asyncio
+import os
+import signal
 import ssl
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
@@ -15,24 +18,17 @@ from mrbokeh.system.errors import InputError
 from tests.scenes.made_viewfinder import made_viewfinder
 from viewfinder.options import ListeningOptions
 from viewfinder.server.access import LOOPBACK_NAMES, Access
-from viewfinder.server.endpoint import Endpoint, Interface, choose, interfaces, load_tls, open_endpoint, page_url, qr_text
+from viewfinder.server.endpoint import Endpoint, Interface, choose, interfaces, load_tls, on_stop, open_endpoint, page_url, qr_text
 from viewfinder.server.sessions import Role, Sessions
 
-LOOPBACK = Interface("lo", "127.0.0.1")
-WIFI = Interface("wlan0", "192.168.1.7")
-CABLE = Interface("eth0", "10.0.0.4")
-BRIDGE = Interface("docker0", "172.17.0.1")
-PUBLIC = Interface("wan", "203.0.114.9")
-MESH = Interface("tailscale0", "100.101.1.2")
+LOOPBACK, WIFI, CABLE = Interface("lo", "127.0.0.1"), Interface("wlan0", "192.168.1.7"), Interface("eth0", "10.0.0.4")
+BRIDGE, PUBLIC, MESH = Interface("docker0", "172.17.0.1"), Interface("wan", "203.0.114.9"), Interface("tailscale0", "100.101.1.2")
 
 
-def test_the_private_address_on_the_way_out_is_taken() -> None:
+def test_the_private_address_on_the_way_out_is_taken_unless_one_is_named() -> None:
     assert choose([LOOPBACK, BRIDGE, WIFI, CABLE], None, WIFI.address) == WIFI.address
     assert choose([LOOPBACK, WIFI], None, None) == WIFI.address
     assert choose([LOOPBACK, PUBLIC, MESH], None, PUBLIC.address) == MESH.address
-
-
-def test_an_interface_may_be_named_by_name_or_address() -> None:
     for wanted in CABLE:
         assert choose([LOOPBACK, WIFI, CABLE], wanted, WIFI.address) == CABLE.address
     # Whoever names a public one wants it.
@@ -40,28 +36,30 @@ def test_an_interface_may_be_named_by_name_or_address() -> None:
 
 
 def test_none_or_several_are_named() -> None:
-    with pytest.raises(InputError, match=r"no interface 'eth7'.*wlan0 \(192.168.1.7\)"):
-        choose([LOOPBACK, WIFI], "eth7", None)
-    with pytest.raises(InputError, match=r"found 2.*docker0.*eth0"):
-        choose([LOOPBACK, BRIDGE, CABLE], None, None)
-    with pytest.raises(InputError, match=r"found 0.*one of none"):
-        choose([LOOPBACK], None, None)
-    with pytest.raises(InputError, match=r"found 0.*wan"):
-        choose([LOOPBACK, PUBLIC], None, PUBLIC.address)
-
-
-def test_this_machine_has_a_loopback() -> None:
+    for found, wanted, on_the_way, sentence in (
+        ([LOOPBACK, WIFI], "eth7", None, r"no interface 'eth7'.*wlan0 \(192.168.1.7\)"),
+        ([LOOPBACK, BRIDGE, CABLE], None, None, r"found 2.*docker0.*eth0"),
+        ([LOOPBACK], None, None, r"found 0.*one of none"), ([LOOPBACK, PUBLIC], None, PUBLIC.address, r"found 0.*wan"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=sentence):
+            choose(found, wanted, on_the_way)
     pytest.importorskip("ifaddr")
     assert "127.0.0.1" in [each.address for each in interfaces()]
 
 
-def test_urls() -> None:
-    assert page_url("127.0.0.1", 8080, secure=False) == "http://127.0.0.1:8080/"
-    assert page_url("::1", 80, secure=True, token="a-b", path="/camera") == "https://[::1]:80/camera#token=a-b"
+@pytest.mark.skipif(os.name == "nt", reason="no handlers can be set there")
+async def test_ctrl_c_and_sigterm_stop_it() -> None:
+    for number in (signal.SIGINT, signal.SIGTERM):
+        stopped = asyncio.Event()
+        on_stop(stopped.set)
+        os.kill(os.getpid(), number)
+        await asyncio.wait_for(stopped.wait(), 5)
 
 
 def test_the_qr_code_reads_as_the_url() -> None:
     pytest.importorskip("segno")
+    assert page_url("127.0.0.1", 8080, secure=False) == "http://127.0.0.1:8080/"
+    assert page_url("::1", 80, secure=True, token="a-b", path="/camera") == "https://[::1]:80/camera#token=a-b"
     url = page_url("192.168.1.7", 8080, secure=False, token="x" * 32)
     plain = qr_text(url, colored=False)
     read, *_ = cv2.QRCodeDetector().detectAndDecode(drawn(plain))
@@ -122,8 +120,7 @@ async def test_the_page_the_stream_and_the_cookie_travel_encrypted(make_certific
     ):
         assert made.url.startswith("https://127.0.0.1:")
         async with client.post(made.url + "enter", json={"token": sessions.invitation(Role.CONTROL)}) as answer:
-            assert answer.status == 200
-            assert "Secure" in answer.headers["Set-Cookie"]
+            assert answer.status == 200 and "Secure" in answer.headers["Set-Cookie"]
         async with client.ws_connect(made.url + "stream") as stream:
             assert (await stream.receive(timeout=5)).type is aiohttp.WSMsgType.BINARY
         async with client.get(made.url) as page:
@@ -135,19 +132,13 @@ async def test_the_page_the_stream_and_the_cookie_travel_encrypted(make_certific
 
 
 async def test_the_address_has_a_name_of_the_certificate(make_certificate: Make) -> None:
+    """Certificate and key may share a file."""
     certificate, key = make_certificate()
-    tls = load_tls(certificate, key)
-    async with made_viewfinder(tls=tls) as made:
-        assert made.url.startswith("https://127.0.0.1:")
-    async with made_viewfinder(tls=tls, host="127.0.0.2") as made:
-        assert made.url.startswith("https://box.local:")
-
-
-def test_certificate_and_key_may_share_a_file(make_certificate: Make, tmp_path: Path) -> None:
-    certificate, key = make_certificate()
-    both = tmp_path / "both.pem"
+    both = certificate.with_name("both.pem")
     both.write_bytes(key.read_bytes() + certificate.read_bytes())
-    assert load_tls(both).names == ("box.local", "127.0.0.1")
+    for host, name in (("127.0.0.1", "127.0.0.1"), ("127.0.0.2", "box.local")):
+        async with made_viewfinder(tls=load_tls(both), host=host) as made:
+            assert made.url.startswith(f"https://{name}:")
 
 
 def test_what_cannot_be_used_is_named(make_certificate: Make, tmp_path: Path) -> None:

@@ -50,8 +50,7 @@ def test_halves_hold_premultiplied_codes_and_alpha(light: list[float], alpha: fl
     # Nothing lies outside the box of the overlay, in neither half.
     outside = np.ones((8, 10), bool)
     outside[2:6, 1:7] = False
-    assert not picture[:8][outside].any()
-    assert not picture[8:][outside].any()
+    assert not picture[:8][outside].any() and not picture[8:][outside].any()
 
 
 def test_over_a_camera_it_gives_what_our_own_composite_gives_where_alpha_is_whole() -> None:
@@ -65,10 +64,7 @@ def test_over_a_camera_it_gives_what_our_own_composite_gives_where_alpha_is_whol
 def test_an_odd_height_and_an_empty_overlay_are_no_trouble() -> None:
     picture = color_over_alpha(overlay([0.5, 0.5, 0.5], 1.0, rows=4, top_px=5), 10, 9, "srgb")
     # The ninth row is left out, so that the seam lies between two rows of chroma.
-    assert picture.shape == (16, 10, 3)
-    assert picture[5:8, 1:7].all()
-    assert picture[8 + 5 : 16, 1:7].all()
-    assert not picture[8 : 8 + 5].any()
+    assert picture.shape == (16, 10, 3) and picture[5:8, 1:7].all() and picture[8 + 5 : 16, 1:7].all() and not picture[8 : 8 + 5].any()
     empty = Overlay(0, 0, np.zeros((0, 0, 3), np.float32), np.zeros((0, 0), np.float32))
     assert not color_over_alpha(empty, 10, 8, "srgb").any()
 
@@ -137,7 +133,8 @@ def test_pictures_arrive_in_the_size_of_the_first(opened: list[FakeCamera]) -> N
     webcam.show(picture(80, 90, 100))
     wait_until(lambda: len(opened[1].sent) == 2)
     webcam.close()
-    device = opened[1]
+    wide, device = fitted(np.full((10, 40, 3), 9, np.uint8), 20, 20), opened[1]
+    assert wide.shape == (20, 20, 3) and not wide[:7].any() and (wide[8:12] == 9).all() and not wide[13:].any()
     assert (device.width, device.height, device.fmt, device.device, device.closed) == (160, 90, "bgr", "/dev/video9", True)
     np.testing.assert_array_equal(device.sent[0], np.full((90, 160, 3), (200, 0, 7), np.uint8))
     assert not device.sent[1][:, :40].any() and not device.sent[1][:, 120:].any()
@@ -156,19 +153,12 @@ def test_a_device_that_is_unplugged_ends_it_with_a_sentence(opened: list[FakeCam
     assert opened[1].closed and "the virtual webcam failed" in caplog.text
 
 
-def test_wide_and_high_pictures_are_fitted() -> None:
-    wide = fitted(np.full((10, 40, 3), 9, np.uint8), 20, 20)
-    assert wide.shape == (20, 20, 3) and not wide[:7].any() and (wide[8:12] == 9).all() and not wide[13:].any()
-
-
-def test_without_the_package_it_says_how_to_get_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_package_it_says_how_to_get_it_and_without_a_device_what_to_load(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyvirtualcam", None)
     with pytest.raises(InputError, match="pip install pyvirtualcam"):
         VirtualWebcam()
-
-
-def test_without_a_device_the_real_library_ends_in_a_sentence() -> None:
-    """Nothing is faked here: pyvirtualcam itself looks for the device."""
+    # Nothing is faked here: pyvirtualcam itself looks for the device.
+    monkeypatch.undo()
     pytest.importorskip("pyvirtualcam")
     with pytest.raises(InputError, match=r"the virtual webcam no-such-device could not be opened .*: on Linux load one with"):
         VirtualWebcam("no-such-device")
