@@ -16,10 +16,14 @@ _PUBLIC = {
     "Lens": "mrbokeh.optics.lens",
     "Psf": "mrbokeh.optics.psf",
     "Renderer": "mrbokeh.renderers.base",
+    "composite": "mrbokeh.api",
+    "merge": "capture.merge_photographs",
     "read_focal_stack": "mrbokeh.stacks.focal_stack",
     "read_image": "mrbokeh.images.image_io",
     "read_layer": "mrbokeh.images.image_io",
     "read_lens": "mrbokeh.optics.lens_file",
+    "read_picture": "mrbokeh.api",
+    "render": "mrbokeh.api",
     "write_image": "mrbokeh.images.image_io",
     "write_layer": "mrbokeh.images.image_io",
     "write_lens": "mrbokeh.optics.lens_file",
@@ -36,3 +40,7 @@ def __getattr__(name: str) -> Any:
     if name not in _PUBLIC:
         raise AttributeError(f"module 'mrbokeh' has no attribute {name!r}")
     return getattr(import_module(_PUBLIC[name]), name)
+
+
+def __dir__() -> list[str]:
+    return [*__all__, "__version__"]

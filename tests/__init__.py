@@ -1,0 +1,5 @@
+"""Tests; types of arguments are checked as type checkers do: a whole number may stand for a float."""
+
+from beartype import BeartypeConf, beartype
+
+checked = beartype(conf=BeartypeConf(is_pep484_tower=True))

@@ -45,13 +45,6 @@ def plate_by(
     return plate if options.matte is None else with_matte(plate, options.matte)
 
 
-def best_mode(plate: Plate) -> str:
-    """Return the best mode that the known data of the plate allow."""
-    if plate.near_alpha is not None or (plate.depth_m is not None and plate.sharp_rgb is not None):
-        return "between"
-    return "over" if plate.depth_m is not None else "front"
-
-
 def _from_space(plate: Plate, photo: Path, space: NamedSpace) -> Plate:
     """The photograph's own numbers, brought from their space to linear Rec.709."""
     if photo.is_dir():

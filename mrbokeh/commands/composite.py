@@ -44,7 +44,6 @@ def composite(
     """
     from mrbokeh.commands._composite_parts import (
         alpha_lost,
-        best_mode,
         blur_told,
         check_outputs,
         layers_by,
@@ -52,7 +51,7 @@ def composite(
         require_options_of_stacks,
         write_results,
     )
-    from mrbokeh.compositing.choose import insertion_of
+    from mrbokeh.compositing.choose import best_mode, insertion_of
     from mrbokeh.compositing.plate_look.finishing import finished, finishing_of
     from mrbokeh.renderers.choose import lens_and_renderer
     from mrbokeh.stacks.capture_bundle import is_bundle, read_bundle

@@ -148,3 +148,10 @@ def insertion_of(mode: str, near_m: float | None = None, *, exact_depth: bool = 
     if mode == "between":
         return InDirtyRectangle(Between(near_depth_m=near_m, refine_edges=not exact_depth))
     return InDirtyRectangle(Rerendered(refine_edges=not exact_depth)) if mode == "rerender" else MODES[mode]
+
+
+def best_mode(plate: Plate) -> str:
+    """Return the best mode that the known data of the plate allow."""
+    if plate.near_alpha is not None or (plate.depth_m is not None and plate.sharp_rgb is not None):
+        return "between"
+    return "over" if plate.depth_m is not None else "front"

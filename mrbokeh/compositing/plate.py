@@ -73,7 +73,7 @@ class Plate:
         if not (0 <= x_px < width and 0 <= y_px < height):
             raise InputError(f"pixel {x_px:g},{y_px:g} lies outside the photograph of {width}x{height} px: choose one within")
         depth_m = float(self.depth_m[int(y_px), int(x_px)])
-        x_m, y_m, z_m = self.camera.unproject(np.array([x_px, y_px]), np.array(depth_m))
+        x_m, y_m, z_m = self.camera.unproject(np.array([x_px, y_px], np.float64), np.array(depth_m))
         return float(x_m), float(y_m), float(z_m)
 
     def length_m(self, pixels: float, depth_m: float) -> float:

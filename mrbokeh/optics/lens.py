@@ -15,7 +15,7 @@ _STEEPEST_TILT_RAD = np.pi / 4
 
 @dataclass(frozen=True)
 class Lens:
-    """Thin lens focused at a distance, in front of a sensor.
+    """Thin lens focused at a distance, in front of a sensor; by default focused at infinity, on a sensor 36 mm wide.
 
     focus_distance_m: from the lens (front principal plane) to the plane in focus, along the axis of the camera (the
       normal of the sensor through the lens); inf is allowed.
@@ -29,8 +29,8 @@ class Lens:
 
     focal_length_mm: float
     f_number: float
-    focus_distance_m: float
-    sensor_width_mm: float
+    focus_distance_m: float = math.inf
+    sensor_width_mm: float = 36.0
     aperture: Aperture = field(default_factory=Aperture.disc)
     tilt_rad: tuple[float, float] = (0.0, 0.0)
     petzval_radius_mm: float = float("inf")

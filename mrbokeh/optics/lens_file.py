@@ -251,8 +251,10 @@ def _from_outline(values: Values) -> Aperture:
 
 
 def read_lens(path: Path | str) -> Lens:
+    """Read a lens file (LENS.json), with the opening that it names. Raises InputError where it does not describe a lens."""
     return lens_from_json(read_json(path, "a lens file (LENS.json)"), str(path), Path(path).parent)
 
 
 def write_lens(path: Path | str, lens: Lens) -> None:
+    """Write a lens file that `read_lens` reads."""
     write_json(path, lens_to_json(lens))

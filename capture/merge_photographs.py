@@ -1,0 +1,70 @@
+"""`mrbokeh.merge`: a focus stack merged in one call, from files or arrays to arrays."""
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from jaxtyping import Float32
+
+from capture.merging.merge import merge_stack
+from capture.stacks.grouping import Grouping
+from capture.stacks.ingest import IngestSettings, ingest
+from mrbokeh.images.image_io import write_image
+from mrbokeh.system.errors import InputError
+
+Plane = Float32[np.ndarray, "height width"]
+
+
+@dataclass(frozen=True)
+class Merged:
+    """A merged focus stack.
+
+    all_in_focus: (H, W, 3) linear Rec.709. focus_index: (H, W) the (fractional) slice in which each pixel is sharp, in the order of
+    their focus. confidence: (H, W) in [0, 1]. depth_m: (H, W) metres, which are guesses unless metres_known. folder: of the stack, for
+    `mrbokeh.composite` and `mrbokeh.read_focal_stack`, or None where none was asked for.
+    """
+
+    all_in_focus: Float32[np.ndarray, "height width 3"]
+    focus_index: Plane
+    confidence: Plane
+    depth_m: Plane
+    metres_known: bool
+    folder: Path | None
+
+
+def merge(photographs: str | Path | Sequence[str | Path | np.ndarray], out: str | Path | None = None) -> Merged:
+    """Merge photographs of one scene at several focus distances, in any order, from a tripod or by hand.
+
+    photographs: a folder, or files (RAW, TIFF, PNG, JPEG, EXR), or linear arrays (H, W, 3) of one size. out: a new folder to keep the
+    FocalStack in. Raises InputError if they do not make one stack.
+
+    >>> merged = mrbokeh.merge("desk/")
+    """
+    given = [photographs] if isinstance(photographs, (str, Path)) else list(photographs)
+    with TemporaryDirectory() as temporary, nullcontext(temporary) if out is None else nullcontext(str(out)) as scene:
+        files = [_file_of(each, Path(temporary) / "arrays", index) for index, each in enumerate(given)]
+        report = ingest(files, Path(scene), IngestSettings(Grouping.none))
+        stacks = [each.stack for each in report.stacks if each.stack is not None]
+        if len(stacks) != 1:
+            raise InputError(f"expected photographs of one focus stack, got {len(stacks)} stacks: merge one at a time")
+        made = merge_stack(stacks[0])
+        return Merged(
+            all_in_focus=made.all_in_focus(),
+            focus_index=made.focus_index(),
+            confidence=made.depth_confidence(),
+            depth_m=made.depth_m(),
+            metres_known=made.metres_known,
+            folder=None if out is None else made.folder,
+        )
+
+
+def _file_of(given: str | Path | np.ndarray, folder: Path, index: int) -> Path:
+    if isinstance(given, (str, Path)):
+        return Path(given)
+    folder.mkdir(exist_ok=True)
+    path = folder / f"{index:04d}.exr"
+    write_image(path, np.asarray(given, np.float32), half=False)
+    return path

@@ -1,0 +1,155 @@
+"""The public verbs on arrays: `mrbokeh.read_picture`, `mrbokeh.render`, `mrbokeh.composite`, with the defaults of the commands.
+
+What may be an array may be the path of a file too. Every error a caller can mend is an `InputError`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32
+
+from mrbokeh.images.layer import Layer, opaque
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.base import Renderer
+from mrbokeh.renderers.choose import DEFAULT
+from mrbokeh.system.errors import InputError
+
+File = str | Path
+Rgb = Float32[np.ndarray, "height width 3"]
+Plane = Float32[np.ndarray, "height width"]
+
+
+def read_picture(path: File) -> Rgb:
+    """Read a photograph (RAW, JPEG, TIFF, PNG, WebP, EXR, HDR), upright, as linear Rec.709 (H, W, 3) of float32; white is 1."""
+    from mrbokeh.stacks.photograph import read_photograph
+
+    return read_photograph(path).rgb
+
+
+def render(
+    picture: np.ndarray | File,
+    depth_m: np.ndarray | File,
+    lens: Lens | File,
+    *,
+    focus: float | tuple[float, float] | None = None,
+    renderer: str | Renderer = DEFAULT,
+) -> Rgb:
+    """Blur an all-in-focus picture with depth as a lens does; return linear Rec.709 (H, W, 3) of float32.
+
+    picture: (H, W, 3) linear, or a file. depth_m: (H, W) metres along the optical axis (inf or <= 0: background), or an EXR with Z.
+    lens: a Lens or a lens file. focus: metres, or the pixel (x, y) to focus on; None keeps the lens's own.
+    renderer: polygon, low-rank, laplacian, lrdm, scatter (exact, slow), the path of a network (.onnx), or a Renderer.
+    Raises InputError if sizes differ or a value is no number.
+
+    >>> blurred = mrbokeh.render(picture, depth_m, mrbokeh.Lens(focal_length_mm=50, f_number=1.8), focus=1.2)
+    """
+    rgb, surface_m = _rgb(picture, "picture"), _depth_of(depth_m)
+    if rgb.shape[:2] != surface_m.shape:
+        raise InputError(f"picture and depth must be of one size, got {rgb.shape[:2]} and {surface_m.shape} (height, width)")
+    return _renderer(renderer).render([opaque(rgb, surface_m)], _focused(_lens(lens), focus, surface_m)).rgb
+
+
+def composite(
+    photo: np.ndarray | File,
+    inserted: Layer | File | Sequence[Layer | File],
+    lens: Lens | File | None = None,
+    *,
+    depth_m: np.ndarray | File | None = None,
+    all_in_focus: np.ndarray | File | None = None,
+    slice_index: int | None = None,
+    focus: float | tuple[float, float] | None = None,
+    at_pixel: tuple[float, float] | None = None,
+    height: float | str | None = None,
+    mode: str | None = None,
+    renderer: str | Renderer = DEFAULT,
+) -> Rgb:
+    """Put virtual objects into a photograph, blurred by its lens, before and behind what it shows; return linear Rec.709 (H, W, 3).
+
+    photo: (H, W, 3) linear, a photograph's file, or the folder of a merged focal stack with the slice_index to put it into.
+    inserted: a GLB file, or sharp layers (Layer or EXR with R, G, B, A and Z in metres) of the photograph's size, front first.
+    lens: a Lens or a lens file; None takes what the file or the stack tells. focus: metres, or a pixel (x, y); needs depth.
+    depth_m: (H, W) metres, or any file that `mrbokeh composite --depth` takes. all_in_focus: the photograph without its blur, if known.
+    at_pixel: (x, y) on which a GLB stands, or to which the depth of layers is scaled. height: of a GLB in metres, or such as "120px".
+    mode: front, over, matte, between or rerender; None takes the best that what is known allows.
+    Raises InputError if something needed is unknown or of the wrong size.
+
+    >>> picture = mrbokeh.composite("scene/desk", "cake.glb", slice_index=2, at_pixel=(600, 420), height="120px")
+    """
+    from mrbokeh.commands._composite_options import ObjectOptions, RenderingOptions
+    from mrbokeh.commands._composite_parts import layers_by, standing_on_pixel
+    from mrbokeh.commands._insertion_options import VirtualOptions
+    from mrbokeh.compositing.choose import best_mode, insertion_of
+    from mrbokeh.compositing.plate import open_plate, plate_of, with_depth
+    from mrbokeh.depth.depth_map import DepthSettings
+    from mrbokeh.images.image_io import read_layer
+
+    known_lens = None if lens is None else _lens(lens)
+    focus_m = None if focus is None or isinstance(focus, tuple) else float(focus)
+    if isinstance(photo, (str, Path)):
+        plate = open_plate(Path(photo), slice_index, known_lens, focus_m)
+    elif known_lens is None:
+        raise InputError("a photograph as an array does not tell its lens: give lens, such as mrbokeh.Lens(focal_length_mm=50, f_number=2)")
+    else:
+        plate = plate_of(_rgb(photo, "photo"), known_lens if focus_m is None else known_lens.focused_at(focus_m))
+    if isinstance(depth_m, (str, Path)):
+        plate = with_depth(plate, Path(depth_m), DepthSettings())
+    elif depth_m is not None:
+        plate = replace(plate, depth_m=_depth_of(depth_m))
+    if all_in_focus is not None:
+        plate = replace(plate, sharp_rgb=_rgb(all_in_focus, "all_in_focus"))
+    if isinstance(focus, tuple):
+        if plate.depth_m is None:
+            raise InputError("to focus on a pixel the photograph needs depth: give depth_m, or focus in metres")
+        plate = replace(plate, lens=_focused(plate.lens, focus, plate.depth_m))
+    given = [inserted] if isinstance(inserted, (Layer, str, Path)) else list(inserted)
+    if len(given) == 1 and not isinstance(given[0], Layer) and Path(given[0]).suffix.lower() == ".glb":
+        stands = None if at_pixel is None else f"{at_pixel[0]},{at_pixel[1]}"
+        standing = ObjectOptions(object_=Path(given[0]), at_pixel=stands, height=None if height is None else str(height))
+        layers = layers_by(VirtualOptions(), standing, RenderingOptions(), plate, None)(plate)
+    else:
+        layers = [each if isinstance(each, Layer) else read_layer(each) for each in given]
+        layers = layers if at_pixel is None else standing_on_pixel(layers, plate, *at_pixel)
+    return insertion_of(mode or best_mode(plate)).insert(plate, layers, _renderer(renderer)).rgb
+
+
+def _rgb(given: np.ndarray | File, name: str) -> Rgb:
+    rgb = read_picture(given) if isinstance(given, (str, Path)) else np.asarray(given)
+    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype.kind != "f":
+        raise InputError(
+            f"{name}: expected linear light as floats of shape (height, width, 3), got {rgb.dtype} {rgb.shape}: read files with "
+            f"mrbokeh.read_picture"
+        )
+    if not np.isfinite(rgb).all():
+        raise InputError(f"{name}: expected numbers, but {int((~np.isfinite(rgb)).any(axis=2).sum())} pixels are NaN or infinite")
+    return np.ascontiguousarray(rgb, np.float32)
+
+
+def _depth_of(given: np.ndarray | File) -> Plane:
+    from mrbokeh.images.image_io import read_depth
+
+    if isinstance(given, (str, Path)):
+        return read_depth(given)
+    depth_m = np.asarray(given, np.float32)
+    if depth_m.ndim != 2 or np.isnan(depth_m).any():
+        raise InputError(f"depth_m: expected metres of shape (height, width), inf where nothing is, got shape {depth_m.shape} or NaN in it")
+    return np.where(depth_m > 0, depth_m, np.float32(np.inf))
+
+
+def _lens(given: Lens | File) -> Lens:
+    from mrbokeh.optics.lens_file import read_lens
+
+    return given if isinstance(given, Lens) else read_lens(given)
+
+
+def _focused(lens: Lens, focus: float | tuple[float, float] | None, depth_m: Plane) -> Lens:
+    if isinstance(focus, tuple):
+        return lens.focused_on(depth_m, focus[0] + 0.5, focus[1] + 0.5)
+    return lens if focus is None else lens.focused_at(float(focus))
+
+
+def _renderer(given: str | Renderer) -> Renderer:
+    from mrbokeh.renderers.choose import make_renderer
+
+    return make_renderer(given) if isinstance(given, str) else given
