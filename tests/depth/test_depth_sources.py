@@ -30,29 +30,34 @@ def png(path: Path, numbers: np.ndarray) -> Path:
     return path
 
 
-def test_exr_is_metres_and_untouched(tmp_path: Path) -> None:
+def test_exr_is_metres_untouched_and_takes_nearest_pixels_so_that_no_depth_is_made_up(tmp_path: Path) -> None:
     depth_m = np.random.default_rng(0).uniform(0.5, 9.0, (24, 32)).astype(np.float32)
     depth_m[3, 4] = np.inf
     write_exr(tmp_path / "z.exr", ExrPart({"Z": depth_m}))
     found = open_depth(tmp_path / "z.exr", GREY)
     np.testing.assert_array_equal(found.depth_m, depth_m)
     assert found.valid.all() and found.note == "z.exr"
-
-
-def test_an_exr_of_another_size_takes_nearest_pixels_so_that_no_depth_is_made_up(tmp_path: Path) -> None:
     depth_m = np.full((12, 16), 4.0, np.float32)
     depth_m[:, :8] = 1.0
     write_exr(tmp_path / "z.exr", ExrPart({"Z": depth_m}))
     assert set(np.unique(open_depth(tmp_path / "z.exr", GREY).depth_m)) == {1.0, 4.0}
 
 
-def test_sixteen_bit_depth_in_steps_of_a_millimetre(tmp_path: Path) -> None:
+def test_sixteen_bit_depth_and_stereo_disparity(tmp_path: Path) -> None:
     """0 is unknown and takes the depth of its nearest known pixel."""
     numbers = np.full((24, 32), 1500, np.uint16)
     numbers[:, 16:], numbers[5, 20] = 2500, 0
     found = open_depth(png(tmp_path / "z.png", numbers), GREY, DepthSettings(metres_per_unit=0.001))
     assert found.depth_m[0, 0] == pytest.approx(1.5) and found.depth_m[5, 20] == pytest.approx(2.5)
     assert not found.valid[5, 20] and found.valid.sum() == 24 * 32 - 1
+    # depth = f b / (d + doffs): 1000 px, 0.2 m and 20 px of offset give 200 / 50 = 4 m for 30 px.
+    disparity = np.full((24, 32), 30.0, np.float32)
+    disparity[0, 0] = np.inf
+    np.savez(tmp_path / "d.npz", disparity)
+    found = open_depth(tmp_path / "d.npz", GREY, DepthSettings(stereo=StereoCalibration(1000.0, 0.2, 20.0)))
+    assert np.allclose(found.depth_m, 4.0) and found.valid.sum() == 24 * 32 - 1
+    with pytest.raises(InputError, match="--stereo"):
+        open_depth(tmp_path / "d.npz", GREY)
 
 
 @pytest.mark.parametrize(("dtype", "full"), [(np.uint8, 255), (np.uint16, 65535)])
@@ -91,17 +96,6 @@ def test_settings_from_text() -> None:
     for wrong in ({"near_far_m": (2.0, 1.0)}, {"metres_per_unit": 0.0}, {"model_gives": "depth"}):
         with pytest.raises(InputError):
             DepthSettings(**wrong)
-
-
-def test_stereo_disparity(tmp_path: Path) -> None:
-    """depth = f b / (d + doffs): 1000 px, 0.2 m and 20 px of offset give 200 / 50 = 4 m for 30 px."""
-    disparity = np.full((24, 32), 30.0, np.float32)
-    disparity[0, 0] = np.inf
-    np.savez(tmp_path / "d.npz", disparity)
-    found = open_depth(tmp_path / "d.npz", GREY, DepthSettings(stereo=StereoCalibration(1000.0, 0.2, 20.0)))
-    assert np.allclose(found.depth_m, 4.0) and found.valid.sum() == 24 * 32 - 1
-    with pytest.raises(InputError, match="--stereo"):
-        open_depth(tmp_path / "d.npz", GREY)
 
 
 def test_motorcycle_of_middlebury(shared_data: Path) -> None:
@@ -160,15 +154,12 @@ def test_no_depth_floats_between_card_and_wall(shrink: int, blur_px: float, shif
     assert wrong.mean() < 0.002 and beyond_a_pixel.mean() < 0.0005
 
 
-def test_a_slanted_floor_stays_slanted() -> None:
+def test_a_slanted_floor_and_a_wire_survive() -> None:
     floor = np.broadcast_to(np.linspace(0.2, 1.5, 48, dtype=np.float32)[:, None], (48, 64)).copy()
     photo = np.random.default_rng(2).uniform(0, 1, (96, 128, 3)).astype(np.float32)
     refined = refined_dioptres(floor, photo)
     np.testing.assert_allclose(refined, cv2.resize(floor, (128, 96)), atol=1e-6)
-
-
-def test_a_wire_survives() -> None:
-    """One pixel of the map wide, before a far wall: snapping must not take its rim for an edge without a near side."""
+    # One pixel of the map wide, before a far wall: snapping must not take its rim for an edge without a near side.
     photo = np.full((96, 128, 3), 0.3, np.float32)
     photo[:, 60:64] = 0.02
     small = np.full((48, 64), 0.25, np.float32)

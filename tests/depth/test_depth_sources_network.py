@@ -87,14 +87,11 @@ def test_a_wrong_sidecar_is_refused(tmp_path: Path) -> None:
             read_network_input(model)
 
 
-def test_any_size_is_the_short_side_in_whole_multiples(tmp_path: Path) -> None:
+def test_any_size_is_whole_multiples_and_padding_is_mirrored_and_cut_away(tmp_path: Path) -> None:
     """32x48 with a short side of 70 in steps of 14: 70 x 105 goes to 70 x 112 (105 / 14 = 7.5, to even 8)."""
     found = predicted(channel_mean(tmp_path / "m.onnx", [1, 3, None, None]), photo(), NetworkInput(short_side_px=70))
     assert found.shape == (70, 112)
-
-
-def test_padding_is_mirrored_and_cut_away(tmp_path: Path) -> None:
-    """A 48x32 picture in a square network of 48: 8 rows above and below are padding; its answer by rows starts at row 9."""
+    # A 48x32 picture in a square network of 48: 8 rows above and below are padding; its answer by rows starts at row 9.
     model = from_height(tmp_path / "m.onnx", [1, 3, 48, 48])
     found = predicted(model, photo(), NetworkInput(fit="pad"))
     np.testing.assert_array_equal(found, np.broadcast_to(np.arange(9, 41, dtype=np.float32)[:, None], SIZE))
@@ -102,12 +99,14 @@ def test_padding_is_mirrored_and_cut_away(tmp_path: Path) -> None:
     np.testing.assert_array_equal(stretched[:, 0], np.arange(1, 49))
 
 
-def test_inverse_depth_is_fitted_between_near_and_far(tmp_path: Path) -> None:
+def test_inverse_depth_is_fitted_and_metric_depth_taken_as_it_is(tmp_path: Path) -> None:
     """Rows 1 to 32 become 1/4 to 1/0.5 dioptres in even steps."""
     model = from_height(tmp_path / "m.onnx", [1, 3, 32, 48])
     found = open_depth(model, photo(), DepthSettings(near_far_m=(0.5, 4.0), refined=False))
     np.testing.assert_allclose(1.0 / found.depth_m[:, 7], np.linspace(0.25, 2.0, 32), rtol=1e-5)
     assert "m.onnx" in found.note
+    found = open_depth(model, photo(), DepthSettings(model_gives="metric", refined=False))
+    np.testing.assert_allclose(found.depth_m[:, 0], np.arange(1, 33), rtol=1e-6)
 
 
 def test_two_known_distances_fix_scale_and_offset(tmp_path: Path) -> None:
@@ -122,12 +121,6 @@ def test_two_known_distances_fix_scale_and_offset(tmp_path: Path) -> None:
     for wrong, words in ((swapped, "swapped"), (one_depth, "different depths"), (outside, "outside")):
         with pytest.raises(InputError, match=words):
             open_depth(model, photo(), wrong)
-
-
-def test_metric_depth_is_taken_as_it_is(tmp_path: Path) -> None:
-    model = from_height(tmp_path / "m.onnx", [1, 3, 32, 48])
-    found = open_depth(model, photo(), DepthSettings(model_gives="metric", refined=False))
-    np.testing.assert_allclose(found.depth_m[:, 0], np.arange(1, 33), rtol=1e-6)
 
 
 def test_what_is_no_depth_network_is_refused(tmp_path: Path) -> None:

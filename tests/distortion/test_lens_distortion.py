@@ -17,14 +17,11 @@ from mrbokeh.system.errors import InputError
 CAMERA = Camera(320, 214, (270.0, 265.0), (158.3, 109.6))
 OPENCV = {"k1": -0.21, "k2": 0.06, "p1": 1.5e-3, "p2": -0.8e-3, "k3": 0.01, "k4": 0.03, "k5": -0.01, "k6": 0.002}
 MODELS = {
-    "barrel": LensDistortion.of("opencv", k1=-0.25, k2=0.08),
-    "pincushion": LensDistortion.of("opencv", k1=0.15, k2=0.02),
-    "rational": LensDistortion.of("opencv", **OPENCV),
-    "fisheye": LensDistortion.of("fisheye", k1=0.02, k2=-0.004, k3=0.001),
-    "ptlens": LensDistortion.of("ptlens", a=0.012, b=-0.035, c=0.01),
-    "poly3": LensDistortion.of("poly3", k1=-0.03),
+    "barrel": LensDistortion.of("opencv", k1=-0.25, k2=0.08), "pincushion": LensDistortion.of("opencv", k1=0.15, k2=0.02),
+    "rational": LensDistortion.of("opencv", **OPENCV), "fisheye": LensDistortion.of("fisheye", k1=0.02, k2=-0.004, k3=0.001),
+    "ptlens": LensDistortion.of("ptlens", a=0.012, b=-0.035, c=0.01), "poly3": LensDistortion.of("poly3", k1=-0.03),
     "poly5": LensDistortion.of("poly5", k1=-0.04, k2=0.01),
-}
+}  # fmt: skip
 
 
 def some_px(camera: Camera = CAMERA, count: int = 400) -> np.ndarray:
@@ -67,20 +64,14 @@ def test_opencv_undistorts_alike() -> None:
     np.testing.assert_allclose(found, np.stack([x, y], axis=-1) + 0.5, atol=5e-5)
 
 
-@pytest.mark.parametrize(
-    ("model", "values"),
-    [
-        ("SIMPLE_PINHOLE", (270.0, 158.3, 109.6)),
-        ("PINHOLE", (270.0, 265.0, 158.3, 109.6)),
-        ("SIMPLE_RADIAL", (270.0, 158.3, 109.6, -0.1)),
-        ("RADIAL", (270.0, 158.3, 109.6, -0.1, 0.03)),
-        ("OPENCV", (270.0, 265.0, 158.3, 109.6, -0.1, 0.03, 1e-3, -2e-3)),
-        ("FULL_OPENCV", (270.0, 265.0, 158.3, 109.6, *OPENCV.values())),
-        ("OPENCV_FISHEYE", (270.0, 265.0, 158.3, 109.6, 0.02, -0.004, 0.001, 2e-4)),
-        ("SIMPLE_RADIAL_FISHEYE", (270.0, 158.3, 109.6, 0.02)),
-        ("RADIAL_FISHEYE", (270.0, 158.3, 109.6, 0.02, -0.004)),
-    ],
-)
+@pytest.mark.parametrize(("model", "values"), [
+    ("SIMPLE_PINHOLE", (270.0, 158.3, 109.6)), ("PINHOLE", (270.0, 265.0, 158.3, 109.6)),
+    ("SIMPLE_RADIAL", (270.0, 158.3, 109.6, -0.1)), ("RADIAL", (270.0, 158.3, 109.6, -0.1, 0.03)),
+    ("OPENCV", (270.0, 265.0, 158.3, 109.6, -0.1, 0.03, 1e-3, -2e-3)),
+    ("FULL_OPENCV", (270.0, 265.0, 158.3, 109.6, *OPENCV.values())),
+    ("OPENCV_FISHEYE", (270.0, 265.0, 158.3, 109.6, 0.02, -0.004, 0.001, 2e-4)),
+    ("SIMPLE_RADIAL_FISHEYE", (270.0, 158.3, 109.6, 0.02)), ("RADIAL_FISHEYE", (270.0, 158.3, 109.6, 0.02, -0.004)),
+])  # fmt: skip
 def test_colmap_projects_alike(model: str, values: tuple[float, ...]) -> None:
     pycolmap = pytest.importorskip("pycolmap")
     theirs = pycolmap.Camera(model=model, width=320, height=214, params=list(values))
@@ -101,16 +92,13 @@ def test_the_inverse_is_exact(name: str) -> None:
     assert np.abs(undistorted - xy_px).max() > 1.0
 
 
-def test_nothing_is_seen_beyond_the_fold() -> None:
+def test_nothing_is_seen_beyond_the_fold_and_nothing_bends_nothing() -> None:
     """r (1 - r^2 / 3) grows up to r = 1, where it is 2/3: points beyond come from nowhere and go nowhere."""
     camera, distortion = Camera(100, 100, (1.0, 1.0), (0.0, 0.0)), LensDistortion.of("opencv", k1=-1.0 / 3.0)
     seen = np.array([[0.66, 0.0], [0.0, -0.66]])
     np.testing.assert_allclose(distortion.distorted_px(distortion.undistorted_px(seen, camera), camera), seen, atol=1e-9)
     assert np.isnan(distortion.undistorted_px(np.array([[0.67, 0.0]]), camera)).all()
     assert np.isnan(distortion.distorted_px(np.array([[1.01, 0.0]]), camera)).all()
-
-
-def test_nothing_bends_nothing() -> None:
     xy_px = some_px()
     for none in (LensDistortion(), LensDistortion.of("opencv"), LensDistortion.of("poly3")):
         assert none.is_none
@@ -120,21 +108,23 @@ def test_nothing_bends_nothing() -> None:
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_a_resized_plate_is_bent_alike(name: str) -> None:
+def test_json_keeps_a_model_that_is_bent_alike_where_a_plate_is_resized(name: str) -> None:
     half = MODELS[name].distorted_px(some_px() / 2, CAMERA.resized(160, 107))
     np.testing.assert_allclose(2 * half, MODELS[name].distorted_px(some_px(), CAMERA), atol=1e-9)
-
-
-@pytest.mark.parametrize("name", MODELS)
-def test_json_keeps_a_model(name: str) -> None:
     assert distortion_from_json(json.loads(json.dumps(distortion_to_json(MODELS[name])))) == MODELS[name]
 
 
-def test_json_takes_names_of_colmap() -> None:
+def test_json_takes_names_of_colmap_and_st_maps_by_their_file(tmp_path: Path) -> None:
     assert distortion_from_json({"model": "RADIAL", "values": [-0.1, 0.02]}) == LensDistortion.of("opencv", k1=-0.1, k2=0.02)
     assert distortion_from_json({"model": "OPENCV_FISHEYE", "values": [0.1, 0.0, 0.0, 0.0]}) == LensDistortion.of("fisheye", k1=0.1)
     assert distortion_from_json({"model": "none"}).is_none
     assert distortion_from_json({"k1": -0.1, "p1": 0.01}) == LensDistortion.of("opencv", k1=-0.1, p1=0.01)
+    uv = st_map_of(MODELS["barrel"], "distort")
+    write_exr(tmp_path / "st.exr", ExrPart({"u": uv[..., 0], "v": uv[..., 1]}))
+    read = distortion_from_json({"model": "st_map", "path": "st.exr"}, folder=tmp_path)
+    assert distortion_to_json(read) == {"model": "st_map", "path": str(tmp_path / "st.exr"), "kind": "distort"}
+    with pytest.raises(InputError, match="made in memory"):
+        distortion_to_json(LensDistortion.from_st_map(StMap(uv)))
 
 
 @pytest.mark.parametrize(
@@ -188,15 +178,6 @@ def test_st_maps_that_cannot_serve(tmp_path: Path) -> None:
         read_st_map(tmp_path / "grey.exr")
     with pytest.raises(InputError, match="distort or undistort"):
         StMap(np.zeros((4, 4, 2)), "redistort")
-
-
-def test_json_names_an_st_map_by_its_file(tmp_path: Path) -> None:
-    uv = st_map_of(MODELS["barrel"], "distort")
-    write_exr(tmp_path / "st.exr", ExrPart({"u": uv[..., 0], "v": uv[..., 1]}))
-    read = distortion_from_json({"model": "st_map", "path": "st.exr"}, folder=tmp_path)
-    assert distortion_to_json(read) == {"model": "st_map", "path": str(tmp_path / "st.exr"), "kind": "distort"}
-    with pytest.raises(InputError, match="made in memory"):
-        distortion_to_json(LensDistortion.from_st_map(StMap(uv)))
 
 
 def test_values_that_are_no_distortion() -> None:

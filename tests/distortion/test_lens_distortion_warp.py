@@ -38,16 +38,13 @@ def test_the_overscan_holds_all_that_the_plate_sees(distortion: LensDistortion) 
     np.testing.assert_array_equal(wide.camera_from_world, PLATE.camera_from_world)
 
 
-def test_barrel_distortion_keeps_the_plates_pixels() -> None:
+def test_barrel_keeps_the_plates_pixels_and_pincushion_takes_more_where_sampling_would_drop() -> None:
     wide = overscan_camera(PLATE, BARREL)
     assert wide.focal_px == PLATE.focal_px
     assert wide.width_px > PLATE.width_px and wide.height_px > PLATE.height_px
     shift = np.asarray(wide.principal_px) - PLATE.principal_px
     np.testing.assert_allclose(shift, np.round(shift), atol=1e-9)
-
-
-def test_pincushion_distortion_takes_more_pixels_where_sampling_would_drop() -> None:
-    """A plate's pixel then covers at least one of the render's, in every direction: singular values of the derivative."""
+    # A plate's pixel then covers at least one of the render's, in every direction: singular values of the derivative.
     wide = overscan_camera(PLATE, PINCUSHION)
     assert wide.focal_px[0] > 1.02 * PLATE.focal_px[0]
     assert wide.focal_px[0] / wide.focal_px[1] == pytest.approx(PLATE.focal_px[0] / PLATE.focal_px[1])
@@ -57,14 +54,11 @@ def test_pincushion_distortion_takes_more_pixels_where_sampling_would_drop() -> 
     assert 0.99 < least < 1.05
 
 
-def test_without_distortion_nothing_happens() -> None:
+def test_without_distortion_nothing_happens_and_whole_pixels_are_cut_off_bit_for_bit() -> None:
     layer = random_layer(PLATE)
     for none in (LensDistortion(), LensDistortion.of("opencv")):
         assert overscan_camera(PLATE, none) is PLATE
         assert distorted(layer, PLATE, PLATE, none) is layer
-
-
-def test_whole_pixels_of_overscan_are_cut_off_bit_for_bit() -> None:
     wide = Camera(340, 230, PLATE.focal_px, (PLATE.principal_px[0] + 7.0, PLATE.principal_px[1] + 9.0))
     layer = random_layer(wide)
     cut = distorted(layer, wide, PLATE, LensDistortion())
@@ -223,7 +217,7 @@ def test_an_st_map_warps_as_its_model() -> None:
     np.testing.assert_allclose(distorted(layer, wide, PLATE, by_map).rgb, distorted(layer, wide, PLATE, BARREL).rgb, atol=5e-2)
 
 
-def test_what_the_lens_cannot_see_is_clear() -> None:
+def test_what_the_lens_cannot_see_is_clear_and_a_layer_of_another_camera_refused() -> None:
     """k1 = -1/3 folds at one focal length from the axis, 2/3 of it in the plate: 0.8 focal lengths to the left is nothing."""
     plate, folds = Camera(160, 40, (100.0, 100.0), (80.0, 20.0)), LensDistortion.of("opencv", k1=-1.0 / 3.0)
     wide = overscan_camera(plate, folds)
@@ -231,8 +225,5 @@ def test_what_the_lens_cannot_see_is_clear() -> None:
     warped = distorted(Layer(np.repeat(full[..., None], 3, axis=2), full, full), wide, plate, folds)
     assert not warped.alpha[:, :10].any() and not warped.alpha[:, -10:].any()
     np.testing.assert_allclose(warped.alpha[:, 20:140], 1.0, rtol=1e-6)
-
-
-def test_a_layer_of_another_camera_is_refused() -> None:
     with pytest.raises(InputError, match="rendered by the overscanned camera"):
         distorted(clear(10, 10), PLATE, PLATE, BARREL)

@@ -110,7 +110,7 @@ def test_parting_does_not_depend_on_threads(seed: int, monkeypatch: pytest.Monke
     assert len(behind.places) == (alone[1][0][..., 3] > 0).sum() > 200
 
 
-def test_antialiased_depth_leaves_nothing_in_the_air() -> None:
+def test_antialiased_depth_leaves_nothing_in_the_air_and_parting_loses_no_light() -> None:
     """A disc at another depth, its depth map resized as pictures are, so that its rim lies at every depth between: the rim's
     pixels take one side or the other, and a steep but even slope stays as it is."""
     rows, columns = np.mgrid[: 4 * SIZE[0], : 4 * SIZE[1]]
@@ -124,9 +124,6 @@ def test_antialiased_depth_leaves_nothing_in_the_air() -> None:
     snapped = np.empty_like(slope)
     snap(snapped, slope, np.zeros(SIZE, bool), 1.0, 0, len(slope))
     np.testing.assert_array_equal(snapped, slope)
-
-
-def test_parting_a_picture_loses_no_light() -> None:
     rng = np.random.default_rng(2)
     values = np.concatenate([rng.uniform(0.0, 1.0, (*SIZE, 3)), np.ones((*SIZE, 1))], axis=2).astype(np.float32)
     coc_px = np.zeros(SIZE, np.float32)

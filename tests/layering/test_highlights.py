@@ -26,15 +26,12 @@ def test_a_light_is_four_times_as_bright_as_most_of_the_25_pixels_around(size: t
     assert size[0] < 40 or 50 < expected.sum() < 300
 
 
-def test_lights_do_not_depend_on_the_bands_they_are_looked_for_in() -> None:
+def test_lights_do_not_depend_on_bands_and_give_way_to_the_median_around_them() -> None:
     values = picture(5, (40, 61))
     in_bands = np.empty((40, 61), np.bool_)
     for top, bottom in ((0, 1), (1, 4), (4, 39), (39, 40)):
         mark_highlights(in_bands, values, top, bottom)
     np.testing.assert_array_equal(in_bands, find_highlights(values))
-
-
-def test_the_median_of_the_surroundings_takes_the_place_of_a_light() -> None:
     values = np.full((9, 9, 4), 0.25, np.float32)
     assert without_highlights(values) is values
     values[4, 4, :3] = 100.0

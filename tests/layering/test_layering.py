@@ -40,7 +40,7 @@ def test_a_slanted_surface_has_no_seams_and_no_dip_of_opacity(slices: int) -> No
     np.testing.assert_array_equal(result.alpha, 1.0)
 
 
-def test_a_slanted_object_over_nothing_stays_opaque_inside() -> None:
+def test_a_slanted_object_over_nothing_stays_opaque_inside_and_its_slices_hardly_show() -> None:
     alpha = np.zeros(SIZE, np.float32)
     alpha[:, 20:76] = 1.0
     card = Layer(np.repeat(alpha[..., None], 3, axis=2), alpha, depth_m(np.linspace(-9.0, 9.0, SIZE[1])).copy())
@@ -48,17 +48,14 @@ def test_a_slanted_object_over_nothing_stays_opaque_inside() -> None:
     # Where the blur shrinks from pixel to pixel a little less light arrives than leaves: 0.9 %, not the 7 % of slices under "over".
     np.testing.assert_allclose(result.alpha[12:-12, 28:68], 1.0, atol=0.01)
     np.testing.assert_allclose(result.rgb[..., 0], result.alpha, atol=1e-6)
-
-
-def test_the_cut_into_slices_hardly_shows() -> None:
-    """One surface, textured: the reference without any slice is a plain scatter, divided by its weights."""
+    # One surface, textured: the reference without any slice is a plain scatter, divided by its weights.
     rng = np.random.default_rng(1)
     slanted = picture(rng.uniform(0.0, 1.0, (*SIZE, 3)), np.linspace(-10.0, 10.0, SIZE[1]))
     one, many = rendered([slanted], slices=1, fill=False), rendered([slanted], slices=12, fill=False)
     assert np.abs(one.rgb - many.rgb).mean() < 0.01
 
 
-def test_what_hides_behind_a_thin_wire_is_interpolated_from_both_sides() -> None:
+def test_what_hides_is_interpolated_from_both_sides_and_real_layers_go_before_it() -> None:
     """A wire of 3 px, blurred by 20 px, over a ramp in focus: where it was the ramp goes on, darkened by the wire's share of the
     disc, which on the wire's axis is the strip of 3 px through the middle of a disc of 20 px: 3 * 20 / (100 pi) to 1 %."""
     ramp = np.linspace(0.2, 1.0, SIZE[1])[None, :, None] * np.ones(3)
@@ -67,10 +64,7 @@ def test_what_hides_behind_a_thin_wire_is_interpolated_from_both_sides() -> None
     result = rendered([picture(rgb, coc_px)])
     # 1.5 %: the formula's own, and what the weights of 8 directions make of a ramp.
     np.testing.assert_allclose(result.rgb[30:40, 47:50, 0] / ramp[0, 47:50, 0], 1.0 - 60.0 / (100.0 * np.pi), atol=0.015)
-
-
-def test_real_layers_go_before_what_is_filled_in() -> None:
-    """Behind a near card lies a second picture, green. Where the lens looks past the card's edge it is seen, not the red beside it."""
+    # Behind a near card lies a second picture, green. Where the lens looks past the card's edge it is seen, not the red beside it.
     rgb, coc_px = np.tile([1.0, 0.0, 0.0], (*SIZE, 1)), np.zeros(SIZE)
     rgb[:, :40], coc_px[:, :40] = 0.0, -24.0
     clean = np.tile([1.0, 0.0, 0.0], (*SIZE, 1))
@@ -114,7 +108,7 @@ def test_the_antialiased_rim_of_a_blurred_lamp_leaves_no_dot() -> None:
     assert result[36, 49] < 2.0 * disc
 
 
-def test_field_cells_meet_their_limit() -> None:
+def test_field_cells_meet_their_limit_and_those_of_a_part_are_those_of_the_whole_frame() -> None:
     """A cat-eye resolved in ever finer cells: halving them brings the result nearer to the finest, and no light is lost."""
     aperture = replace(Aperture.disc(32), cat_eye=0.8)
     rng = np.random.default_rng(3)
@@ -126,11 +120,7 @@ def test_field_cells_meet_their_limit() -> None:
     for each in (coarse, middle, finest):
         np.testing.assert_allclose(each.sum((0, 1)), values.sum((0, 1)), rtol=1e-5)
     assert np.abs(middle - finest).mean() < 0.6 * np.abs(coarse - finest).mean()
-
-
-def test_cells_of_a_part_are_those_of_the_whole_frame() -> None:
-    """Light in a window sees the aperture of its place in the frame, not of its place in the window."""
-    aperture = replace(Aperture.disc(32), cat_eye=0.8)
+    # Light in a window sees the aperture of its place in the frame, not of its place in the window.
     values = np.zeros((*SIZE, 4), np.float32)
     values[60, 80] = 1.0
     coc_px = np.full(SIZE, 14.0, np.float32)

@@ -37,14 +37,11 @@ def test_a_tilted_focus_gives_each_sample_the_blur_of_its_pixel(samples: LightFi
     np.testing.assert_allclose(flat.coc_px(tilted), picture[y, x], rtol=1e-4, atol=1e-4)
 
 
-def test_the_raw_picture_is_the_mean_of_each_pixel() -> None:
+def test_the_raw_picture_is_the_mean_of_each_pixel_and_joined_samples_are_all_of_them(samples: LightFieldSamples) -> None:
     samples = sample_planes([Plane(even(0.3))], 8, 4)
     np.testing.assert_allclose(samples.raw_picture(), 0.3, rtol=1e-6)
     one = replace(samples, rgb=np.where((samples.pixels()[0] == 3)[:, None], samples.rgb, 0).astype(np.float32))
     np.testing.assert_allclose(one.raw_picture()[..., 0], np.where(np.arange(8) == 3, 0.3, 0.0)[None].repeat(8, 0), rtol=1e-6)
-
-
-def test_joined_samples_are_all_of_them(samples: LightFieldSamples) -> None:
     both = joined([samples, samples])
     assert both.count == 2 * samples.count and both.per_pixel == 8.0
     np.testing.assert_array_equal(both.raw_picture(), samples.raw_picture())
@@ -52,19 +49,11 @@ def test_joined_samples_are_all_of_them(samples: LightFieldSamples) -> None:
         joined([samples, replace(samples, width_px=SIZE_PX + 1)])
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "says"),
-    [
-        ("rgb", np.nan, "rgb .* finite"),
-        ("depth_m", 0.0, "positive metres"),
-        ("depth_m", np.nan, "positive metres"),
-        ("xy_px", -3.0, "within the picture"),
-        ("xy_px", 17.0, "within the picture"),
-        ("time", 24.0, "divide it by the exposure"),
-        ("lens_uv", 12.5, "unit pupil"),
-        ("motion_px", np.inf, "motion_px .* finite"),
-    ],
-)
+@pytest.mark.parametrize(("name", "value", "says"), [
+    ("rgb", np.nan, "rgb .* finite"), ("depth_m", 0.0, "positive metres"), ("depth_m", np.nan, "positive metres"),
+    ("xy_px", -3.0, "within the picture"), ("xy_px", 17.0, "within the picture"), ("time", 24.0, "divide it by the exposure"),
+    ("lens_uv", 12.5, "unit pupil"), ("motion_px", np.inf, "motion_px .* finite"),
+])  # fmt: skip
 def test_what_cannot_be_is_refused(samples: LightFieldSamples, name: str, value: float, says: str) -> None:
     wrong = getattr(samples, name).copy()
     wrong[5] = value
@@ -77,17 +66,14 @@ def test_what_cannot_be_is_refused(samples: LightFieldSamples, name: str, value:
         LightFieldSamples(4, 4, *none)
 
 
-def test_an_archive_keeps_every_bit(samples: LightFieldSamples, tmp_path: Path) -> None:
+def test_an_archive_and_exr_keep_every_bit_whatever_the_order(samples: LightFieldSamples, tmp_path: Path) -> None:
     samples.depth_m[7] = np.inf
     write_samples(tmp_path / "samples.npz", samples)
     read = read_samples(tmp_path / "samples.npz")
     assert (read.width_px, read.height_px) == (SIZE_PX, SIZE_PX)
     for name in CHANNELS:
         np.testing.assert_array_equal(getattr(read, name), getattr(samples, name))
-
-
-def test_exr_keeps_every_bit_whatever_the_order(samples: LightFieldSamples, tmp_path: Path) -> None:
-    """Sorted by pixel; within a pixel in the order in which they came. One pixel has a sample less than the others."""
+    # Sorted by pixel; within a pixel in the order in which they came. One pixel has a sample less than the others.
     samples.depth_m[7] = np.inf
     order = np.random.default_rng(3).permutation(samples.count)[:-1]
     shuffled = LightFieldSamples(SIZE_PX, SIZE_PX, *(getattr(samples, name)[order] for name in _FIELDS))
@@ -100,7 +86,7 @@ def test_exr_keeps_every_bit_whatever_the_order(samples: LightFieldSamples, tmp_
     assert [part.name for part in read_exr(tmp_path / "samples.exr")] == ["sample00", "sample01", "sample02", "sample03"]
 
 
-def test_files_that_hold_no_samples_say_so(samples: LightFieldSamples, tmp_path: Path) -> None:
+def test_files_that_hold_no_samples_are_cut_short_or_of_the_future_say_so(samples: LightFieldSamples, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no such file"):
         read_samples(tmp_path / "none.npz")
     with pytest.raises(InputError, match=r"\.npz or \.exr"):
@@ -118,9 +104,6 @@ def test_files_that_hold_no_samples_say_so(samples: LightFieldSamples, tmp_path:
     write_exr(tmp_path / "half.exr", [ExrPart({"R": ones, "Z": ones}, f"sample0{k}") for k in (0, 1)])
     with pytest.raises(InputError, match=r"missing"):
         read_samples(tmp_path / "half.exr")
-
-
-def test_a_file_cut_short_and_one_of_the_future_are_refused(samples: LightFieldSamples, tmp_path: Path) -> None:
     write_samples(tmp_path / "samples.npz", samples)
     whole = (tmp_path / "samples.npz").read_bytes()
     (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])

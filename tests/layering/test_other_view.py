@@ -43,15 +43,12 @@ def seen_by(camera: Camera, with_post: bool = True) -> tuple[np.ndarray, np.ndar
     return rgb.astype(np.float32), depth_m.astype(np.float32)
 
 
-def test_a_view_moved_into_its_own_camera_is_itself() -> None:
+def test_points_land_where_their_parallax_puts_them() -> None:
     rgb, depth_m = seen_by(CAMERA)
     layer = layer_from_view(rgb, depth_m, CAMERA, CAMERA)
     np.testing.assert_array_equal(layer.rgb, rgb)
     np.testing.assert_allclose(layer.depth_m, depth_m, rtol=1e-6)
-
-
-def test_points_land_where_their_parallax_puts_them() -> None:
-    """0.25 m aside the wall moves by 96 * 0.25 / 4 = 6 px and the post by 24: both whole pixels, so colours are kept exactly."""
+    # 0.25 m aside the wall moves by 96 * 0.25 / 4 = 6 px and the post by 24: both whole pixels, so colours are kept exactly.
     rgb, depth_m = seen_by(moved(0.25))
     layer = layer_from_view(rgb, depth_m, moved(0.25), CAMERA)
     expected, _ = seen_by(CAMERA, with_post=False)
@@ -59,6 +56,9 @@ def test_points_land_where_their_parallax_puts_them() -> None:
     assert wall.mean() > 0.65
     np.testing.assert_array_equal(layer.rgb[wall], expected[wall])
     assert (layer.depth_m[:, WIDTH // 2] == np.float32(POST_M)).all(), "the post is where it is"
+    rgb, depth_m = seen_by(CAMERA)
+    with pytest.raises(InputError, match="resize"):
+        layer_from_view(rgb[:-2].copy(), depth_m[:-2].copy(), CAMERA, CAMERA)
 
 
 def test_what_another_view_saw_is_nearer_to_the_truth_than_what_was_guessed() -> None:
@@ -74,9 +74,3 @@ def test_what_another_view_saw_is_nearer_to_the_truth_than_what_was_guessed() ->
     informed = render_layers([picture, *others], lens, spread, layering).rgb
     around = np.s_[:, WIDTH // 2 - 8 : WIDTH // 2 + 8]
     assert psnr(informed[around], truth[around]) > psnr(guessed[around], truth[around]) + 6.0
-
-
-def test_a_view_of_another_size_than_its_camera_is_refused() -> None:
-    rgb, depth_m = seen_by(CAMERA)
-    with pytest.raises(InputError, match="resize"):
-        layer_from_view(rgb[:-2].copy(), depth_m[:-2].copy(), CAMERA, CAMERA)

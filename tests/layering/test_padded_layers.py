@@ -47,7 +47,7 @@ def test_a_lamp_on_the_border_does_not_go_on_as_a_bar() -> None:
     np.testing.assert_array_equal(sheet.values[outside, 0], 0.5)
 
 
-def test_pixels_that_cover_nothing_have_no_circle_of_confusion_and_need_no_depth() -> None:
+def test_pixels_that_cover_nothing_have_no_circle_of_confusion_and_sheets_know_those_that_do() -> None:
     alpha = np.zeros(SIZE, np.float32)
     alpha[3, 4:7] = 0.5
     source = layer(alpha)
@@ -59,9 +59,6 @@ def test_pixels_that_cover_nothing_have_no_circle_of_confusion_and_need_no_depth
     source.depth_m[3, 5] = np.nan
     with pytest.raises(InputError, match="finite circle of confusion"):
         coc_px_of(source, LENS)
-
-
-def test_covered_pixels_of_a_sheet() -> None:
     values = np.zeros((3, 4, 5), np.float32)
     values[1, 2], values[2, 0] = 0.5, 0.25
     sheet = PaddedLayer(values, np.arange(12, dtype=np.float32).reshape(3, 4), False)

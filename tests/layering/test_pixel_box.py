@@ -31,13 +31,10 @@ def test_what_is_cut_comes_back_to_its_place(box: Box) -> None:
     assert np.count_nonzero(whole) == np.count_nonzero(inside.of(PICTURE))
 
 
-def test_beyond_the_border_it_goes_on_or_is_a_value() -> None:
+def test_beyond_the_border_it_goes_on_or_is_a_value_and_boxes_have_sizes() -> None:
     box = Box(-1, 2, 6, 10)
     np.testing.assert_array_equal(box.cut(PICTURE, "edge"), [[6, 7, 7, 7], [6, 7, 7, 7], [14, 15, 15, 15]])
     np.testing.assert_array_equal(box.cut(PICTURE, "constant", -1.0), [[-1, -1, -1, -1], [6, 7, -1, -1], [14, 15, -1, -1]])
-
-
-def test_sizes() -> None:
     box = Box(1, 4, 2, 7)
     assert box.size_px == (3, 5) and box.origin_px == (1, 2) and not box.is_empty and NOWHERE.is_empty
     assert box.grown(3) == Box(-2, 7, -1, 10) and box.grown(3).within(FRAME) == Box(0, 6, 0, 8)
@@ -65,15 +62,12 @@ def test_the_smallest_box_with_light() -> None:
     assert lit_box(glow) == Box(3, 4, 1, 2) and lit_box(replace(glow, extra={"matte": matte})) == Box(3, 5, 1, 7)
 
 
-def test_the_part_is_seen_where_the_whole_sees_it_and_blurred_as_there() -> None:
+def test_the_part_is_seen_and_blurred_as_in_the_whole_where_lenses_blur_alike() -> None:
     camera, box = Camera(8, 6, (9.0, 8.0), (4.2, 2.9)), Box(1, 4, 2, 7)
     part = box.camera_of(camera)
     np.testing.assert_allclose(part.project(np.array([[0.1, 0.2, 1.5]]))[0] + (2, 1), camera.project(np.array([[0.1, 0.2, 1.5]]))[0])
     assert (part.width_px, part.height_px) == (5, 3)
     assert float(box.lens_of(LENS, 8).coc_px(1.3, 5)) == pytest.approx(float(LENS.coc_px(1.3, 8)))
-
-
-def test_which_lenses_blur_alike_everywhere() -> None:
     coloured = replace(LENS.aperture, lateral_chromatic=(0.01, 0.0, -0.01))
     others = [
         replace(LENS, tilt_rad=(0.05, 0.0)),

@@ -132,7 +132,7 @@ def patches(corners: Sequence[tuple[int, int]], size: tuple[int, int]) -> list[P
     return sorted_slices([pixels], [np.ones(len(places), np.float32)], 6.0, size[1], CallingThread())[0][1]
 
 
-def test_light_of_different_islands_does_not_meet_and_neighbours_stay_together() -> None:
+def test_light_of_different_islands_does_not_meet_but_those_too_near_to_pay_are_one() -> None:
     size = (300, 400)
     parts = patches([(10, 10), (10, 22), (150, 200), (280, 390)], size)
     pieces = list(connected_components(parts, 3, size))
@@ -147,10 +147,7 @@ def test_light_of_different_islands_does_not_meet_and_neighbours_stay_together()
         reached.append(lit)
     assert [int(piece[0].runs[:, 1].sum() - piece[0].runs[:, 0].sum()) for piece in pieces] == [32, 16, 16]
     assert np.sum(reached, axis=0).max() == 1
-
-
-def test_islands_too_near_to_pay_are_one() -> None:
-    """Two patches of 4 px with 46 px between: one window of 60 x 60 px costs less than to spread twice."""
+    # Two patches of 4 px with 46 px between: one window of 60 x 60 px costs less than to spread twice.
     parts = patches([(10, 10), (60, 60)], (80, 80))
     assert len(list(connected_components(parts, 3, (80, 80)))) == 1
 
@@ -199,7 +196,7 @@ def test_a_spread_may_return_what_it_was_given() -> None:
         np.testing.assert_allclose(one, expected, atol=1e-6)
 
 
-def test_slices_do_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_slices_do_not_depend_on_threads_and_nothing_renders_as_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Bit for bit."""
     alone = composited(two_sheets(), slicing(DISC), by_depth=False)
     for module in ("system.resources", "layering.slices"):
@@ -208,8 +205,5 @@ def test_slices_do_not_depend_on_threads(monkeypatch: pytest.MonkeyPatch) -> Non
         together = composited(two_sheets(), replace(slicing(DISC), pool=pool), by_depth=False)
     for one, other in zip(alone, together, strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-def test_nothing_at_all_renders_as_nothing() -> None:
     nothing = render_layers([clear(8, 9)], Lens(50.0, 2.0, 2.0, 36.0), SPREAD, Layering())
     assert isinstance(nothing, Layer) and not nothing.rgb.any() and not nothing.alpha.any()

@@ -103,7 +103,7 @@ def test_rows_are_the_convolution_with_the_kernel() -> None:
         np.testing.assert_allclose(rows[:, c] @ picture[:, 0], expected, atol=2e-6)
 
 
-def test_an_aperture_is_its_picture_and_is_mirrored_in_front() -> None:
+def test_an_aperture_is_its_picture_mirrored_in_front_and_projected_on_the_nearest_point() -> None:
     grid = PupilGrid(33)
     picture = grid.of_aperture(HEPTAGON)
     for diameter_px in (12.0, -20.0):
@@ -112,10 +112,7 @@ def test_an_aperture_is_its_picture_and_is_mirrored_in_front() -> None:
         assert kernel.sum(dtype=np.float64) == pytest.approx(1.0, abs=1e-6)
     np.testing.assert_allclose(kernel_of(grid, picture, -20.0), kernel_of(grid, picture, 20.0)[::-1, ::-1], atol=1e-7)
     assert kernel_of(grid, picture, 0.8).shape == (1, 1, 1)
-
-
-def test_projection_on_the_simplex_is_the_nearest_point() -> None:
-    """No point of the simplex is nearer (variational inequality: (v - p).(s - p) <= 0 for all s, and so for its corners)."""
+    # No point of the simplex is nearer (variational inequality: (v - p).(s - p) <= 0 for all s, and so for its corners).
     values = np.random.default_rng(0).standard_normal((5, 7))
     found = on_simplex(values, 3.0)
     np.testing.assert_allclose(found.sum(axis=1), 3.0)
@@ -179,7 +176,7 @@ def test_a_lamp_in_front_of_a_wall_keeps_its_own_blur() -> None:
     assert np.hypot(rows - 30, columns - 40).min() > 4.0
 
 
-def test_shared_evidence_is_the_sum_and_goes_to_all_that_share() -> None:
+def test_shared_evidence_is_the_sum_and_the_simplest_description_is_taken() -> None:
     knots, rng = Knots((5.0, 10.0)), np.random.default_rng(0)
     evidence = Evidence(rng.random((4, 3, 7, 7)).astype(np.float32), rng.random((4, 3, 7)), rng.random(4), np.arange(4))
     merged, fewer = Sharing(colours=True, diameters=True).merged(evidence, knots)
@@ -191,10 +188,7 @@ def test_shared_evidence_is_the_sum_and_goes_to_all_that_share() -> None:
     np.testing.assert_allclose(both.energies, np.tile(evidence.energies[:2] + evidence.energies[2:], 2))
     spread = Sharing(colours=True, diameters=True).spread(merged.sides, knots, 3)
     np.testing.assert_array_equal(spread[2:], np.broadcast_to(merged.sides[1], (2, 3, 7)))
-
-
-def test_the_simplest_description_within_the_standard_error_is_taken() -> None:
-    """Squares are worse than the best by 1, 1.2 and 1.1 of everything (error 0.06), by -0.5, 0.6, 0.2 (0.32, mean 0.1), by nothing."""
+    # Squares are worse than the best by 1, 1.2 and 1.1 of everything (error 0.06), by -0.5, 0.6, 0.2 (0.32, mean 0.1), by nothing.
     squares = np.array([[11.0, 11.2, 11.1], [9.5, 10.6, 10.2], [10.0, 10.0, 10.0]])
     assert simplest_of(np.sqrt(squares).tolist()) == 1
     assert simplest_of(np.sqrt(squares[[0, 2]]).tolist()) == 1
@@ -310,7 +304,7 @@ def test_the_command_writes_a_bank_that_renders(tmp_path: Path) -> None:
         run("fit", stack.folder, "--out", out)
 
 
-def test_a_bank_over_the_field() -> None:
+def test_a_bank_over_the_field_whose_axes_go_both_ways() -> None:
     """Nine regions give nine kernels per diameter; each place takes its own region's."""
     knots = Knots((10.0,), (3, 3), highs=(0.8, 0.6))
     grid = PupilGrid(21)
@@ -323,9 +317,6 @@ def test_a_bank_over_the_field() -> None:
         own = bank.kernel_at(np.array([10.0, *place]))[..., 0]
         alike = [likeness(own, kernel_of(grid, each.T, 10.0)[..., 0]) for each in pictures[9:]]
         assert alike[field] > 0.5 and int(np.argmax(alike)) == field
-
-
-def test_axes_of_the_field_go_both_ways() -> None:
     axis = Axis("field_x", -0.8, 0.8)
     np.testing.assert_allclose(axis.to_unit(np.array([-0.8, -0.4, 0.0, 0.8])), [0.0, 0.25, 0.5, 1.0])
     np.testing.assert_allclose(axis.from_unit(axis.to_unit(np.array([-0.3, 0.7]))), [-0.3, 0.7])

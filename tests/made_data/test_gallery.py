@@ -85,16 +85,13 @@ def test_what_a_check_finds_is_its_result(tmp_path: Path) -> None:
     assert sorted(each.name for each in tmp_path.iterdir()) == ["out", "report.html"]
 
 
-def test_pictures_stand_side_by_side_and_long_sheets_are_cut(tmp_path: Path) -> None:
+def test_pictures_stand_side_by_side_long_sheets_are_cut_and_linear_ones_shown_as_light(tmp_path: Path) -> None:
     """Both 20 px high, the larger at half its size; of a sheet as high as wide 0.9 of the height are shown."""
     for name, height, width in (("small.png", 20, 30), ("large.png", 40, 100), ("sheet.png", 200, 200)):
         write_image(tmp_path / name, np.full((height, width, 3), 0.3, np.float32))
     assert decoded(result_jpeg(tmp_path / "small.png", tmp_path / "large.png")).shape == (20, 80, 3)
     assert decoded(result_jpeg(tmp_path / "sheet.png")).shape == (180, 200, 3)
-
-
-def test_linear_pictures_are_shown_as_light(tmp_path: Path) -> None:
-    """Linear 0.2140 is half of sRGB's range, 128 of 255."""
+    # Linear 0.2140 is half of sRGB's range, 128 of 255.
     write_image(tmp_path / "grey.exr", np.full((40, 2000, 3), 0.2140, np.float32))
     shown = decoded(result_jpeg(tmp_path / "grey.exr"))
     assert shown.shape == (19, WIDEST_PX, 3)

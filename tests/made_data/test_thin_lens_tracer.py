@@ -124,7 +124,7 @@ def test_what_lies_in_the_focus_plane_is_as_sharp_as_a_pinhole_sees_it() -> None
     np.testing.assert_allclose(depth_m, 1.0, rtol=1e-6)
 
 
-def test_depth_is_along_the_axis_for_a_turned_camera() -> None:
+def test_a_wider_footprint_is_a_box_filter_and_depth_is_along_the_axis_for_a_turned_camera() -> None:
     """Pixel and depth unprojected by Camera lie on the sphere that was traced."""
     ball = Sphere((-0.0338, 0.0051, 1.1996), 0.003, plain_texture((0.5, 0.5, 0.5)))
     angle = 0.02
@@ -135,10 +135,7 @@ def test_depth_is_along_the_axis_for_a_turned_camera() -> None:
     points_m = cam.unproject(cam.pixel_centres_px(), np.where(hit, depth_m, 1.0))[hit]
     assert 300 < hit.sum() < hit.size
     np.testing.assert_allclose(np.linalg.norm(points_m - ball.centre_m, axis=1), ball.radius_m, atol=2e-6)
-
-
-def test_a_wider_footprint_is_a_box_filter() -> None:
-    """An optical low-pass filter of 2 px: each value of a vertical edge's profile is the mean over two pixels' width."""
+    # An optical low-pass filter of 2 px: each value of a vertical edge's profile is the mean over two pixels' width.
     picture = trace_pinhole(edge_scene(1.0), camera(LENS), 512, footprint_px=2.0)[0][..., 0].mean(axis=0)
     middle = SIZE_PX // 2
     np.testing.assert_allclose(picture[middle - 2 : middle + 2], [0.0, 0.25, 0.75, 1.0], atol=0.005)
@@ -154,14 +151,11 @@ def test_a_ring_aperture_leaves_its_middle_dark() -> None:
     assert picture.sum() == pytest.approx(expected, rel=0.01)
 
 
-def test_the_seed_decides_every_pixel() -> None:
+def test_the_seed_decides_every_pixel_and_a_camera_with_another_focal_length_is_refused() -> None:
     texture = np.random.default_rng(0).random((64, 64, 3)).astype(np.float32)
     scene = wall(1.3, texture, half_m=0.008)
     first, again, other = (trace(scene, camera(LENS), LENS, 32, seed) for seed in (5, 5, 6))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-4
-
-
-def test_a_camera_with_another_focal_length_is_refused() -> None:
     with pytest.raises(InputError, match="camera_for_lens"):
         trace(Scene(), camera(LENS), LENS.focused_at(0.5), 16)

@@ -9,23 +9,15 @@ from mrbokeh.system.errors import InputError
 
 SQUARE = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
 APERTURES = {
-    "disc": Aperture.disc(),
-    "triangle": Aperture.blades(3, 0.1),
-    "hexagon": Aperture.blades(6),
-    "heptagon": Aperture.blades(7, 0.5),
-    "curved": Aperture.blades(5, 0.3, curvature=0.5),
-    "hollow": Aperture.blades(5, 0.3, curvature=-0.8),
-    "ring": Aperture.ring(0.6),
-    "star": Aperture.star(5, 0.4),
-    "heart": Aperture.heart(),
-    "anamorphic": Aperture.blades(6).squeezed(2.0),
-}
+    "disc": Aperture.disc(), "triangle": Aperture.blades(3, 0.1), "hexagon": Aperture.blades(6),
+    "heptagon": Aperture.blades(7, 0.5), "curved": Aperture.blades(5, 0.3, curvature=0.5),
+    "hollow": Aperture.blades(5, 0.3, curvature=-0.8), "ring": Aperture.ring(0.6), "star": Aperture.star(5, 0.4),
+    "heart": Aperture.heart(), "anamorphic": Aperture.blades(6).squeezed(2.0),
+}  # fmt: skip
 REACHING_OUT = {
-    "square": Aperture((SQUARE,), (1.0,)),
-    "displaced disc": Aperture((Aperture.disc().outlines[0] + [0.3, -0.1],), (1.0,)),
-    "wide": Aperture.disc().squeezed(0.5),
-    "disc": Aperture.disc(),
-}
+    "square": Aperture((SQUARE,), (1.0,)), "displaced disc": Aperture((Aperture.disc().outlines[0] + [0.3, -0.1],), (1.0,)),
+    "wide": Aperture.disc().squeezed(0.5), "disc": Aperture.disc(),
+}  # fmt: skip
 
 
 def coverage_by_clipping(aperture: Aperture, diameter_px: float) -> np.ndarray:

@@ -10,12 +10,9 @@ from mrbokeh.optics.aperture_shapes import centroid, net_area
 from mrbokeh.system.errors import InputError
 
 SHAPES = {
-    "disc": Aperture.disc(),
-    "blades": Aperture.blades(7, 0.2, 0.4),
-    "ring": Aperture.ring(0.6),
-    "heart": Aperture.heart(),
+    "disc": Aperture.disc(), "blades": Aperture.blades(7, 0.2, 0.4), "ring": Aperture.ring(0.6), "heart": Aperture.heart(),
     "star": Aperture.star(),
-}
+}  # fmt: skip
 COLOURS = (0.1, 0.0, -0.1)
 MODIFIERS = {"cat_eye": 0.6, "spherical_aberration": 0.7, "axial_chromatic": COLOURS, "lateral_chromatic": COLOURS}
 CORNER = (0.8, 0.6)
@@ -64,13 +61,10 @@ def test_all_together_leave_a_sum_of_one_and_no_negative_light(name: str, diamet
             assert kernel.sum() == pytest.approx(1.0, rel=1e-12) and kernel.min() > -1e-15
 
 
-def test_what_varies_with_what() -> None:
+def test_what_is_seen_is_plain_kept_and_varies_as_its_modifiers_do() -> None:
     changed = {name: replace(Aperture.disc(), **{name: value}) for name, value in MODIFIERS.items()}
     assert {name for name, aperture in changed.items() if aperture.varies_over_field} == {"cat_eye", "lateral_chromatic"}
     assert {name for name, aperture in changed.items() if aperture.is_chromatic} == {"axial_chromatic", "lateral_chromatic"}
-
-
-def test_what_is_seen_is_plain_and_kept() -> None:
     aperture = replace(Aperture.heart(), **MODIFIERS)
     seen = aperture.seen(-1, CORNER, 2)
     assert seen.is_plain and aperture.seen(-1, CORNER, 2) is seen and aperture.seen(1, CORNER, 2) is not seen
@@ -78,9 +72,6 @@ def test_what_is_seen_is_plain_and_kept() -> None:
         aperture.packed()
     with pytest.raises(InputError, match="side"):
         aperture.seen(0, CORNER)
-
-
-def test_shapes_keep_their_modifiers() -> None:
     changed = replace(Aperture.disc(), **MODIFIERS)
     for again in (changed.obstructed(0.5), changed.squeezed(1.5), changed.rotated(0.1)):
         assert all(getattr(again, name) == value for name, value in MODIFIERS.items())
@@ -93,30 +84,21 @@ def test_a_cat_eye_leaves_the_overlap_of_two_discs(cat_eye: float) -> None:
         assert light(seen) / np.pi == pytest.approx(overlap_of_discs(abs(cat_eye) * share), rel=1e-3)
 
 
-def test_a_cat_eye_over_a_ring_keeps_the_whole_stop_while_the_rim_does_not_reach_it() -> None:
+def test_a_cat_eye_is_the_opening_itself_in_the_middle_and_its_front_rim_leaves_the_half_towards_it() -> None:
+    """By symmetry the lens-shaped opening has its centroid halfway between both discs, at -cat_eye / 2 times the field."""
+    np.testing.assert_allclose(middle(replace(Aperture.disc(), cat_eye=0.6).seen(1, CORNER)), [-0.24, -0.18], atol=1e-3)
+    np.testing.assert_allclose(middle(replace(Aperture.disc(), cat_eye=-0.6).seen(1, CORNER)), [0.24, 0.18], atol=1e-3)
+    for shape in SHAPES.values():
+        assert replace(shape, cat_eye=0.8).seen(1, (0.0, 0.0)).outlines[0] is shape.outlines[0]
     seen = replace(Aperture.ring(0.4), cat_eye=0.5).seen(1, CORNER)
     assert light(seen) / np.pi == pytest.approx(overlap_of_discs(0.5) - 0.4**2, rel=1e-3)
 
 
-def test_the_front_rim_leaves_the_half_towards_the_middle_of_the_frame() -> None:
-    """By symmetry the lens-shaped opening has its centroid halfway between both discs, at -cat_eye / 2 times the field."""
-    np.testing.assert_allclose(middle(replace(Aperture.disc(), cat_eye=0.6).seen(1, CORNER)), [-0.24, -0.18], atol=1e-3)
-    np.testing.assert_allclose(middle(replace(Aperture.disc(), cat_eye=-0.6).seen(1, CORNER)), [0.24, 0.18], atol=1e-3)
-
-
-def test_in_the_middle_of_the_frame_a_cat_eye_is_the_opening_itself() -> None:
-    for shape in SHAPES.values():
-        assert replace(shape, cat_eye=0.8).seen(1, (0.0, 0.0)).outlines[0] is shape.outlines[0]
-
-
-def test_a_rim_may_cut_an_opening_into_parts() -> None:
+def test_a_rim_may_cut_an_opening_into_parts_or_hide_it() -> None:
     """A U, 1.2 wide, with arms 0.2 wide: a rim displaced upwards by 0.6 (reaching down to 0.4) cuts off its foot."""
     u_shape = np.array([[-0.6, -0.6], [-0.4, -0.6], [-0.4, 0.5], [0.4, 0.5], [0.4, -0.6], [0.6, -0.6], [0.6, 0.7], [-0.6, 0.7]])
     seen = Aperture((u_shape,), (1.0,), cat_eye=0.6).seen(1, (0.0, 1.0))
     assert seen.weights == (1.0, 1.0) and len(seen.outlines) == 2
-
-
-def test_an_opening_that_the_rim_hides_is_an_error() -> None:
     far_left = Aperture((np.array([[-1.0, -0.1], [-0.9, -0.1], [-0.9, 0.1]]),), (1.0,), cat_eye=1.0)
     with pytest.raises(InputError, match="no light passes"):
         far_left.seen(1, (-1.0, 0.0))
@@ -138,39 +120,30 @@ def test_spherical_aberration_weights_by_the_square_of_the_radius(strength: floa
             assert there == pytest.approx(1 + side * strength * (2 * rho**2 - 1), abs=abs(strength) / zones + 0.01)
 
 
-def test_spherical_aberration_turns_with_the_side() -> None:
+def test_spherical_aberration_turns_with_the_side_and_leaves_a_hole_dark() -> None:
     """Over-correction behind the focus is under-correction in front: the same polygons, bit for bit."""
     one, other = (replace(Aperture.heart(), spherical_aberration=sign * 0.6) for sign in (1, -1))
     assert one.seen(1).weights == other.seen(-1).weights
     for a, b in zip(one.seen(1).outlines, other.seen(-1).outlines, strict=True):
         np.testing.assert_array_equal(a, b)
     assert one.rasterize(41.0).kernel[20, 20] < one.rasterize(-41.0).kernel[20, 20], "positive: dark middle behind the focus"
-
-
-def test_spherical_aberration_leaves_the_hole_of_a_ring_dark_and_drops_what_cancels() -> None:
     seen = replace(Aperture.ring(0.6), spherical_aberration=1.0).seen(1)
     assert abs(seen.rasterize(61.0).kernel[30, 30]) < 1e-12
     inside = [outline for outline in seen.outlines if np.hypot(*outline.T).max() < 0.59]
     assert not inside
 
 
-def test_axial_chromatic_scales_the_diameter_and_turns_with_the_side() -> None:
+def test_chromatic_errors_scale_and_displace_the_pupil_of_a_colour() -> None:
     aperture = replace(Aperture.disc(), axial_chromatic=(0.1, 0.0, -0.2))
     assert aperture.channel_scale(1) == pytest.approx((1.1, 1.0, 0.8))
     assert aperture.channel_scale(-1) == pytest.approx((0.9, 1.0, 1.2))
     assert aperture.seen(1, CORNER, 0).outlines[0] is aperture.outlines[0]
-
-
-def test_lateral_chromatic_displaces_the_pupil_of_a_colour_along_the_field() -> None:
     aperture = replace(Aperture.heart(), lateral_chromatic=(0.1, 0.0, -0.2))
     np.testing.assert_allclose(middle(aperture.seen(1, CORNER, 0)), [0.08, 0.06], atol=1e-12)
     np.testing.assert_allclose(middle(aperture.seen(-1, CORNER, 2)), [-0.16, -0.12], atol=1e-12)
     for channel, field_xy in ((1, CORNER), (None, CORNER), (0, (0.0, 0.0))):
         assert aperture.seen(1, field_xy, channel).outlines[0] is aperture.outlines[0]
-
-
-def test_lateral_chromatic_grows_with_the_blur_and_turns_with_its_sign() -> None:
-    """The kernel's centroid lies at 0.1 times the field times half the signed diameter; in focus it is in register."""
+    # The kernel's centroid lies at 0.1 times the field times half the signed diameter; in focus it is in register.
     aperture = replace(Aperture.disc(), lateral_chromatic=(0.1, 0.0, 0.0))
     for diameter_px in (-40.0, 10.0, 40.0):
         kernel = kernel_of(aperture, diameter_px, (1.0, 0.0), 0)

@@ -39,7 +39,7 @@ def test_blades_have_the_area_of_a_polygon_with_circular_segments(count: int, cu
     assert area(blades(count, 0.4, curvature)) == pytest.approx(expected, abs=6e-3)  # a 64-gon in the unit circle lacks 0.005
 
 
-def test_the_vertices_of_curved_blades_lie_on_circles_of_their_radius() -> None:
+def test_the_vertices_of_curved_blades_lie_on_circles_of_their_radius_inwards_too() -> None:
     """The first blade of a pentagon of curvature 1/2 (McGraw Fig. 7 left): distance 2 from its centre beyond the middle."""
     outline = blades(5, 0.0, 0.5)
     first = outline[: len(outline) // 5 + 1]
@@ -48,10 +48,7 @@ def test_the_vertices_of_curved_blades_lie_on_circles_of_their_radius() -> None:
     centre = chord_middle / apothem * (apothem - np.sqrt(2.0**2 - half_chord**2))
     np.testing.assert_allclose(np.hypot(*(first - centre).T), 2.0, rtol=1e-12)
     np.testing.assert_allclose(np.hypot(*blades(5, 0.0, 1.0).T), 1.0, rtol=1e-12)
-
-
-def test_four_inward_blades_of_the_pupils_radius_make_an_astroid_of_quarter_circles() -> None:
-    """The unit square's diagonal is 2; four quarter discs of radius 1 between its corners leave 4 - pi."""
+    # The unit square's diagonal is 2; four quarter discs of radius 1 between its corners leave 4 - pi.
     assert area(blades(4, 0.0, -1.0)) == pytest.approx(4 - np.pi, rel=1e-2)
 
 
@@ -76,14 +73,10 @@ def test_a_star_has_the_area_of_its_triangles(points: int, inner: float) -> None
     np.testing.assert_allclose(Aperture.star(points, inner).outlines[0][0], [0.0, -1.0], atol=1e-15)
 
 
-def test_a_heart_has_the_area_of_its_curve() -> None:
+def test_a_heart_has_the_area_of_its_curve_is_symmetric_and_stays_in_place() -> None:
     """Green's theorem: the curve encloses 180 pi and is 32 wide."""
     heart = Aperture.heart()
     assert light(heart) / width(heart) ** 2 == pytest.approx(180 * np.pi / 32**2, rel=3e-3)
-
-
-def test_a_heart_is_symmetric_stands_on_its_tip_and_stays_in_place() -> None:
-    heart = Aperture.heart()
     outline = heart.outlines[0]
     np.testing.assert_allclose(np.sort(outline[:, 0]), np.sort(-outline[:, 0]), atol=1e-12)
     np.testing.assert_allclose(middle(heart), 0.0, atol=1e-12)
@@ -101,9 +94,10 @@ def test_squeeze_divides_the_width(squeeze: float) -> None:
     assert width(squeezed) == pytest.approx(width(Aperture.disc()) / squeeze)
 
 
-def test_neutral_changes_return_the_same_aperture() -> None:
+def test_neutral_changes_return_the_same_aperture_and_turns_go_from_x_to_y() -> None:
     disc = Aperture.disc()
     assert disc.squeezed(1.0) is disc and disc.rotated(0.0) is disc and disc.obstructed(0.0) is disc
+    np.testing.assert_allclose(Aperture.blades(5).rotated(0.3).outlines[0], Aperture.blades(5, 0.3).outlines[0], atol=1e-15)
 
 
 REFUSED = [
@@ -122,25 +116,15 @@ def test_openings_that_cannot_be_are_refused(make: Callable[..., Aperture], of: 
         make(*of)
 
 
-def test_rotation_turns_from_x_to_y() -> None:
-    np.testing.assert_allclose(Aperture.blades(5).rotated(0.3).outlines[0], Aperture.blades(5, 0.3).outlines[0], atol=1e-15)
-
-
-def test_a_drawn_disc_is_traced_to_a_fraction_of_a_pixel() -> None:
+def test_drawn_discs_rings_and_bars_are_traced() -> None:
     traced = Aperture.from_picture(smooth_disc(100, (43.2, 55.7), 30.4))
     radii = np.hypot(*traced.outlines[0].T)
     assert radii.min() > 1 - 0.25 / 30.4 and radii.max() == pytest.approx(1.0)
     assert light(traced) == pytest.approx(np.pi, rel=1e-2)
-
-
-def test_a_drawn_ring_has_a_hole() -> None:
     traced = Aperture.from_picture(smooth_disc(128, (64.0, 64.0), 50.0) - smooth_disc(128, (64.0, 64.0), 20.0))
     assert traced.weights == (1.0, -1.0)
     assert area(traced.outlines[1]) / area(traced.outlines[0]) == pytest.approx((20 / 50) ** 2, rel=2e-2)
-
-
-def test_a_drawing_may_touch_the_border_and_have_parts() -> None:
-    """Two bars of 10 x 40 and 20 x 40 pixels: the light's centroid divides their distance 1 : 2."""
+    # Two bars of 10 x 40 and 20 x 40 pixels: the light's centroid divides their distance 1 : 2.
     picture = np.zeros((40, 80), np.float32)
     picture[:, :10] = picture[:, 60:] = 3.0
     traced = Aperture.from_picture(picture)
@@ -161,7 +145,7 @@ def test_grey_is_rendered_by_levels() -> None:
     assert right / (right - starts[0] + np.diff(starts).mean() / 2) == pytest.approx(1 / 3, abs=0.005)
 
 
-def test_svg_circles_and_curves_have_their_areas() -> None:
+def test_svg_curves_have_their_areas_and_subpaths_follow_the_even_odd_rule() -> None:
     """A parabola over its chord: 2/3 of base times height; the cubic with both controls 1 above the chord's ends: 3/5."""
     circle = Aperture.from_outline("M 30 50 a 20 20 0 1 0 40 0 a 20,20 0 1 0 -40,0 z")
     assert light(circle) / width(circle) ** 2 == pytest.approx(np.pi / 4, rel=2e-3)
@@ -169,9 +153,6 @@ def test_svg_circles_and_curves_have_their_areas() -> None:
     assert light(parabola) / width(parabola) ** 2 == pytest.approx(1 / 3, rel=2e-3)
     cubic = Aperture.from_outline("m0,0 c0,1 1,1 1,0 z")
     assert light(cubic) / width(cubic) ** 2 == pytest.approx(0.6, rel=3e-3)
-
-
-def test_svg_subpaths_follow_the_even_odd_rule() -> None:
     framed = Aperture.from_outline("M0 0H4V4H0Z M1 1h2v2h-2z")
     assert framed.weights == (1.0, -1.0)
     assert light(framed) / width(framed) ** 2 == pytest.approx(12 / 16)

@@ -51,15 +51,13 @@ def test_an_upright_picture_has_the_blur_of_the_level_one(tmp_path: Path) -> Non
     assert upright.camera.focal_px == pytest.approx(level.camera.focal_px)
 
 
-def test_a_picture_that_was_turned_before_is_asked_about(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_upright_pictures_are_told_and_turned_ones_asked_about(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Without a turn in its EXIF it could be a cut; sensor_height_mm decides it."""
     path = photo(tmp_path / "photo.jpg", (64, 96))
     assert open_plate(path, lens=LEVEL).lens.sensor_width_mm == 36.0
     assert "higher than wide and does not say that it was turned" in caplog.text and "sensor_height_mm" in caplog.text
     assert open_plate(path, lens=replace(LEVEL, sensor_height_mm=24.0)).lens.sensor_width_mm == pytest.approx(24.0)
-
-
-def test_one_line_says_what_was_taken(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.clear()
     open_plate(photo(tmp_path / "level.jpg", (96, 64)), lens=LEVEL)
     open_plate(photo(tmp_path / "made_for.jpg", (96, 64), 6), lens=UPRIGHT)
     assert not caplog.text

@@ -23,18 +23,13 @@ def new(path: Path, *options: object) -> Lens:
     return read_lens(path)
 
 
-@pytest.mark.parametrize(
-    ("options", "expected"),
-    [
-        ([], Aperture.disc()),
-        (["--blades", 7, "--rotation", 30], Aperture.blades(7, np.pi / 6)),
-        (["--blades", 5, "--curvature", 0.5], Aperture.blades(5, 0.0, 0.5)),
-        (["--shape", "ring", "--inner", 0.6], Aperture.ring(0.6)),
-        (["--shape", "star", "--blades", 6, "--inner", 0.5], Aperture.star(6, 0.5)),
-        (["--shape", "heart", "--squeeze", 2], Aperture.heart().squeezed(2.0)),
-        (["--shape", "outline", "--path", "M0 0H1V1Z"], Aperture.from_outline("M0 0H1V1Z")),
-    ],
-)
+@pytest.mark.parametrize(("options", "expected"), [
+    ([], Aperture.disc()), (["--blades", 7, "--rotation", 30], Aperture.blades(7, np.pi / 6)),
+    (["--blades", 5, "--curvature", 0.5], Aperture.blades(5, 0.0, 0.5)), (["--shape", "ring", "--inner", 0.6], Aperture.ring(0.6)),
+    (["--shape", "star", "--blades", 6, "--inner", 0.5], Aperture.star(6, 0.5)),
+    (["--shape", "heart", "--squeeze", 2], Aperture.heart().squeezed(2.0)),
+    (["--shape", "outline", "--path", "M0 0H1V1Z"], Aperture.from_outline("M0 0H1V1Z")),
+])  # fmt: skip
 def test_shapes(tmp_path: Path, options: list[object], expected: Aperture) -> None:
     made = new(tmp_path / "lens.json", *options).aperture
     assert made.weights == expected.weights
@@ -59,16 +54,11 @@ def test_modifiers_tilt_and_curvature(tmp_path: Path) -> None:
     assert lens.tilt_rad == pytest.approx(tuple(np.radians([1, -2]))) and lens.petzval_radius_mm == 75.0
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--inner", 0.5], "--inner does nothing for the shape disc"),
-        (["--shape", "heart", "--blades", 5], "--blades does nothing for the shape heart"),
-        (["--shape", "blob"], "expected --shape out of"),
-        (["--shape", "ring"], "inner missing"),
-        (["--cat-eye", 3], "cat_eye"),
-    ],
-)
+@pytest.mark.parametrize(("options", "message"), [
+    (["--inner", 0.5], "--inner does nothing for the shape disc"),
+    (["--shape", "heart", "--blades", 5], "--blades does nothing for the shape heart"),
+    (["--shape", "blob"], "expected --shape out of"), (["--shape", "ring"], "inner missing"), (["--cat-eye", 3], "cat_eye"),
+])  # fmt: skip
 def test_options_wired_to_nothing_are_refused(tmp_path: Path, options: list[object], message: str) -> None:
     with pytest.raises(InputError, match=message):
         new(tmp_path / "lens.json", *options)
@@ -80,7 +70,7 @@ COLOURED = Aperture(
 )  # fmt: skip
 
 
-def test_kernels_in_colour() -> None:
+def test_kernels_in_colour_and_the_sheet_shows_what_the_lens_has() -> None:
     """The blur of red is 1.1, of blue 0.9 times as wide; each colour keeps its light."""
     kernel = kernel_rgb(COLOURED, 30.0)
     np.testing.assert_allclose(kernel.sum((0, 1)), 1.0, rtol=1e-12)
@@ -89,8 +79,6 @@ def test_kernels_in_colour() -> None:
     grey = kernel_rgb(Aperture.disc(), 30.0)
     np.testing.assert_array_equal(grey[..., 0], grey[..., 2])
 
-
-def test_the_sheet_shows_what_the_lens_has() -> None:
     def titles(lens: Lens) -> str:
         return " ".join(axes.get_title() for axes in draw_lens(lens, 960).axes)
 

@@ -40,7 +40,7 @@ def test_lens_file_round_trip(tmp_path: Path, focus_m: float) -> None:
     assert again.has_flat_focus and again.aperture.is_plain
 
 
-def test_all_fields_survive(tmp_path: Path) -> None:
+def test_all_fields_survive_and_the_first_version_is_read_as_ever(tmp_path: Path) -> None:
     modifiers = {"cat_eye": -0.4, "spherical_aberration": 0.3, "axial_chromatic": (0.1, 0.0, -0.1), "lateral_chromatic": (0.0, 0.1, 0.2)}
     lens = replace(NIKKOR, aperture=replace(Aperture.ring(0.5), **modifiers), tilt_rad=(0.1, -0.2), petzval_radius_mm=-70.0)
     write_lens(tmp_path / "lens.json", lens)
@@ -48,9 +48,6 @@ def test_all_fields_survive(tmp_path: Path) -> None:
     assert again.tilt_rad == pytest.approx(lens.tilt_rad, rel=1e-14) and again.petzval_radius_mm == -70.0
     assert same_outlines(again.aperture, lens.aperture)
     assert all(getattr(again.aperture, name) == value for name, value in modifiers.items())
-
-
-def test_a_document_of_the_first_version_is_read_as_ever() -> None:
     outline = [[1, 0], [0, 1], [-1, 0], [0, -1]]
     document = BODY | {"format": "mrbokeh-lens", "version": 1, "focus_distance_m": None}
     document |= {"aperture": {"outlines": [outline], "weights": [1]}}
@@ -103,7 +100,7 @@ def test_tilt_and_curvature_are_read(changed: dict[str, Any]) -> None:
     assert lens.petzval_radius_mm == changed.get("petzval_radius_mm", np.inf)
 
 
-def test_an_image_is_found_beside_the_lens_file(tmp_path: Path) -> None:
+def test_an_image_is_found_beside_the_lens_file_and_may_have_grey_levels(tmp_path: Path) -> None:
     """A white disc of half the opacity on transparent white: opacity counts, its scale does not."""
     y, x = np.mgrid[:64, :64] + 0.5
     cover = np.clip(20.5 - np.hypot(x - 32, y - 32), 0, 1)
@@ -113,64 +110,37 @@ def test_an_image_is_found_beside_the_lens_file(tmp_path: Path) -> None:
     (tmp_path / "sub" / "lens.json").write_text(json.dumps(BODY | {"aperture": {"shape": "image", "image": "disc.png"}}))
     outlines = read_lens(tmp_path / "sub" / "lens.json").aperture.outlines
     assert len(outlines) == 1 and np.hypot(*outlines[0].T).min() > 0.98
-
-
-def test_grey_levels_of_an_image(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "ramp.png"), np.repeat(np.linspace(0, 65535, 64).astype(np.uint16)[None], 32, axis=0))
     document = BODY | {"aperture": {"shape": "image", "image": "ramp.png", "levels": 4}}
     assert lens_from_json(document, folder=tmp_path).aperture.weights == (0.25,) * 4
     assert len(lens_from_json(BODY | {"aperture": {"shape": "image", "image": "ramp.png"}}, folder=tmp_path).aperture.weights) == 1
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"f_nummer": 2}, "'f_nummer'"),
-        ({"f_number": -1.8}, "positive"),
-        ({"f_number": "1.8"}, "f_number to be a number"),
-        ({"f_number": True}, "f_number to be a number"),
-        ({"f_number": None}, "f_number to be a number"),
-        ({"f_number": float("nan")}, "f_number to be a number"),
-        ({"focus_distance_m": 0.04}, "cannot focus"),
-        ({"focus_distance_m": float("nan")}, "focus_distance_m to be a number"),
-        ({"sensor_width_mm": float("inf")}, "sensor_width_mm to be a number"),
-        ({"tilt_deg": 3}, "tilt_deg to be a list of 2 numbers"),
-        ({"tilt_deg": [0, 60]}, "45 degrees"),
-        ({"petzval_radius_mm": 0}, "petzval_radius_mm"),
-        ({"aperture": "disc"}, "expected an object"),
-        ({"aperture": {}}, "incomplete: shape"),
-        ({"version": 2}, "version 1"),
-    ],
-)
+@pytest.mark.parametrize(("changed", "message"), [
+    ({"f_nummer": 2}, "'f_nummer'"), ({"f_number": -1.8}, "positive"), ({"f_number": "1.8"}, "f_number to be a number"),
+    ({"f_number": float("nan")}, "f_number to be a number"), ({"focus_distance_m": 0.04}, "cannot focus"),
+    ({"sensor_width_mm": float("inf")}, "sensor_width_mm to be a number"), ({"tilt_deg": 3}, "tilt_deg to be a list of 2 numbers"),
+    ({"tilt_deg": [0, 60]}, "45 degrees"), ({"petzval_radius_mm": 0}, "petzval_radius_mm"),
+    ({"aperture": "disc"}, "expected an object"), ({"aperture": {}}, "incomplete: shape"), ({"version": 2}, "version 1"),
+])  # fmt: skip
 def test_mistakes_in_a_lens_are_named(changed: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         lens_from_json(BODY | {"aperture": {"shape": "disc"}} | changed)
 
 
-@pytest.mark.parametrize(
-    ("aperture", "message"),
-    [
-        ({"shape": "blob"}, "expected a shape out of disc, polygon"),
-        ({"shape": ["disc"]}, "expected a shape out of"),
-        ({"shape": "disc", "cateye": 0.5}, "'cateye'"),
-        ({"shape": "polygon"}, "blades missing"),
-        ({"shape": "polygon", "blades": 6.5}, "blades to be a whole number"),
-        ({"shape": "polygon", "blades": 2}, "at least 3 blades"),
-        ({"shape": "polygon", "blades": 6, "curvature": 2}, "curvature"),
-        ({"shape": "ring"}, "inner missing"),
-        ({"shape": "ring", "inner": 1.5}, "below 1"),
-        ({"shape": "outline"}, "either points"),
-        ({"shape": "outline", "points": [[0, 0], [1, 1]]}, "at least 3 points"),
-        ({"shape": "outline", "points": [[0, 0], [1, 1], [2, "x"]]}, "at least 3 points"),
-        ({"shape": "image", "image": ""}, "image to be a text"),
-        ({"shape": "disc", "cat_eye": 1.5}, "cat_eye must lie between"),
-        ({"shape": "disc", "squeeze": 0}, "squeeze"),
-        ({"shape": "disc", "axial_chromatic": [0, 0]}, "axial_chromatic to be a list of 3 numbers"),
-        ({"outlines": [[[0, 0], [1, 0], [0, 1]]], "weights": [0]}, "let light through"),
-        ({"outlines": [[[0, 0], [1, 0], [0, 1]]]}, "weights missing"),
-        ({"outlines": [[[0, 0], [1, 0], [0, 1]]], "weights": [1], "shape": "disc"}, "'shape'"),
-    ],
-)
+@pytest.mark.parametrize(("aperture", "message"), [
+    ({"shape": "blob"}, "expected a shape out of disc, polygon"), ({"shape": "disc", "cateye": 0.5}, "'cateye'"),
+    ({"shape": "polygon"}, "blades missing"), ({"shape": "polygon", "blades": 6.5}, "blades to be a whole number"),
+    ({"shape": "polygon", "blades": 2}, "at least 3 blades"), ({"shape": "polygon", "blades": 6, "curvature": 2}, "curvature"),
+    ({"shape": "ring"}, "inner missing"), ({"shape": "ring", "inner": 1.5}, "below 1"), ({"shape": "outline"}, "either points"),
+    ({"shape": "outline", "points": [[0, 0], [1, 1], [2, "x"]]}, "at least 3 points"),
+    ({"shape": "image", "image": ""}, "image to be a text"), ({"shape": "disc", "cat_eye": 1.5}, "cat_eye must lie between"),
+    ({"shape": "disc", "squeeze": 0}, "squeeze"),
+    ({"shape": "disc", "axial_chromatic": [0, 0]}, "axial_chromatic to be a list of 3 numbers"),
+    ({"outlines": [[[0, 0], [1, 0], [0, 1]]], "weights": [0]}, "let light through"),
+    ({"outlines": [[[0, 0], [1, 0], [0, 1]]]}, "weights missing"),
+    ({"outlines": [[[0, 0], [1, 0], [0, 1]]], "weights": [1], "shape": "disc"}, "'shape'"),
+])  # fmt: skip
 def test_mistakes_in_an_aperture_are_named(aperture: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         aperture_of(**aperture)

@@ -52,37 +52,22 @@ def test_the_low_ends_of_boxes_belong_to_them(counts: tuple[int, ...]) -> None:
     np.testing.assert_array_equal(grid.index_of(grid.boxes[..., 0] + 1e-12), np.arange(len(grid)))
 
 
-def test_cells_grow_linearly_with_the_smallest_coordinate() -> None:
+def test_cells_grow_linearly_and_the_triangular_root_is_exact_at_its_jumps() -> None:
     grid = NestedGrid((36, 36))
     steps = np.round(36 * grid.boxes).astype(int)
     whole = steps[(steps[..., 1] < 36).all(axis=1)]
     level = triangular_root(whole[..., 0].min(axis=1).astype(float))
     np.testing.assert_array_equal(whole[..., 1] - whole[..., 0], np.stack([level + 1] * 2, axis=1))
-
-
-def test_points_outside_go_to_the_nearest_cell_and_batches_keep_their_shape() -> None:
-    grid = NestedGrid((9, 9))
-    assert grid.index_of(np.array([-3.0, 5.0])) == grid.index_of(np.array([0.0, 1.0]))
-    places = np.random.default_rng(0).random((4, 5, 2))
-    np.testing.assert_array_equal(grid.index_of(places)[2, 3], grid.index_of(places[2, 3]))
-
-
-def test_the_triangular_root_is_exact_at_its_jumps() -> None:
     levels = np.arange(3000)
     starts = np.asarray(triangular(levels), np.float64)
     np.testing.assert_array_equal(triangular_root(starts), levels)
     np.testing.assert_array_equal(triangular_root(np.nextafter(starts[1:], 0.0)), levels[:-1])
 
 
-def test_the_numbers_of_cells_of_table_1() -> None:
-    """400 samples for two coordinates, and a storage that grows as n^1.5 instead of n^2: four times the steps, eight times the cells.
-
-    Levels end at about sqrt(2 n); level l has about 2 (n - l^2 / 2) / l cells, which sums to n log n: well below n^1.5.
-    """
-    assert 380 <= len(NestedGrid((75, 75))) <= 420
-    assert len(NestedGrid((600, 600))) < 8 * len(NestedGrid((150, 150)))
-
-
-def test_a_grid_needs_steps() -> None:
+def test_points_outside_go_to_the_nearest_cell_and_a_grid_needs_steps() -> None:
+    grid = NestedGrid((9, 9))
+    assert grid.index_of(np.array([-3.0, 5.0])) == grid.index_of(np.array([0.0, 1.0]))
+    places = np.random.default_rng(0).random((4, 5, 2))
+    np.testing.assert_array_equal(grid.index_of(places)[2, 3], grid.index_of(places[2, 3]))
     with pytest.raises(InputError, match="at least one step"):
         NestedGrid((4, 0))

@@ -6,8 +6,8 @@ import pytest
 from mrbokeh.figures.psf_bank_drawing import draw_bank, sampled_cells
 from mrbokeh.optics.psf_bank import Axis, PsfBank, grid_over
 from mrbokeh.optics.psf_bank_file import read_bank, write_bank
-from mrbokeh.optics.psf_grid import NestedGrid, ProportionalGrid
-from mrbokeh.psf_models.build import PAPER_COUNTS, PAPER_EXPONENTS, Combined, bank_head
+from mrbokeh.optics.psf_grid import ProportionalGrid
+from mrbokeh.psf_models.build import PAPER_COUNTS, Combined, bank_head
 from mrbokeh.system.errors import InputError
 from tests.bench.bench_combined_bank import overlaps
 
@@ -72,12 +72,6 @@ def test_the_default_bank_is_nearer_to_exact_kernels_than_the_papers() -> None:
         assert np.percentile(elsewhere[1], 95) < 0.7 * np.percentile(elsewhere[0], 95)
 
 
-def test_the_papers_grid_is_what_counts_ask_for() -> None:
-    """Table 1: exponents 2 and 1, about 400 samples on a nested grid."""
-    head = bank_head(Combined(counts=PAPER_COUNTS), 0, 0)
-    assert head.grid == NestedGrid((75, 75)) and tuple(axis.exponent for axis in head.axes) == PAPER_EXPONENTS == (2.0, 1.0)
-
-
 def test_a_bank_in_proportion_comes_back_from_its_folder(tmp_path) -> None:
     axes = (Axis("diameter_px", 0.0, 20.0), Axis("motion_px", 0.0, 300.0))
     cells = len(ProportionalGrid((7, 3), (20.0, 300.0), 2.0))
@@ -89,7 +83,7 @@ def test_a_bank_in_proportion_comes_back_from_its_folder(tmp_path) -> None:
     np.testing.assert_array_equal(again.nearest(again.centres * [-1.0, 1.0]), np.arange(cells), err_msg="both sides of the focus")
 
 
-def test_its_sheet_shows_small_kernels_too() -> None:
+def test_its_sheet_shows_small_kernels_too_and_odd_grids_are_refused() -> None:
     """Six by six of them, the smallest within the first tenth of both ranges, the largest in the last third."""
     model = Combined(64.0, 64.0, cells=60)
     head = bank_head(model, 0, 0)
@@ -98,9 +92,6 @@ def test_its_sheet_shows_small_kernels_too() -> None:
     cells = sampled_cells(bank)
     assert len(cells) == 36 and (bank.centres[cells[0]] < 6.4).all() and (bank.centres[cells[-1]] > 42.0).all()
     assert "each of which shares" in " ".join(axes.get_title() for axes in draw_bank(bank).axes)
-
-
-def test_what_is_refused() -> None:
     for counts, highs_px, knee_px in (
         ((0, 3), (9.0, 9.0), 1.0),
         ((3,), (9.0,), 1.0),

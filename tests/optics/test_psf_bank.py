@@ -39,48 +39,35 @@ def test_remapping_goes_both_ways(axis: Axis) -> None:
     np.testing.assert_allclose(axis.to_unit(there), unit, atol=1e-12)
 
 
-def test_small_coordinates_are_sampled_more_finely() -> None:
+def test_small_coordinates_are_sampled_more_finely_and_those_beyond_the_range_are_cut() -> None:
     """An exponent of 2 over 32 px: ten even steps end at 32 (i / 10)^2, the first is 0.32 px and the last 6.08 px wide."""
     np.testing.assert_allclose(np.diff(DIAMETER.from_unit(np.linspace(0, 1, 11)))[[0, -1]], [0.32, 6.08])
     widths = np.diff(SIGNED.from_unit(np.linspace(0, 1, 21)))
     assert widths.argmin() in (9, 10) and widths[0] == pytest.approx(widths[-1])
-
-
-def test_coordinates_beyond_the_range_and_signs() -> None:
     np.testing.assert_array_equal(DIAMETER.to_unit(np.array([-8.0, 8.0, 99.0])), [0.5, 0.5, 1.0])
     np.testing.assert_allclose(SIGNED.to_unit(np.array([-99.0, -5.0, 0.0, 5.0])), [0.0, 0.25, 0.5, 0.75])
     np.testing.assert_allclose(INFINITE.to_unit(np.array([0.1, np.inf])), [0.0, 1.0])
     assert INFINITE.between(1.0, np.inf, 0.5) == pytest.approx(2.0), "half way in dioptres"
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        (("width", 0.0, 1.0), "expected an axis out of"),
-        (("motion_px", 3.0, 3.0), "low before high"),
-        (("depth_m", 1.0, np.inf), "finite"),
-        (("motion_px", 0.0, 3.0, 0.0), "positive exponent"),
-        (("depth_m", 0.0, 3.0, 1.0, True), "above 0 m"),
-        (("motion_px", -3.0, 3.0), "only diameter_px may be negative"),
-        (("diameter_px", -3.0, 4.0), "only diameter_px may be negative"),
-    ],
-)
+@pytest.mark.parametrize(("values", "message"), [
+    (("width", 0.0, 1.0), "expected an axis out of"), (("motion_px", 3.0, 3.0), "low before high"),
+    (("depth_m", 1.0, np.inf), "finite"), (("motion_px", 0.0, 3.0, 0.0), "positive exponent"),
+    (("depth_m", 0.0, 3.0, 1.0, True), "above 0 m"), (("motion_px", -3.0, 3.0), "only diameter_px may be negative"),
+    (("diameter_px", -3.0, 4.0), "only diameter_px may be negative"),
+])  # fmt: skip
 def test_axes_that_make_no_sense(values: tuple, message: str) -> None:
     with pytest.raises(InputError, match=message):
         Axis(*values)
 
 
-def test_the_nearest_kernel_is_that_of_the_cell() -> None:
+def test_the_nearest_kernel_is_that_of_the_cell_and_is_turned_in_front_of_the_focus() -> None:
     bank = random_bank()
     np.testing.assert_array_equal(bank.nearest(bank.centres), np.arange(len(bank.kernels)))
     rng = np.random.default_rng(0)
     points = np.stack([32.0 * rng.random(200), rng.random(200)], axis=1)
     low, high = bank.boxes[bank.nearest(points), :, 0], bank.boxes[bank.nearest(points), :, 1]
     assert ((low <= points) & (points <= high)).all()
-
-
-def test_in_front_of_the_focus_kernels_are_turned() -> None:
-    bank = random_bank()
     behind, in_front = (bank.kernel_at(np.array([side * 20.0, 0.3])) for side in (1, -1))
     np.testing.assert_array_equal(in_front, behind[::-1, ::-1])
     still = [random_bank(near_side_turned=False).kernel_at(np.array([side * 20.0, 0.3])) for side in (1, -1)]
@@ -164,7 +151,7 @@ def test_damaged_banks_are_named(tmp_path: Path) -> None:
             read_bank(folder)
 
 
-def test_kernels_as_pictures(tmp_path: Path) -> None:
+def test_kernels_as_pictures_in_colour_and_grey(tmp_path: Path) -> None:
     """EXR keeps the numbers; PNG keeps them to a step of 16 bits of its largest; the index says where each belongs."""
     bank = random_bank()
     assert export_bank(bank, tmp_path / "exr", "exr") == len(bank.kernels)
@@ -182,12 +169,9 @@ def test_kernels_as_pictures(tmp_path: Path) -> None:
     )
     with pytest.raises(InputError, match="exists already"):
         export_bank(bank, tmp_path / "png", "png")
-
-
-def test_grey_kernels_become_grey_pictures(tmp_path: Path) -> None:
     bank = random_bank(1)
-    export_bank(bank, tmp_path / "exr", "exr")
-    np.testing.assert_array_equal(read_image(tmp_path / "exr" / "00003.exr"), np.repeat(bank.kernels[3], 3, axis=2))
+    export_bank(bank, tmp_path / "grey", "exr")
+    np.testing.assert_array_equal(read_image(tmp_path / "grey" / "00003.exr"), np.repeat(bank.kernels[3], 3, axis=2))
 
 
 def test_the_sheet_shows_what_the_bank_has() -> None:
