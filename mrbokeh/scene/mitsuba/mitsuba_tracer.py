@@ -6,6 +6,7 @@ balls under a small light and lost 3.2 dB on a finely textured helmet (pictures 
 """
 
 import os
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,9 +26,9 @@ LLVM = "llvm_ad_rgb"
 
 _PLACES = ("/usr/lib", "/usr/lib64", "/usr/local/lib", "/opt/homebrew/opt/llvm/lib")
 _PATTERNS = ("libLLVM*", "*/libLLVM*", "llvm-*/lib/libLLVM*")
-_TESTED = "19"
-# Debian's LLVM 15 crashes on processors with AVX-512.
-_CRASHES = ("LLVM-15", "LLVM.so.15")
+_TESTED = 19
+# Debian's LLVM 14 and 15, which Mesa brings, abort the process on processors with AVX-512.
+_FIRST_USABLE = 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,6 +146,8 @@ def load(threads: int = 0) -> Any:
     library = find_llvm()
     if library is not None:
         os.environ.setdefault("DRJIT_LIBLLVM_PATH", str(library))
+    elif _libraries():
+        raise _no_llvm(f"there is only {_libraries()[0].name}, and those before {_FIRST_USABLE} abort")
     try:
         import drjit
         import mitsuba
@@ -154,24 +157,37 @@ def load(threads: int = 0) -> Any:
         mitsuba.set_variant(LLVM)
         drjit.eval(mitsuba.Float([0.0]) + 1.0)
     except (ImportError, RuntimeError) as error:
-        raise InputError(
-            f"expected the LLVM library that Mitsuba's path tracer compiles with, but it does not load ({str(error).splitlines()[0]}): "
-            "install one (Debian: apt install libllvm19) or name it in DRJIT_LIBLLVM_PATH, or choose the renderer embree"
-        ) from None
+        raise _no_llvm(f"it does not load ({str(error).splitlines()[0]})") from None
     if threads:
         drjit.set_thread_count(threads)
     return mitsuba
 
 
 def find_llvm() -> Path | None:
-    """LLVM's shared library: where DRJIT_LIBLLVM_PATH says, else version 19 or, without it, the last by name."""
+    """Return LLVM's shared library: where DRJIT_LIBLLVM_PATH says, else version 19 or, without it, the newest that can be used."""
     named = os.environ.get("DRJIT_LIBLLVM_PATH")
     if named:
         return Path(named)
-    found = [path for place in _PLACES for pattern in _PATTERNS for path in Path(place).glob(pattern)]
-    libraries = [path for path in found if path.is_file() and (".so" in path.name or path.suffix == ".dylib")]
-    usable = [path for path in libraries if not any(name in path.name for name in _CRASHES)]
-    return max(usable, key=lambda path: (_TESTED in path.name, path.name), default=None)
+    usable = [path for path in _libraries() if _version(path) >= _FIRST_USABLE]
+    return max(usable, key=lambda path: (_version(path) == _TESTED, _version(path)), default=None)
+
+
+def _libraries() -> list[Path]:
+    found = [path for place in _PLACES for pattern in _PATTERNS for path in sorted(Path(place).glob(pattern))]
+    return [path for path in found if path.is_file() and (".so" in path.name or path.suffix == ".dylib")]
+
+
+def _version(path: Path) -> int:
+    """Return the version that a library's name tells; one that tells none is taken for a usable one."""
+    told = re.search(r"LLVM(?:-|\.so\.)(\d+)", path.resolve().name)
+    return int(told[1]) if told else _FIRST_USABLE
+
+
+def _no_llvm(why: str) -> InputError:
+    return InputError(
+        f"expected the LLVM library that Mitsuba's path tracer compiles with, but {why}: "
+        "install one (Debian: apt install libllvm19) or name it in DRJIT_LIBLLVM_PATH, or choose the renderer embree"
+    )
 
 
 def require_denoiser() -> None:
