@@ -4,6 +4,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,12 +21,17 @@ from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.system.errors import InputError
 from tests.objects.test_scene_gltf import GlbWriter
 from tests.scenes.stage_scenes import FOCAL_PX, HEIGHT, LENS, ONE_CARD, WIDTH, backend, camera, centroid, scene_file
-from viewfinder.stage.stage import AdaptiveResolution, Fade, Stage
+from viewfinder.stage.stage import FADE_S, AdaptiveResolution, Fade, Stage
 from viewfinder.stage.stage_setup import live_renderer
 from viewfinder.tracking.tracker import TrackedPose
 
 BLACK = np.zeros((HEIGHT, WIDTH, 3), np.float32)
 PATIENCE_S = 60.0
+
+
+def aside(right_m: float) -> Camera:
+    """The camera, moved to the right."""
+    return camera((right_m, 1.0, -0.1), (right_m, 0.0, -0.1))
 
 
 def pose_of(view: Camera) -> TrackedPose:
@@ -64,19 +70,18 @@ class Stream:
 
 @pytest.fixture
 def stage(tmp_path: Path) -> Iterator[Stage]:
-    with_stage = Stage(scene_file(tmp_path, ONE_CARD), backend())
-    yield with_stage
-    with_stage.close()
+    with closing(Stage(scene_file(tmp_path, ONE_CARD), backend())) as opened:
+        yield opened
 
 
 def centre_px(overlay: Overlay, view: Camera) -> tuple[float, float]:
     return centroid(overlay.over(np.zeros((view.height_px, view.width_px, 3), np.float32))[..., 0])
 
 
-def rewrite(path: Path, text: str) -> None:
+def rewrite(path: Path, content: str | bytes) -> None:
     """As an editor does; with a time of its own, however coarse the clock of the file system is."""
     before_s = path.stat().st_mtime
-    path.write_text(text, encoding="utf-8")
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
     os.utime(path, (before_s + 2.0, before_s + 2.0))
 
 
@@ -85,22 +90,23 @@ def test_the_object_appears_where_it_stands_and_moves_with_every_frame(stage: St
     assert not stream.frame().shines_through.size or stage.seen is not None
     assert centre_px(stream.settled(), camera()) == pytest.approx((80, 56), abs=0.05)
     # 2 cm to the right at 1 m are 3 px; the very next frame shows it, drawn or not.
-    stream.view = camera((0.02, 1.0, -0.1), (0.02, 0.0, -0.1))
+    stream.view = aside(0.02)
     assert centre_px(stream.frame(), camera())[0] == pytest.approx(80 - FOCAL_PX * 0.02, abs=0.1)
 
 
 def test_nothing_is_drawn_again_when_nothing_moved(stage: Stage) -> None:
     stream = Stream(stage, camera())
     stream.settled()
-    drawing = stage.seen.drawing
+    status, drawing = stage.status, stage.seen.drawing
+    assert status.triangles == 2 and status.problem is None and status.renderer == "polygon" and status.resolution == 1.0
+    assert status.layer_age_ms is not None and 0.0 <= status.layer_age_ms < 1e3 * PATIENCE_S and status.draws_per_s > 0
     for _ in range(60):
         stream.frame()
         # Jitter of a third of a pixel is moved, not drawn.
-        aside_m = 0.002 * float(np.sin(stream.time_s * 40))
-        stream.view = camera((aside_m, 1.0, -0.1), (aside_m, 0.0, -0.1))
+        stream.view = aside(0.002 * float(np.sin(stream.time_s * 40)))
         time.sleep(0.003)
     assert stage.seen.drawing is drawing and not stage.status.busy
-    stream.view = camera((0.05, 1.0, -0.1), (0.05, 0.0, -0.1))
+    stream.view = aside(0.05)
     stream.settled()
     assert stage.seen.drawing is not drawing
 
@@ -130,9 +136,21 @@ def test_a_lost_track_fades_within_half_a_second_where_it_was_and_comes_back(sta
     assert back[:2] == pytest.approx([1 / 15, 2 / 15], abs=0.01) and back[-1] == pytest.approx(1.0)
 
 
-def test_no_pose_ever_shows_nothing(stage: Stage) -> None:
-    assert not Stream(stage, camera()).frame(tracked=False).shines_through.size
-    assert stage.status.layer_age_ms is None
+def test_an_unsure_pose_shows_nothing_at_first_and_fades_what_was_there(stage: Stage) -> None:
+    """As no pose. After a certain one, the object is gone within the half second of a lost track, and comes back."""
+
+    def least_through(is_certain: bool, time_s: float) -> float:
+        pose = TrackedPose(camera().camera_from_world, 0.2, time_s, is_certain=is_certain)
+        return float(stage.overlay(pose, camera(), LENS, time_s).shines_through.min(initial=1.0))
+
+    stream = Stream(stage, camera())
+    assert not stream.frame(tracked=False).shines_through.size and stage.status.layer_age_ms is None
+    assert least_through(False, stream.time_s) == 1.0
+    stream.until(lambda: stage.status.layer_age_ms is not None)
+    time_s = stream.time_s + 1.0
+    assert least_through(True, time_s) < 0.1
+    assert least_through(False, time_s + 0.5 * FADE_S) == pytest.approx(0.5, abs=0.06)
+    assert least_through(False, time_s + FADE_S) == 1.0 and least_through(True, time_s + 2.5 * FADE_S) < 0.1
 
 
 def test_another_size_of_frames(stage: Stage) -> None:
@@ -144,18 +162,10 @@ def test_another_size_of_frames(stage: Stage) -> None:
     assert centre_px(stream.settled(), stream.view) == pytest.approx((40, 28), abs=0.1)
 
 
-def test_the_status_tells_what_is_going_on(stage: Stage) -> None:
+def test_the_scene_file_and_its_glb_are_followed_and_a_mistake_keeps_the_old_scene(stage: Stage, tmp_path: Path) -> None:
     stream = Stream(stage, camera())
     stream.settled()
-    status = stage.status
-    assert status.triangles == 2 and status.problem is None and status.renderer == "polygon" and status.resolution == 1.0
-    assert status.layer_age_ms is not None and 0.0 <= status.layer_age_ms < 1e3 * PATIENCE_S and status.draws_per_s > 0
-
-
-def test_the_scene_file_is_followed_and_a_mistake_keeps_the_old_scene(stage: Stage, tmp_path: Path) -> None:
-    stream = Stream(stage, camera())
-    stream.settled()
-    path = tmp_path / "scene.toml"
+    path, glb = tmp_path / "scene.toml", tmp_path / "card.glb"
     rewrite(path, ONE_CARD + "position_m = [0.2, 0, 0]\n")
     stream.until(lambda: centre_px(stream.frame(), camera())[0] > 109)
     assert centre_px(stream.frame(), camera())[0] == pytest.approx(80 + FOCAL_PX * 0.2, abs=0.05)
@@ -164,21 +174,13 @@ def test_the_scene_file_is_followed_and_a_mistake_keeps_the_old_scene(stage: Sta
     assert "scene.toml" in str(stage.status.problem) and centre_px(stream.frame(), camera())[0] > 109
     rewrite(path, ONE_CARD)
     stream.until(lambda: stage.status.problem is None and centre_px(stream.frame(), camera())[0] < 81)
-
-
-def test_a_changed_glb_is_shown(stage: Stage, tmp_path: Path) -> None:
-    stream = Stream(stage, camera())
-    stream.settled()
     writer = GlbWriter()
     writer.square({"emissiveFactor": [0.0, 1.0, 0.0], "doubleSided": True, "pbrMetallicRoughness": {"baseColorFactor": [0, 0, 0, 1]}})
-    before_s = (tmp_path / "card.glb").stat().st_mtime
-    writer.write(tmp_path / "card.glb")
-    os.utime(tmp_path / "card.glb", (before_s + 2.0, before_s + 2.0))
+    rewrite(glb, writer.write(tmp_path / "green.glb").read_bytes())
     stream.until(lambda: bool(stream.frame().over(BLACK)[56, 80, 0] < 0.1))
     assert stream.frame().over(BLACK)[56, 80, 1] == pytest.approx(1.0, abs=0.05)
     # A half-written file is told, and the object stays.
-    (tmp_path / "card.glb").write_bytes(b"glTF")
-    os.utime(tmp_path / "card.glb", (before_s + 4.0, before_s + 4.0))
+    rewrite(glb, b"glTF")
     stream.until(lambda: stage.status.problem is not None)
     assert stream.frame().over(BLACK)[56, 80, 1] == pytest.approx(1.0, abs=0.05)
 
@@ -230,18 +232,18 @@ def test_renderers_are_switched_and_one_that_refuses_leaves_the_picture(stage: S
 
 
 def test_frames_do_not_wait_for_drawings_and_the_newest_request_wins(stage: Stage) -> None:
-    slow = Slow(0.3)
+    slow = Slow(0.15)
     stage.set_renderer("slow", slow)
     stream = Stream(stage, camera())
     stream.settled()
     drawn_before = slow.times
     for step in range(30):
-        stream.view = camera((0.01 * step, 1.0, -0.1), (0.01 * step, 0.0, -0.1))
+        stream.view = aside(0.01 * step)
         overlay = stream.frame()
         assert centre_px(overlay, camera())[0] == pytest.approx(80 - FOCAL_PX * 0.01 * step, abs=0.5)
         time.sleep(0.005)
     stream.settled()
-    # 30 views within half a second: the drawing under way, those that fit, and the last.
+    # 30 views within a third of a second: the drawing under way, those that fit, and the last.
     assert slow.times - drawn_before < 10
 
 
@@ -251,8 +253,7 @@ def test_slow_drawings_get_coarser_and_still_ones_fine_again(stage: Stage) -> No
     stream.settled()
 
     def moving_and_coarse() -> bool:
-        aside_m = 0.05 * float(np.sin(stream.time_s))
-        stream.view = camera((aside_m, 1.0, -0.1), (aside_m, 0.0, -0.1))
+        stream.view = aside(0.05 * float(np.sin(stream.time_s)))
         return stage.status.resolution == 0.5
 
     stream.until(moving_and_coarse)
@@ -262,43 +263,29 @@ def test_slow_drawings_get_coarser_and_still_ones_fine_again(stage: Stage) -> No
 def test_what_is_animated_is_drawn_again_and_again(tmp_path: Path) -> None:
     writer = GlbWriter()
     writer.square({"emissiveFactor": [1.0, 1.0, 1.0], "doubleSided": True})
-    steps = writer.accessor(np.array([0.0, 1.0], np.float32), "SCALAR")
+    steps = writer.accessor(np.array([0.0, 0.3], np.float32), "SCALAR")
     places = writer.accessor(np.array([[0, 0, 0], [4, 0, 0]], np.float32), "VEC3")
-    writer.json["animations"] = [
-        {
-            "name": "go",
-            "samplers": [{"input": steps, "output": places}],
-            "channels": [{"sampler": 0, "target": {"node": 0, "path": "translation"}}],
-        }
-    ]
+    channels = [{"sampler": 0, "target": {"node": 0, "path": "translation"}}]
+    writer.json["animations"] = [{"name": "go", "samplers": [{"input": steps, "output": places}], "channels": channels}]
     writer.write(tmp_path / "moving.glb")
     path = tmp_path / "scene.toml"
     path.write_text('[[object]]\nname = "m"\nglb = "moving.glb"\nheight_m = 0.1\nanimation = "go"\nloop = false\n')
-    stage = Stage(path, backend())
-    try:
+    with closing(Stage(path, backend())) as stage:
         stream = Stream(stage, camera((0.0, 1.0, -0.05), (0.0, 0.0, -0.05)))
-        stream.until(lambda: stage.seen is not None and stage.seen.drawing.request.time_s > 1.0)
-        # 4 m of a square of 2 m that is scaled to 0.1 m are 0.2 m; after a second it stands still there.
+        stream.until(lambda: stage.seen is not None and stage.seen.drawing.request.time_s > 0.3)
+        # 4 m of a square of 2 m that is scaled to 0.1 m are 0.2 m; then it stands still there.
         assert centre_px(stream.frame(), camera())[0] == pytest.approx(80 + FOCAL_PX * 0.2, abs=0.1)
-    finally:
-        stage.close()
 
 
-def test_the_lens_of_the_file_and_a_file_that_is_wrong(tmp_path: Path) -> None:
+def test_the_lens_of_the_file_and_a_file_that_is_wrong_and_the_thread_ends_with_the_stage(tmp_path: Path) -> None:
     write_lens(tmp_path / "lens.json", LENS)
-    stage = Stage(scene_file(tmp_path, ONE_CARD + "[lens]\nfile = 'lens.json'\n"), backend())
-    assert stage.lens is not None and replace(stage.lens, aperture=LENS.aperture) == LENS
-    stage.close()
+    before = threading.active_count()
+    with closing(Stage(scene_file(tmp_path, ONE_CARD + "[lens]\nfile = 'lens.json'\n"), backend())) as stage:
+        assert stage.lens is not None and replace(stage.lens, aperture=LENS.aperture) == LENS
+        assert threading.active_count() == before + 1
+    assert threading.active_count() == before
     with pytest.raises(InputError, match="expected a scene file"):
         Stage(tmp_path / "other.toml", backend())
-
-
-def test_the_thread_ends_with_the_stage(tmp_path: Path) -> None:
-    before = threading.active_count()
-    stage = Stage(scene_file(tmp_path, ONE_CARD), backend())
-    assert threading.active_count() == before + 1
-    stage.close()
-    assert threading.active_count() == before
 
 
 def test_fading_goes_by_the_time_of_frames() -> None:

@@ -15,15 +15,7 @@ from tests.scenes.phone_on_camera import CAMERA_FROM_PHONE, rig_error
 from tests.scenes.told_parts import ToldCamera, ToldTracker
 from tests.scenes.waiting import wait_until
 from viewfinder.frames import CameraFrame
-from viewfinder.tracking.phone_rig import (
-    PhoneRig,
-    PosePair,
-    angle_deg,
-    calibrate_rig,
-    read_phone_rig,
-    rigid_of,
-    write_phone_rig,
-)
+from viewfinder.tracking.phone_rig import PhoneRig, PosePair, angle_deg, calibrate_rig, read_phone_rig, rigid_of, write_phone_rig
 from viewfinder.tracking.phone_tracker import PhoneTracker
 from viewfinder.tracking.tracker import TrackedPose
 

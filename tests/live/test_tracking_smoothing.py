@@ -27,9 +27,8 @@ def pose_of(turn_deg: np.ndarray, place_m: np.ndarray) -> np.ndarray:
 
 def panned(yaw_deg: float) -> np.ndarray:
     """A camera that turns on the spot before a board 1 m away."""
-    turn = Rotation.from_euler("y", -yaw_deg, degrees=True).as_matrix()
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = turn, turn @ (0.0, 0.0, 1.0)
+    pose = pose_of(np.array([0.0, -yaw_deg, 0.0]), np.zeros(3))
+    pose[:3, 3] = pose[:3, :3] @ (0.0, 0.0, 1.0)
     return pose
 
 
@@ -142,13 +141,22 @@ def test_the_pose_of_the_file_is_that_of_every_frame(tmp_path: Path) -> None:
 
 
 def test_files_that_are_no_camera_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no such file"):
-        read_fixed_pose(tmp_path / "none.json")
     write_json(tmp_path / "list.json", [1, 2])
-    with pytest.raises(InputError, match="expected width_px"):
-        read_fixed_pose(tmp_path / "list.json")
     skewed = POSE.copy()
     skewed[0, 0] = 2.0
-    write_json(tmp_path / "skewed.json", camera_to_json(Camera(640, 360, (600.0, 600.0), (320.0, 180.0), skewed)))
-    with pytest.raises(InputError, match="rigid"):
-        read_fixed_pose(tmp_path / "skewed.json")
+    write_json(tmp_path / "skewed.json", camera_to_json(replace(TRIPOD, camera_from_world=skewed)))
+    for name, sentence in (("none", "no such file"), ("list", "expected width_px"), ("skewed", "rigid")):
+        with pytest.raises(InputError, match=sentence):
+            read_fixed_pose(tmp_path / f"{name}.json")
+
+
+def test_smoothing_does_not_glide_from_a_wrong_pose_to_the_right_one() -> None:
+    """An unsure pose is given as it comes, and the next certain one, too."""
+    wrong, right = np.eye(4), np.eye(4)
+    wrong[:3, 3], right[:3, 3] = (0.0, 0.0, 1.0), (0.1, 0.0, 1.0)
+    poses = [wrong, wrong, right]
+    inner = ToldTracker(lambda frame: TrackedPose(poses[frame.sequence], 0.2, frame.captured_s, is_certain=frame.sequence == 2))
+    smoothed = SmoothedTracker(inner, smoothing=True)
+    for number, pose in enumerate(poses):
+        shown = smoothed.track(CameraFrame(np.zeros((4, 4, 3), np.uint8), number / 30.0, number), CAMERA)
+        np.testing.assert_allclose(shown.camera_from_world, pose, atol=1e-12)
