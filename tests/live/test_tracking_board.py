@@ -14,15 +14,8 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.board_calibration import calibrated
-from mrbokeh.tracking.charuco.board import (
-    CharucoBoard,
-    CharucoGrid,
-    black_rectangles_mm,
-    board_from_json,
-    board_to_json,
-    read_board,
-    write_board,
-)
+from mrbokeh.tracking.charuco import board as boards
+from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, black_rectangles_mm, board_from_json, board_to_json
 from mrbokeh.tracking.charuco.detector import CharucoDetector
 from tests.scenes.traced_board_clip import BOARD, tilted_views
 from viewfinder.tracking.printed_board import MARGIN_MM, BoardView, page_for, plan_board, write_board_pdf
@@ -39,12 +32,9 @@ def rasterised(rectangles_mm: np.ndarray, size_mm: tuple[float, float], px_per_m
     return picture
 
 
-def test_corners_lie_where_opencv_has_them() -> None:
+def test_corners_lie_where_opencv_has_them_and_those_of_the_second_grid_are_moved_by_its_offset() -> None:
     theirs = np.asarray(SIMPLE.opencv_board(0).getChessboardCorners()).reshape(-1, 3) / 1000.0
     np.testing.assert_allclose(SIMPLE.corners_m, theirs, atol=1e-9)
-
-
-def test_corners_of_the_second_grid_are_moved_by_its_offset() -> None:
     first_of_second = BOARD.corners_m[np.flatnonzero(BOARD.grid_of_corner == 1)[0]]
     np.testing.assert_allclose(first_of_second, (0.020, 0.163, 0.0), atol=1e-12)
     assert len(BOARD.corners_m) == 3 * 2 + 8 * 4
@@ -58,27 +48,22 @@ def test_rectangles_do_not_overlap() -> None:
 
 
 def test_json_keeps_the_board(tmp_path: Path) -> None:
-    write_board(tmp_path / "board.json", BOARD)
-    assert read_board(tmp_path / "board.json") == BOARD
+    boards.write_board(tmp_path / "board.json", BOARD)
+    assert boards.read_board(tmp_path / "board.json") == BOARD
     assert len(json.loads((tmp_path / "board.json").read_text())["black_mm"]) == len(black_rectangles_mm(BOARD))
 
 
-@pytest.mark.parametrize(
-    ("change", "sentence"),
-    [
-        ({"grids": []}, "at least one ChArUco grid"),
-        ({"grids": [{"squares": [5, 4]}]}, "grid 1: expected squares"),
-        ({"grids": [{"squares": [2, 4], "square_mm": 20.0, "marker_mm": 15.0}]}, "at least 3x3 squares"),
-        ({"grids": [{"squares": [5, 4], "square_mm": 20.0, "marker_mm": 25.0}]}, "0 < marker < square"),
-        ({"grids": [{"squares": [5, 4], "square_mm": 20.0, "marker_mm": 15.0, "colour": 1}]}, "colour"),
-        ({"dictionary": "DICT_9X9"}, "DICT_4X4_50"),
-        ({"dictionary": "DICT_4X4_50", "grids": [{"squares": [12, 11], "square_mm": 20.0, "marker_mm": 15.0}]}, "66 markers"),
+def test_what_is_no_board_is_refused_with_a_sentence() -> None:
+    plain = {"squares": [5, 4], "square_mm": 20.0, "marker_mm": 15.0}
+    for change, sentence in (
+        ({"grids": []}, "at least one ChArUco grid"), ({"grids": [{"squares": [5, 4]}]}, "grid 1: expected squares"),
+        ({"grids": [plain | {"squares": [2, 4]}]}, "at least 3x3 squares"), ({"dictionary": "DICT_9X9"}, "DICT_4X4_50"),
+        ({"grids": [plain | {"colour": 1}]}, "colour"), ({"grids": [plain | {"marker_mm": 25.0}]}, "0 < marker < square"),
+        ({"dictionary": "DICT_4X4_50", "grids": [plain | {"squares": [12, 11]}]}, "66 markers"),
         ({"squares": [5, 4]}, "expected a ChArUco board"),
-    ],
-)
-def test_what_is_no_board_is_refused_with_a_sentence(change: dict[str, object], sentence: str) -> None:
-    with pytest.raises(InputError, match=re.escape(sentence)):
-        board_from_json({**board_to_json(SIMPLE), **change}, "board.json")
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=re.escape(sentence)):
+            board_from_json({**board_to_json(SIMPLE), **change}, "board.json")
 
 
 def test_grids_must_not_share_markers_or_paper() -> None:
@@ -99,24 +84,17 @@ def drawn_in(pdf: bytes) -> tuple[np.ndarray, tuple[float, float]]:
     return rectangles, (width, height)
 
 
-def test_the_pdf_draws_the_board_at_true_size(tmp_path: Path) -> None:
+def test_the_pdf_draws_the_board_at_true_size_and_its_picture_is_found_there(tmp_path: Path) -> None:
     write_board_pdf(tmp_path / "board.pdf", BOARD, "a4")
     rectangles, page_mm = drawn_in((tmp_path / "board.pdf").read_bytes())
     assert page_mm == pytest.approx((210.0, 297.0), abs=0.01)
     moved = rectangles - [(210.0 - 184.0) / 2, MARGIN_MM, 0.0, 0.0]
     np.testing.assert_allclose(moved, black_rectangles_mm(BOARD), atol=1e-3)
-
-
-def test_a_picture_of_the_pdf_is_found_where_it_was_drawn(tmp_path: Path) -> None:
-    """2 px per mm, each the mean of 16: a tenth of a millimetre is a fifth of a pixel."""
-    write_board_pdf(tmp_path / "board.pdf", BOARD, "a4")
-    rectangles, page_mm = drawn_in((tmp_path / "board.pdf").read_bytes())
-    found = CharucoDetector(BOARD).detect(
-        cv2.resize(rasterised(rectangles, page_mm, 8), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
-    )
+    # 2 px per mm, each the mean of 16: a tenth of a millimetre is a fifth of a pixel.
+    printed = cv2.resize(rasterised(rectangles, page_mm, 8), None, fx=0.25, fy=0.25, interpolation=cv2.INTER_AREA)
+    found = CharucoDetector(BOARD).detect(printed)
     assert len(found) == len(BOARD.corners_m)
-    drawn_mm = found.xy_px / 2.0 - [13.0, MARGIN_MM]
-    np.testing.assert_allclose(drawn_mm, 1000.0 * BOARD.corners_m[found.ids, :2], atol=0.1)
+    np.testing.assert_allclose(found.xy_px / 2.0 - [13.0, MARGIN_MM], 1000.0 * BOARD.corners_m[found.ids, :2], atol=0.1)
 
 
 def test_the_ruler_is_100_mm_and_the_text_says_what_it_is(tmp_path: Path) -> None:

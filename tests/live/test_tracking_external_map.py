@@ -4,6 +4,8 @@ import itertools
 import json
 import shutil
 import tempfile
+import time
+from contextlib import closing
 from pathlib import Path
 
 import cv2
@@ -21,6 +23,7 @@ from viewfinder.frames import CameraFrame, Pose
 from viewfinder.tracking.map_tracker import MapLocaliser, MapTracker, matches, pose_in_map, pose_refined
 from viewfinder.tracking.phone_rig import angle_deg
 from viewfinder.tracking.sparse_map import CACHE_NAME, SparseMap, read_sparse_map
+from viewfinder.tracking.tracker import TrackedPose
 
 INTRINSICS = Camera(WIDTH_PX, HEIGHT_PX, (FOCAL_PX, FOCAL_PX), (WIDTH_PX / 2, HEIGHT_PX / 2))
 PLACES_M = [(-0.6, -0.3, 0.0), (-0.2, -0.1, 0.2), (0.2, -0.4, 0.0), (0.6, -0.2, 0.1), (0.0, 0.1, 0.4)]
@@ -169,15 +172,17 @@ def test_tracker_between_localisations(room: tuple[Path, float, Pose], room_map:
 
 
 def test_tracker_with_its_thread(room: tuple[Path, float, Pose], room_map: SparseMap) -> None:
-    camera = walk(1)[0]
-    tracker = MapTracker(MapLocaliser(room_map, INTRINSICS), room[2])
-    try:
-        numbers = itertools.count()
-        wait_until(lambda: tracker.track(frame(next(numbers), camera), INTRINSICS) is not None)
-        found = tracker.track(frame(next(numbers), camera), INTRINSICS)
-        assert off(found.camera_from_world, camera.camera_from_world)[1] < 0.012
-    finally:
-        tracker.close()
+    camera, numbers = walk(1)[0], itertools.count()
+    shown = frame(0, camera).bgr
+    with closing(MapTracker(MapLocaliser(room_map, INTRINSICS), room[2])) as tracker:
+
+        def found() -> TrackedPose | None:
+            time.sleep(0.02)
+            number = next(numbers)
+            return tracker.track(CameraFrame(shown, number / 30.0, number), INTRINSICS)
+
+        wait_until(lambda: found() is not None)
+        assert off(found().camera_from_world, camera.camera_from_world)[1] < 0.012
 
 
 def test_looks_are_kept_and_renewed(room: tuple[Path, float, Pose], room_map: SparseMap, tmp_path: Path) -> None:
@@ -195,24 +200,21 @@ def test_looks_are_kept_and_renewed(room: tuple[Path, float, Pose], room_map: Sp
 
 
 def test_wrong_maps(room: tuple[Path, float, Pose], tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="scale of the map"):
-        read_sparse_map(tmp_path)
-    with pytest.raises(InputError, match="expected a COLMAP model"):
-        read_sparse_map(tmp_path, 1.0)
-    with pytest.raises(InputError, match="positive number"):
-        read_sparse_map(room[0], 0.0)
+    def assert_refused(sentence: str, folder: Path = tmp_path, scale: float | None = 1.0) -> None:
+        with pytest.raises(InputError, match=sentence):
+            read_sparse_map(folder, scale)
+
+    assert_refused("scale of the map", scale=None)
+    assert_refused("expected a COLMAP model")
+    assert_refused("positive number", room[0], 0.0)
     shutil.copytree(room[0] / "sparse", tmp_path / "sparse")
-    with pytest.raises(InputError, match="expected the pictures"):
-        read_sparse_map(tmp_path, 1.0)
+    assert_refused("expected the pictures")
     (tmp_path / "images").mkdir()
-    whole = (tmp_path / "sparse" / "0" / "points3D.bin").read_bytes()
-    for half in (b"\1", whole[: len(whole) // 2]):
-        (tmp_path / "sparse" / "0" / "points3D.bin").write_bytes(half)
-        with pytest.raises(InputError, match="is cut off"):
-            read_sparse_map(tmp_path, 1.0)
-    (tmp_path / "sparse" / "0" / "points3D.bin").write_bytes(bytes(8))
-    with pytest.raises(InputError, match="no points"):
-        read_sparse_map(tmp_path, 1.0)
+    points = tmp_path / "sparse" / "0" / "points3D.bin"
+    whole = points.read_bytes()
+    for content, sentence in ((b"\1", "is cut off"), (whole[: len(whole) // 2], "is cut off"), (bytes(8), "no points")):
+        points.write_bytes(content)
+        assert_refused(sentence)
 
 
 HELD_OUT = ("0008.jpg", "0027.jpg", "0045.jpg", "0084.jpg")
