@@ -7,7 +7,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from datasets_scripts.public_datasets import KINDS, Conversion, DepthMaps, convert, crop_of, main, sharpest_depth_m
 from datasets_scripts.public_sets.adapters import f_number_of
@@ -17,6 +16,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset, read_focal_stack_dataset
 from mrbokeh.system.errors import InputError
+from tests.scenes.command_line import printed_by
 from training.data.dataset import read_pair
 from training.data.training_data import training_data
 from training.evaluation.methods import scatter_reference
@@ -230,13 +230,8 @@ def test_the_focus_is_found_where_detail_is_kept(focus_m: float) -> None:
 
 
 def test_the_command_converts_and_keeps_a_finished_set(tmp_path: Path) -> None:
-    import typer
-
     ebb_folder(tmp_path / "ebb", tmp_path / "maps")
-    app = typer.Typer()
-    app.command()(main)
-    arguments = ["ebb", str(tmp_path / "ebb"), str(tmp_path / "out"), "--depth", str(tmp_path / "maps"), "--near-m", "1", "--far-m", "4"]
-    first, again = (CliRunner().invoke(app, arguments) for _ in range(2))
-    assert first.exit_code == 0 and "1 stacks" in first.output
-    assert again.exit_code == 2 and "exists already" in again.output
-    assert CliRunner().invoke(app, ["nothing", *arguments[1:]]).exit_code == 2
+    arguments = [tmp_path / "ebb", tmp_path / "out", "--depth", tmp_path / "maps", "--near-m", 1, "--far-m", 4]
+    assert "1 stacks" in printed_by(main, "ebb", *arguments)
+    assert "exists already" in printed_by(main, "ebb", *arguments, exit_code=2)
+    printed_by(main, "nothing", *arguments, exit_code=2)

@@ -5,8 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from datasets_scripts.made_sets.truth_set import SHAPE_NAMES, TruthPlan, lens_shape
 from datasets_scripts.render_truth import main, render_truth
@@ -26,6 +24,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import scatter
 from mrbokeh.system.errors import InputError
+from tests.scenes.command_line import printed_by
 from tests.scenes.scalar_truth_tracer import ScalarTracer, require_mitsuba
 
 SIZE_PX = 96
@@ -112,11 +111,8 @@ def test_share_of_the_aperture_seen_past_a_straight_edge(z_m: float, behind: boo
 
     In front of the plane in focus a black half plane hides a white wall there; behind it a white half plane is seen blurred.
     """
-    bodies = (
-        (wall(1.0, (1.0, 1.0, 1.0)), wall(z_m, (0.0, 0.0, 0.0), 0.0))
-        if not behind
-        else (wall(z_m, (1.0, 1.0, 1.0), -200.0), wall(50.0, (0.0, 0.0, 0.0)))
-    )
+    in_front = (wall(1.0, (1.0, 1.0, 1.0)), wall(z_m, (0.0, 0.0, 0.0), 0.0))
+    bodies = (wall(z_m, (1.0, 1.0, 1.0), -200.0), wall(50.0, (0.0, 0.0, 0.0))) if behind else in_front
     picture = tracer(bodies).traced(opening(1.0), 1024).rgb[..., 0]
     radius_px = 0.5 * abs(coc_px(z_m, 1.0))
     inside = (np.arange(101) + 0.5) / 101 - 0.5
@@ -182,12 +178,9 @@ def test_an_edge_hides_as_much_of_a_lamp_as_of_the_aperture() -> None:
 # --- Sampling and pupils -------------------------------------------------------------------------------------------------------------
 
 
-def test_reversed_bits_of_known_numbers() -> None:
-    assert reversed_bits(np.array([1, 0x80000000, 6], np.uint32)).tolist() == [0x80000000, 1, 0x60000000]
-
-
 def test_every_pixel_has_well_spread_points_of_its_own() -> None:
-    """Owen scrambling keeps a (0, m, 2) net: each of 16 x 16 cells holds one of 256 points, in the first two dimensions."""
+    assert reversed_bits(np.array([1, 0x80000000, 6], np.uint32)).tolist() == [0x80000000, 1, 0x60000000]
+    # Owen scrambling keeps a (0, m, 2) net: each of 16 x 16 cells holds one of 256 points, in the first two dimensions.
     table = sobol_table(256)
     for pixel in (0, 1, 70000):
         seeds = [scramble_seed(np.array([pixel], np.uint32), np.array([k], np.uint32)) for k in range(2)]
@@ -222,12 +215,9 @@ def moments(aperture: Aperture) -> tuple[float, np.ndarray, np.ndarray]:
     return area, first, second
 
 
-def test_two_discs_share_all_nothing_and_what_the_lens_of_arcs_says() -> None:
+def test_openings_are_shares_of_discs_and_those_that_rays_cannot_take_are_refused() -> None:
     """At a distance of one radius: (2 pi / 3 - sqrt(3) / 2) / pi."""
     assert two_disc_overlap(np.array([0.0, 2.0, 1.0])) == pytest.approx([1.0, 0.0, (2 * np.pi / 3 - np.sqrt(3) / 2) / np.pi])
-
-
-def test_openings_that_rays_cannot_take_are_refused() -> None:
     with pytest.raises(InputError, match="weights"):
         pupil_table(Aperture((Aperture.disc().outlines[0],), (0.5,)))
     with pytest.raises(InputError, match="round"):
@@ -316,12 +306,9 @@ def test_the_script_makes_a_set_goes_on_and_refuses_another(tmp_path: Path) -> N
     assert render_truth(tmp_path, plan) == 1
     # Threads add a lamp's rays in any order, which may change the last bit.
     assert read_image(folder / "truth" / "disc_1.exr") == pytest.approx(before, rel=2e-3)
-    app = typer.Typer()
-    app.command()(main)
-    refused = CliRunner().invoke(app, [str(tmp_path), "--scenes", "fence", "--shapes", "disc", "--width", "48", "--height", "27"])
-    assert refused.exit_code == 2 and "--overwrite" in refused.output
-    unknown = CliRunner().invoke(app, [str(tmp_path / "new"), "--scenes", "sea"])
-    assert unknown.exit_code == 2 and "fence" in unknown.output and not (tmp_path / "new").exists()
+    other = ("--scenes", "fence", "--shapes", "disc", "--width", 48, "--height", 27)
+    assert "--overwrite" in printed_by(main, tmp_path, *other, exit_code=2)
+    assert "fence" in printed_by(main, tmp_path / "new", "--scenes", "sea", exit_code=2) and not (tmp_path / "new").exists()
 
 
 # --- The committed set ---------------------------------------------------------------------------------------------------------------
@@ -377,9 +364,8 @@ def test_committed_truth_is_blurred_by_the_opening_and_focus_that_its_descriptio
 
     def scattered_psnr(focus_m: float, shape: np.ndarray) -> float:
         lens = Lens(**meta["lens"], focus_distance_m=focus_m, aperture=Aperture((shape,), (1.0,)))
-        spread = scatter(
-            np.dstack([sharp, np.ones_like(depth_m)]).astype(np.float64), lens.coc_px(depth_m, depth_m.shape[1]), lens.aperture
-        )
+        opaque = np.dstack([sharp, np.ones_like(depth_m)]).astype(np.float64)
+        spread = scatter(opaque, lens.coc_px(depth_m, depth_m.shape[1]), lens.aperture)
         return psnr((spread[..., :3] / np.maximum(spread[..., 3:], 1e-3)).astype(np.float32), truth)
 
     right = scattered_psnr(near_m, outline)

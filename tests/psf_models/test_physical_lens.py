@@ -12,7 +12,6 @@ from mrbokeh.optics.psf_grid import NestedGrid
 from mrbokeh.psf_models import _physical_lens_numba as compiled
 from mrbokeh.psf_models._lens_beam import BANDS_UM, GREEN_UM
 from mrbokeh.psf_models._physical_lens_numba import trace_ray
-from mrbokeh.psf_models.base import sobol_blocks
 from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface, index_at
 from mrbokeh.psf_models.physical_lens import PhysicalLens, biconvex_lens
 from mrbokeh.system.errors import InputError
@@ -139,13 +138,6 @@ def test_far_from_focus_on_the_axis_the_blur_is_the_thin_lens_circle_of_confusio
     assert relative_error_of_coc(depth_m, 11.0) == pytest.approx(error * (32.0 / 11.0) ** 2, rel=0.25)
 
 
-def test_in_focus_the_light_stays_together() -> None:
-    model = PhysicalLens(pair(), focus_distance_m=2.0, image_width_px=1000, f_number=11.0)
-    kernel = model.kernel(at(2.0), RAYS, 0)
-    middle = len(kernel) // 2
-    assert_allclose(kernel[middle, middle], 1.0, atol=0.01)
-
-
 @pytest.mark.parametrize("eccentricity", [0.0, 0.6, 0.9])
 def test_light_is_kept(eccentricity: float) -> None:
     """A kernel sums to its open share in each colour, or to 1 where vignetting is left to others."""
@@ -181,7 +173,7 @@ def landings(model: PhysicalLens, depth_m: float, eccentricity: float, colour: i
     return (np.concatenate([x, x]), np.concatenate([y, -y])), np.concatenate([weights[lit, colour]] * 2)
 
 
-def test_kernels_are_mirror_images_about_the_field() -> None:
+def test_kernels_are_mirror_images_about_the_field_and_the_chief_ray_lands_where_it_should() -> None:
     """Only half of the pupil is traced: rays on its other half, traced in the open, land at the mirrored places."""
     model = lens()
     kernel = model.kernel(at(6.0, 0.7), RAYS, 1)
@@ -197,6 +189,11 @@ def test_kernels_are_mirror_images_about_the_field() -> None:
             ends.append(place + (model.beam.sensor_at_mm - place[2]) / heading[2] * heading)
         assert_allclose(ends[0], ends[1] * [1, -1, 1], atol=1e-9)
         assert_allclose(landed_at(model, chief, 6.0, a, b), ends[0][:2], atol=1e-8)
+    # The ray through a = b = 0 is the chief ray of whatever depth: it meets the sensor at the eccentricity asked for.
+    for eccentricity in (0.0, 0.3, 1.0):
+        chief = model.beam.chief_ray(eccentricity)
+        for depth_m in (0.7, 2.0, 100.0):
+            assert_allclose(landed_at(model, chief, depth_m, 0.0, 0.0), [-eccentricity * 0.5 * np.hypot(36.0, 24.0), 0.0], atol=1e-8)
 
 
 def landed_at(model: PhysicalLens, chief: np.ndarray, depth_m: float, a: float, b: float, wavelength_um: float = GREEN_UM) -> np.ndarray:
@@ -204,15 +201,6 @@ def landed_at(model: PhysicalLens, chief: np.ndarray, depth_m: float, a: float, 
     point = (beam.table, chief[1:], beam.front_mm, 0.001 / depth_m, a, b, wavelength_um, beam.sensor_at_mm)
     assert compiled.trace_point(*point, np.empty(6), landing) > 0.0
     return landing
-
-
-def test_the_chief_ray_lands_where_it_should() -> None:
-    """The ray through a = b = 0 is the chief ray of whatever depth: it meets the sensor at the eccentricity asked for."""
-    model = lens()
-    for eccentricity in (0.0, 0.3, 1.0):
-        chief = model.beam.chief_ray(eccentricity)
-        for depth_m in (0.7, 2.0, 100.0):
-            assert_allclose(landed_at(model, chief, depth_m, 0.0, 0.0), [-eccentricity * 0.5 * np.hypot(36.0, 24.0), 0.0], atol=1e-8)
 
 
 def blocked_and_free(model: PhysicalLens, depth_m: float, eccentricity: float, steps: int) -> float:
@@ -253,9 +241,13 @@ def test_cat_eyes_close_towards_the_corner() -> None:
     assert widths[1][0] < 0.8 * widths[1][1]
 
 
-def test_wide_rims_close_nothing() -> None:
+def test_wide_rims_close_nothing_and_light_in_focus_stays_together() -> None:
     """With rims far outside the beam only the iris is left: the projected pupil stays open within a few per cent."""
     assert lens(30.0).throughput(20.0, 0.4) == pytest.approx(1.0, abs=0.03)
+    model = PhysicalLens(pair(), focus_distance_m=2.0, image_width_px=1000, f_number=11.0)
+    kernel = model.kernel(at(2.0), RAYS, 0)
+    middle = len(kernel) // 2
+    assert_allclose(kernel[middle, middle], 1.0, atol=0.01)
 
 
 @pytest.mark.parametrize(("depth_m", "side"), [(20.0, 1.0), (1.05, -1.0)])
@@ -277,7 +269,7 @@ def focus_of(model: LensPrescription, wavelength_um: float) -> float:
     return float(ray[2] - ray[0] * ray[5] / ray[3])
 
 
-def test_blue_focuses_nearer_than_red() -> None:
+def test_blue_focuses_nearer_than_red_and_fringes_turn_over_at_the_focus() -> None:
     """The single lens: focal lengths differ by f / V between the F and C lines, 50 / 64.17 mm = 0.78 mm."""
     single = biconvex_lens(50.0, 8.0)
     blue, green, red = (focus_of(single, each) for each in (0.48613, 0.55, 0.65627))
@@ -285,10 +277,7 @@ def test_blue_focuses_nearer_than_red() -> None:
     assert red - blue == pytest.approx(50.0 / 64.17, rel=0.02)
     achromat = focus_of(pair(), 0.65627) - focus_of(pair(), 0.48613)
     assert abs(achromat) < 0.5 * (red - blue)
-
-
-def test_colour_fringes_turn_over_at_the_focus() -> None:
-    """Behind the focus blue, which focuses nearer to the lens, is the wider disc; in front red is."""
+    # Behind the focus blue, which focuses nearer to the lens, is the wider disc; in front red is.
     model = PhysicalLens(biconvex_lens(50.0, 8.0), focus_distance_m=2.0, image_width_px=6000)
     for depth_m, wider in ((20.0, 2), (1.2, 0)):
         kernel = model.kernel(at(depth_m), RAYS, 0)
@@ -330,25 +319,14 @@ def test_prefiltering_is_the_mean_over_the_box() -> None:
     assert whole.sum() == pytest.approx(total.sum(), rel=0.01)
 
 
-@pytest.mark.slow
-def test_rays_are_spread_more_evenly_than_chance_would() -> None:
-    """Against four times as many rays of another seed, half a million rays miss a third of what as many pseudo-random ones do.
-
-    Measured: 0.0025 of the light against 0.018. An additive recurrence over the five dimensions (square roots of primes), which
-    stood here before, left streaks and 0.0082, and hardly less with more rays.
-    """
-    model, rays, box = PhysicalLens(pair(), image_width_px=1000), 1 << 19, np.array([[0.65, 0.66], [0.0, 0.01]])
-    truth = model.landed(box, 4 * rays, sobol_blocks(5, 4 * rays, 1))
-    random = model.landed(box, rays, np.random.default_rng(0).random((8, rays // 8, 5)))
-    even = model.landed(box, rays, sobol_blocks(5, rays, 0))
-    missed, by_chance = (np.abs(each - truth).sum() / truth.sum() for each in (even, random))
-    assert missed < by_chance / 3.0
-
-
-def test_more_rays_than_a_chunk_are_no_seam() -> None:
+def test_more_rays_than_a_chunk_are_no_seam_and_the_grid_has_the_papers_number_of_samples() -> None:
     """Rays come in chunks of 65,536; a kernel of 100,000 differs from one of 65,536 by noise only."""
     few, many = lens().kernel(at(6.0), 65536, 0), lens().kernel(at(6.0), 100000, 0)
     assert few.shape == many.shape and np.abs(few - many).sum() < 0.06 * few.sum()
+    # Table 1: 4,000 samples, exponents 2.5 and 1.2.
+    model = lens()
+    assert len(NestedGrid(model.counts)) == pytest.approx(4000, abs=5)
+    assert [axis.exponent for axis in model.axes] == [2.5, 1.2] and model.turns == "field" and model.channels == 3
 
 
 def test_a_bank_ends_where_the_lens_goes_black() -> None:
@@ -359,13 +337,6 @@ def test_a_bank_ends_where_the_lens_goes_black() -> None:
     assert model.throughput(100.0, field.high) == pytest.approx(0.01, abs=0.02)
     with pytest.raises(InputError, match=r"no light passes|no ray"):
         model.kernel(at(2.0, min(1.0, field.high + 0.1)), RAYS, 0)
-
-
-def test_the_grid_has_the_papers_number_of_samples() -> None:
-    """Table 1: 4,000 samples, exponents 2.5 and 1.2."""
-    model = lens()
-    assert len(NestedGrid(model.counts)) == pytest.approx(4000, abs=5)
-    assert [axis.exponent for axis in model.axes] == [2.5, 1.2] and model.turns == "field" and model.channels == 3
 
 
 def test_mistakes_are_named() -> None:

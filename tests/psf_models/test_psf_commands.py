@@ -1,12 +1,12 @@
 """`mrbokeh lens psf`, `export` and `show` as a user meets them: real files, builds that stopped half way, and mistakes."""
 
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from mrbokeh.commands.lens import app
 from mrbokeh.images.image_io import read_image, write_image
@@ -20,12 +20,12 @@ from mrbokeh.psf_models.simple_lens import SimpleLens
 from mrbokeh.renderers.bank.kernel_files import build_spreadlets, spreadlets_beside
 from mrbokeh.renderers.kernels.spreadlets import Sparsification, Spreadlet, sparsify
 from mrbokeh.system.errors import InputError
+from tests.scenes.command_line import printed_by
 
 SMALL = ["--diameter", "12", "--counts", "4"]
 
 
-def run(*arguments: object) -> str:
-    return CliRunner().invoke(app, [*map(str, arguments)], catch_exceptions=False).stdout
+run = partial(printed_by, app)
 
 
 def picture_file(path: Path) -> Path:
@@ -44,13 +44,16 @@ def test_a_bank_of_the_disc_holds_the_disc(tmp_path: Path) -> None:
     assert ends[0] < bank.kernels[3][middle, middle, 0] < ends[1]
 
 
-def test_the_opening_of_a_lens_file(tmp_path: Path) -> None:
+def test_the_opening_of_a_lens_file_and_a_picture_become_banks(tmp_path: Path) -> None:
     write_lens(tmp_path / "lens.json", Lens(50.0, 1.8, 2.0, 36.0, Aperture.heart()))
     run("psf", "simple", "--lens", tmp_path / "lens.json", "--out", tmp_path / "bank", *SMALL)
     bank = read_bank(tmp_path / "bank")
     expected = SimpleLens(Aperture.heart()).kernel(bank.boxes[3], 0, 0)
     np.testing.assert_allclose(bank.kernels[3], expected, atol=1e-7)
     assert bank.near_side_turned
+    run("psf", "stylized", "--image", picture_file(tmp_path / "logo.png"), "--out", tmp_path / "logo", *SMALL)
+    bank = read_bank(tmp_path / "logo")
+    assert bank.channels == 3 and len(bank.kernels) == 4 and bank.near_side_turned
 
 
 def test_combined_traced_by_rays(tmp_path: Path) -> None:
@@ -60,12 +63,6 @@ def test_combined_traced_by_rays(tmp_path: Path) -> None:
     assert bank.axes[0].high == 8.0 and bank.axes[1].high == 6.0
     for box, kernel in zip(bank.boxes, bank.kernels, strict=True):
         assert np.abs(kernel - Combined().kernel(box, 0, 0)).sum() < 0.03
-
-
-def test_a_picture_becomes_a_bank(tmp_path: Path) -> None:
-    run("psf", "stylized", "--image", picture_file(tmp_path / "logo.png"), "--out", tmp_path / "bank", *SMALL)
-    bank = read_bank(tmp_path / "bank")
-    assert bank.channels == 3 and len(bank.kernels) == 4 and bank.near_side_turned
 
 
 def test_the_same_bank_whatever_the_threads(tmp_path: Path) -> None:
@@ -134,7 +131,7 @@ def test_every_model_can_be_made_by_name(name: str, tmp_path: Path) -> None:
 PAIR = "60 2 1.5 20\n-60 5 1 20\n0 5 0 12\n60 2 1.5 20\n-60 0 1 20\n"
 
 
-def test_a_physical_lens_is_what_its_options_say(tmp_path: Path) -> None:
+def test_physical_lenses_and_media_are_what_their_options_say(tmp_path: Path) -> None:
     """Each option of the command line arrives as its namesake of the constructor: same settings, same kernels."""
     (tmp_path / "pair.dat").write_text(PAIR)
     options = ("--prescription", tmp_path / "pair.dat", "--focus", 3, "--f-number", 8, "--sensor-width", 24)
@@ -150,12 +147,9 @@ def test_a_physical_lens_is_what_its_options_say(tmp_path: Path) -> None:
     np.testing.assert_array_equal(bank.kernels[4], model.kernel(bank.boxes[4], 1 << 12, 4))
     made = choose_model("physical", ModelOptions(sensor_width_mm=24.0, sensor_height_mm=24.0, focus_distance_m=np.inf))
     assert made.settings["half_diagonal_mm"] == pytest.approx(12.0 * np.sqrt(2.0)) and made.settings["focus_distance_m"] == "inf"
-
-
-def test_a_medium_is_what_its_options_say(tmp_path: Path) -> None:
     options = ("--density-per-m", 0.4, "--anisotropy", 0.5, "--focal-px", 60, "--far", 2, "--counts", 3)
-    run("psf", "volume", *options, "--rays", 1000, "--out", tmp_path / "bank")
-    bank = read_bank(tmp_path / "bank")
+    run("psf", "volume", *options, "--rays", 1000, "--out", tmp_path / "medium")
+    bank = read_bank(tmp_path / "medium")
     assert [bank.settings[key] for key in ("density_per_m", "anisotropy", "focal_px")] == [0.4, 0.5, 60.0] and bank.axes[0].high == 2.0
 
 

@@ -168,17 +168,14 @@ def test_the_opening_that_rays_see_is_made_of_its_polygons(aperture: Aperture) -
     np.testing.assert_allclose(seen, expected, atol=1e-12)
 
 
-def test_in_front_of_the_focus_a_lens_is_seen_turned() -> None:
+def test_in_front_of_the_focus_a_lens_is_seen_turned_and_sides_that_differ_have_signed_diameters() -> None:
     """The bank's half turn is what the opening does at a negative diameter; a symmetric opening needs none."""
     heart = SimpleLens(Aperture.heart())
     assert heart.near_side_turned and not SimpleLens().near_side_turned and not SimpleLens(Aperture.blades(6)).near_side_turned
     behind, in_front = heart.exact(np.array([19.0])), heart.exact(np.array([-19.0]))
     np.testing.assert_allclose(in_front, behind[::-1, ::-1], atol=1e-7)
     assert np.abs(in_front - behind).max() > 0.5 * behind.max()
-
-
-def test_a_lens_whose_sides_differ_has_signed_diameters() -> None:
-    """Over-corrected: bright rims behind, bright middle in front; red is the wider behind, the narrower in front."""
+    # Over-corrected: bright rims behind, bright middle in front; red is the wider behind, the narrower in front.
     model = SimpleLens(Aperture(Aperture.disc().outlines, (1.0,), spherical_aberration=0.8, axial_chromatic=(0.1, 0.0, -0.1)))
     assert model.axes == (Axis("diameter_px", -512.0, 512.0, 2.0),) and model.channels == 3 and not model.near_side_turned
     behind, in_front = model.exact(np.array([40.0])), model.exact(np.array([-40.0]))
@@ -189,19 +186,7 @@ def test_a_lens_whose_sides_differ_has_signed_diameters() -> None:
     assert widths[0] == [45, 41, 37] and widths[1] == [37, 41, 45]  # 1.1, 1 and 0.9 times 40, in whole and begun pixels
 
 
-def test_colours_of_a_stylized_psf_differ_in_scale_only() -> None:
-    """Second moments about the centroid go with the square of the scale, less the pixel's own 1/12 on both sides."""
-    picture = np.repeat(logo()[..., :1], 3, axis=2)
-    model = Stylized(picture, chromatic=(0.2, 0.0, -0.2))
-    kernel = model.exact(np.array([60.0])).astype(np.float64)
-    places = np.arange(len(kernel)) - len(kernel) // 2
-    spread = kernel.sum(axis=0).T @ places**2 - 1.0 / 12.0
-    np.testing.assert_allclose(np.sqrt(spread / spread[1]), [1.2, 1.0, 0.8], rtol=1e-3)
-    plain = Stylized(picture, chromatic=(0.0, 0.0, 0.0)).exact(np.array([60.0]))
-    np.testing.assert_array_equal(plain[..., 0], plain[..., 2])
-
-
-def test_a_stylized_psf_is_the_picture() -> None:
+def test_a_stylized_psf_is_the_picture_and_its_colours_differ_in_scale_only() -> None:
     """Enlarged so that a pixel of the picture covers 4 x 4 pixels: sums over these are the picture, upright as it was given."""
     picture = np.repeat(logo()[..., :1], 3, axis=2)
     picture[52, 5] = 0.0
@@ -213,6 +198,15 @@ def test_a_stylized_psf_is_the_picture() -> None:
     row, column = (np.round(len(kernel) / 2 + 4.0 * (corner - place)).astype(int) for corner, place in ((10, origin[1]), (20, origin[0])))
     seen = kernel[row : row + 120, column : column + 200].reshape(30, 4, 50, 4).sum(axis=(1, 3))
     assert np.corrcoef(seen.ravel(), light[10:40, 20:70].ravel())[0, 1] > 0.9
+    # Second moments about the centroid go with the square of the scale, less the pixel's own 1/12 on both sides.
+    picture = np.repeat(logo()[..., :1], 3, axis=2)
+    model = Stylized(picture, chromatic=(0.2, 0.0, -0.2))
+    kernel = model.exact(np.array([60.0])).astype(np.float64)
+    places = np.arange(len(kernel)) - len(kernel) // 2
+    spread = kernel.sum(axis=0).T @ places**2 - 1.0 / 12.0
+    np.testing.assert_allclose(np.sqrt(spread / spread[1]), [1.2, 1.0, 0.8], rtol=1e-3)
+    plain = Stylized(picture, chromatic=(0.0, 0.0, 0.0)).exact(np.array([60.0]))
+    np.testing.assert_array_equal(plain[..., 0], plain[..., 2])
 
 
 @pytest.mark.parametrize("dimensions", [2, 3, 5])

@@ -5,7 +5,7 @@ kernels are float32.
 """
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -32,15 +32,6 @@ from mrbokeh.psf_models.torch_tracing._rays import summed  # noqa: E402
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 RAYS = 1 << 15
 Model = Callable[..., PsfModel]
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Few rays gain nothing from threads, which wait for one another where tests run side by side."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 def picture() -> np.ndarray:

@@ -53,7 +53,7 @@ def test_mean_cosine_is_the_anisotropy(anisotropy: float) -> None:
         assert below == pytest.approx(share, abs=1e-6)
 
 
-def test_turning_keeps_the_angle_and_the_length() -> None:
+def test_turning_keeps_the_angle_and_the_length_and_has_no_preferred_side() -> None:
     rng = np.random.default_rng(0)
     for _ in range(200):
         direction = rng.normal(size=3)
@@ -61,10 +61,7 @@ def test_turning_keeps_the_angle_and_the_length() -> None:
         new, cosine = direction.copy(), rng.uniform(-1.0, 1.0)
         compiled.turn(new, cosine, rng.uniform(0.0, 2.0 * np.pi))
         assert np.linalg.norm(new) == pytest.approx(1.0, abs=1e-12) and new @ direction == pytest.approx(cosine, abs=1e-9)
-
-
-def test_turning_has_no_preferred_side() -> None:
-    """Over a full turn of the azimuth what is across the old direction cancels, for directions on both sides of the pole."""
+    # Over a full turn of the azimuth what is across the old direction cancels, for directions on both sides of the pole.
     for direction in (np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.0, -1.0]), np.array([0.6, -0.48, 0.64])):
         total = np.zeros(3)
         for azimuth in np.arange(16) / 16.0 * 2.0 * np.pi:
@@ -142,15 +139,7 @@ def test_energy_of_straight_walks_is_analytic(albedo: float) -> None:
     assert (albedo**collisions).mean() == pytest.approx(np.exp(-(1.0 - albedo) * tau), rel=0.01)
 
 
-def test_energy_with_absorption_lies_between_its_bounds() -> None:
-    """No path out is shorter than straight: energy is at most exp(-(1 - a) tau), and at least exp(-(1 - a) mean collisions) (Jensen)."""
-    for distance_m in (1.0, 4.0):
-        _, collisions = traced(distance_m)
-        energy = (0.9**collisions).mean()
-        assert np.exp(np.log(0.9) * collisions.mean()) < energy < np.exp(-0.1 * 0.9 * distance_m)
-
-
-def test_a_kernel_without_absorption_keeps_all_light_and_blue_loses_some() -> None:
+def test_absorption_darkens_colours_where_they_absorb() -> None:
     model = Volume(size_px=129, focal_px=200.0)
     near, far = (model.kernel(at(distance_m), RAYS, 0) for distance_m in (0.5, 4.0))
     for kernel in (near, far):
@@ -158,10 +147,7 @@ def test_a_kernel_without_absorption_keeps_all_light_and_blue_loses_some() -> No
         assert_allclose(light[:2], 1.0, rtol=1e-5)
         assert light[2] < 1.0
     assert far[:, :, 2].sum() < near[:, :, 2].sum()
-
-
-def test_absorption_darkens_all_colours_where_all_absorb() -> None:
-    """The whole is what would be seen without absorption: a grey medium is darker, not scaled back to 1."""
+    # The whole is what would be seen without absorption: a grey medium is darker, not scaled back to 1.
     light = Volume(albedo=(0.5, 0.5, 0.5), size_px=65, focal_px=50.0).kernel(at(1.0), RAYS, 0).sum(axis=(0, 1), dtype=np.float64)
     assert_allclose(light, light[0])
     assert light[0] < 0.8
@@ -191,35 +177,19 @@ def test_rings_are_the_photons_turned_at_random() -> None:
     assert (np.abs(blocks[0] - blocks[1]) < 5.0 * np.sqrt(blocks[1] + 1.0)).all()
 
 
-def test_the_majorant_changes_nothing_but_time() -> None:
-    tight, loose = (Volume(size_px=65, focal_px=60.0, majorant_per_m=each).kernel(at(2.0), 1 << 18, 0) for each in (0.9, 2.0))
-    assert np.abs(tight - loose).sum() < 0.03 * tight.sum()
-
-
-def test_prefiltering_is_the_mean_over_distances() -> None:
+def test_prefiltering_is_the_mean_over_distances_and_the_majorant_changes_nothing_but_time() -> None:
     model = Volume(size_px=65, focal_px=60.0)
     whole = model.kernel(np.array([[1.0, 2.0]]), 1 << 18, 0)
     parts = [model.kernel(at(each), 1 << 16, 5) for each in 1.0 + (np.arange(8) + 0.5) / 8.0]
     assert np.abs(whole - np.mean(parts, axis=0)).sum() < 0.04 * whole.sum()
+    tight, loose = (Volume(size_px=65, focal_px=60.0, majorant_per_m=each).kernel(at(2.0), 1 << 18, 0) for each in (0.9, 2.0))
+    assert np.abs(tight - loose).sum() < 0.03 * tight.sum()
 
 
-def test_same_seed_same_kernel_other_seed_another() -> None:
-    model = Volume(size_px=65)
-    first, again, other = (model.kernel(at(2.0), 100000, seed) for seed in (7, 7, 8))
-    assert np.array_equal(first, again) and not np.array_equal(first, other)
-
-
-@pytest.mark.parametrize(
-    ("wrong", "sentence"),
-    [
-        ({"density_per_m": -1.0}, "density"),
-        ({"anisotropy": 1.0}, "between -1 and 1"),
-        ({"albedo": (1.0, 1.0, 1.1)}, "albedos"),
-        ({"size_px": 64}, "odd width"),
-        ({"majorant_per_m": 0.5}, "majorant"),
-        ({"focal_px": 0.0}, "focal length"),
-    ],
-)
+@pytest.mark.parametrize(("wrong", "sentence"), [
+    ({"density_per_m": -1.0}, "density"), ({"anisotropy": 1.0}, "between -1 and 1"), ({"albedo": (1.0, 1.0, 1.1)}, "albedos"),
+    ({"size_px": 64}, "odd width"), ({"majorant_per_m": 0.5}, "majorant"), ({"focal_px": 0.0}, "focal length"),
+])  # fmt: skip
 def test_mistakes_are_named(wrong: dict, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         Volume(**wrong)

@@ -21,17 +21,14 @@ def restlessness(dioptres: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.diff(dioptres, 2) ** 2)))
 
 
-def test_keys_go_linearly_in_dioptres_and_are_held() -> None:
+def test_keys_go_linearly_or_smoothly_in_dioptres_and_are_held() -> None:
     """1 D to 0.25 D over 30 frames: at frame 10 0.75 D."""
     pull = parse_focus_keys("10:1,40:4")
     assert pull.at(20) == pytest.approx(1.0 / 0.75) and pull.at(10) == 1.0 and pull.at(40) == 4.0
     assert pull.at(0) == 1.0 and pull.at(99) == 4.0
     assert pull.shifted(100).at(120) == pytest.approx(1.0 / 0.75)
     assert parse_focus_keys("0:2,10:inf").at(5) == 4.0 and parse_focus_keys("0:2,10:inf").at(10) == float("inf")
-
-
-def test_smooth_keys_rest_at_both_ends_and_never_overshoot() -> None:
-    """Of two keys smooth is 3 t^2 - 2 t^3; through a key in between it goes on without a stop, and stays between its keys."""
+    # Of two keys smooth is 3 t^2 - 2 t^3; through a key in between it goes on without a stop, and stays between its keys.
     pull = parse_focus_keys("0:1,10:2", "smooth")
     assert 1.0 / pull.at(2.5) == pytest.approx(1.0 - 0.5 * (3 * 0.0625 - 2 * 0.015625))
     pull = parse_focus_keys("0:1,10:2,20:2.1,30:8", "smooth")
@@ -51,16 +48,13 @@ def test_keys_that_are_none_are_refused() -> None:
         FocusPull(np.array([1.0, 1.0]), np.array([1.0, 1.0]))
 
 
-def test_the_venice_writes_feet(shared_data: Path) -> None:
+def test_venice_red_and_canon_write_feet_millimetres_and_bits(shared_data: Path) -> None:
     """The first row is 5.83 ft."""
     pull = read_focus_pull(venice(shared_data))
     assert len(pull.frames) == 588 and pull.at(0) == pytest.approx(5.83 * 0.3048)
     with pytest.raises(InputError, match="from frame 0 to 587"):
         pull.at(588)
-
-
-def test_red_writes_millimetres_and_canon_bits(shared_data: Path) -> None:
-    """REDline: 410 and 420 mm. Canon: 3F000000 is 0.5."""
+    # REDline: 410 and 420 mm. Canon: 3F000000 is 0.5.
     folder = venice(shared_data).parent
     red, canon = read_focus_pull(folder / "red_frames.csv"), read_focus_pull(folder / "canon_frames.csv")
     assert (red.at(0), red.at(1)) == (pytest.approx(0.41), pytest.approx(0.42))
@@ -75,15 +69,11 @@ def test_plain_tables_name_their_unit(tmp_path: Path) -> None:
     assert pull.at(12) == pytest.approx(1.0 / 0.75)
 
 
-@pytest.mark.parametrize(
-    ("text", "says"),
-    [
-        ("frame,distance\n0,1\n", "with its unit"),
-        ("focus_distance_m\n\n", "holds no row"),
-        ("frame,focus_distance_m\n0,\n1,\n", "none of its 2 rows"),
-        ("frame,focus_distance_m\n0,near\n", "row 1: its focus distance is not a number"),
-    ],
-)
+@pytest.mark.parametrize(("text", "says"), [
+    ("frame,distance\n0,1\n", "with its unit"), ("focus_distance_m\n\n", "holds no row"),
+    ("frame,focus_distance_m\n0,\n1,\n", "none of its 2 rows"),
+    ("frame,focus_distance_m\n0,near\n", "row 1: its focus distance is not a number"),
+])  # fmt: skip
 def test_tables_without_focus_are_refused(tmp_path: Path, text: str, says: str) -> None:
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(InputError, match=says):

@@ -1,14 +1,15 @@
 """New slices of a focal stack, held against traced ones and against slices that were left out; one virtual scene in a whole stack."""
 
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from mrbokeh.commands.refocus import app
 from mrbokeh.compositing.over import OverPhotograph
+from mrbokeh.compositing.plate import plate_of
 from mrbokeh.compositing.stack_compositing import composite_stack
 from mrbokeh.images.camera_rgb import read_camera_rgb, write_camera_rgb
 from mrbokeh.images.exr_io import read_exr
@@ -22,6 +23,7 @@ from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, writ
 from mrbokeh.stacks.focus_places import FocusLookup, parse_focus
 from mrbokeh.system.errors import InputError
 from tests.scenes.card_stack import CARD_PX, LENS, SIZE, make_card_stack
+from tests.scenes.command_line import printed_by
 
 BETWEEN_M = 0.52
 
@@ -30,16 +32,22 @@ def card_stack(folder: Path) -> FocalStack:
     return make_card_stack(folder, 3)
 
 
-def run(*arguments: object) -> str:
-    result = CliRunner().invoke(app, [*map(str, arguments)], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
-    return result.output
+run = partial(printed_by, app)
 
 
-def test_a_captured_focus_gives_the_captured_slice(tmp_path: Path) -> None:
+def test_a_captured_focus_gives_the_captured_slice_and_others_what_the_lens_gives(tmp_path: Path) -> None:
     stack = card_stack(tmp_path / "stack")
     found = Refocusing(stack, ScatterReference(threads=1)).slice_at(0.55)
     np.testing.assert_array_equal(found, stack.slice_rgb(1))
+    # The stack was made by this very renderer and lens, so that nothing is left for residuals and truth is exact.
+    way = Refocusing(stack, ScatterReference(threads=1))
+    for focus_m in (BETWEEN_M, 0.45, float("inf")):
+        truth = make_card_stack(tmp_path / f"truth_{focus_m}", 3, (focus_m,)).slice_rgb(0)
+        np.testing.assert_allclose(way.slice_at(focus_m), truth, atol=2e-5)
+    wide = replace(LENS, f_number=LENS.f_number / 2)
+    way = Refocusing(stack, ScatterReference(threads=1), wide)
+    assert way.lens_at(0.5).coc_px_per_dioptre(SIZE[1]) == pytest.approx(2 * LENS.focused_at(0.5).coc_px_per_dioptre(SIZE[1]))
+    np.testing.assert_array_equal(way.slice_at(0.5), way.rendered(0.5))
 
 
 def test_nothing_pops_where_a_focus_pull_passes_a_captured_slice(tmp_path: Path) -> None:
@@ -53,23 +61,6 @@ def test_nothing_pops_where_a_focus_pull_passes_a_captured_slice(tmp_path: Path)
         dim = at.max(axis=2) < 0.9
         assert np.abs(at - beside)[dim].mean() < most
     assert np.abs(Refocusing(stack, ScatterReference(threads=1), residuals=False).slice_at(0.55) - stack.slice_rgb(1)).mean() > 0.005
-
-
-def test_between_and_beyond_the_captured_slices_is_what_the_lens_gives(tmp_path: Path) -> None:
-    """The stack was made by this very renderer and lens, so that nothing is left for residuals and truth is exact."""
-    stack = card_stack(tmp_path / "stack")
-    way = Refocusing(stack, ScatterReference(threads=1))
-    for focus_m in (BETWEEN_M, 0.45, float("inf")):
-        truth = make_card_stack(tmp_path / f"truth_{focus_m}", 3, (focus_m,)).slice_rgb(0)
-        np.testing.assert_allclose(way.slice_at(focus_m), truth, atol=2e-5)
-
-
-def test_a_larger_opening_blurs_more_and_the_residuals_stay_out(tmp_path: Path) -> None:
-    stack = card_stack(tmp_path / "stack")
-    wide = replace(LENS, f_number=LENS.f_number / 2)
-    way = Refocusing(stack, ScatterReference(threads=1), wide)
-    assert way.lens_at(0.5).coc_px_per_dioptre(SIZE[1]) == pytest.approx(2 * LENS.focused_at(0.5).coc_px_per_dioptre(SIZE[1]))
-    np.testing.assert_array_equal(way.slice_at(0.5), way.rendered(0.5))
 
 
 def test_scale_and_f_number_go_over_between_slices(tmp_path: Path) -> None:
@@ -201,29 +192,20 @@ def lamp(depth_m: float = 0.6) -> Layer:
     return Layer(alpha[..., None] * np.array([0.1, 0.9, 0.3], np.float32), alpha, np.where(alpha > 0, depth_m, np.inf).astype(np.float32))
 
 
-def test_every_slice_holds_the_scene_with_its_own_blur(tmp_path: Path) -> None:
+def test_a_scene_in_a_stack_has_each_slice_s_blur_and_merges_as_if_it_had_been_there(tmp_path: Path) -> None:
     stack, renderer = card_stack(tmp_path / "stack"), ScatterReference(threads=1)
     made = composite_stack(stack, [lamp()], OverPhotograph(), renderer, tmp_path / "made")
     read = read_focal_stack(tmp_path / "made")
     assert read.focus_distances_m == stack.focus_distances_m == made.focus_distances_m
-    alone = OverPhotograph().insert
     for index in range(len(stack)):
-        from mrbokeh.compositing.plate import plate_of
-
-        expected = alone(plate_of(stack.slice_rgb(index), stack.lens_of(index), stack.depth_m()), [lamp()], renderer).rgb
+        plate = plate_of(stack.slice_rgb(index), stack.lens_of(index), stack.depth_m())
+        expected = OverPhotograph().insert(plate, [lamp()], renderer).rgb
         np.testing.assert_allclose(read.slice_rgb(index), expected, atol=2e-5)
-
-
-def test_the_result_merges_as_if_the_lamp_had_been_there(tmp_path: Path) -> None:
-    """Depth and all-in-focus picture hold the visible half of the lamp, sharp; what it does not touch is bit for bit the same."""
-    stack = card_stack(tmp_path / "stack")
-    made = composite_stack(stack, [lamp()], OverPhotograph(), ScatterReference(threads=1), tmp_path / "made")
+    # Depth and all-in-focus picture hold the visible half of the lamp, sharp; what it does not touch is bit for bit the same.
     seen = np.zeros(SIZE, bool)
     seen[16:32, CARD_PX : CARD_PX + 8] = True
     np.testing.assert_array_equal(made.depth_m(), np.where(seen, np.float32(0.6), stack.depth_m()))
-    np.testing.assert_allclose(
-        made.all_in_focus()[seen], np.broadcast_to(np.array([0.1, 0.9, 0.3], np.float32), (seen.sum(), 3)), atol=1e-6
-    )
+    np.testing.assert_allclose(made.all_in_focus()[seen], np.tile(np.float32([0.1, 0.9, 0.3]), (seen.sum(), 1)), atol=1e-6)
     np.testing.assert_array_equal(made.all_in_focus()[~seen], stack.all_in_focus()[~seen])
     assert (made.depth_confidence()[seen] == 1).all()
     # 0.6 m lies between the slices at 0.55 m and 0.7 m, evenly in dioptres.

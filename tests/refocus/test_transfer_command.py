@@ -99,16 +99,13 @@ def test_a_focus_pull_is_a_film(files: dict[str, Path]) -> None:
         run(files, "one.png", "--focus", "1:2:5")
 
 
-def test_clipped_light_is_boosted_only_when_asked(files: dict[str, Path]) -> None:
+def test_clipped_light_is_boosted_only_when_asked_and_smoothly(files: dict[str, Path]) -> None:
     """The lamp at 2 m is one pixel of white 5 px out of focus; three stops more are eight times its light, and of nothing else."""
     plain = read_image(run(files, "a.exr", photo="photo.png"))
     boosted = read_image(run(files, "b.exr", "--highlights", 3, photo="photo.png"))
     np.testing.assert_allclose(plain, expected(files, 1.0), rtol=2e-3, atol=1e-4)
     gained = (boosted.astype(np.float64) - plain).sum(axis=(0, 1))
     np.testing.assert_allclose(gained, 7.0, rtol=0.01)
-
-
-def test_recovery_goes_over_smoothly_and_leaves_what_is_not_clipped() -> None:
     grey = np.repeat(np.linspace(0, 1, 400, dtype=np.float32)[None, :, None], 3, axis=2)
     found = with_recovered_highlights(grey, 2.0)
     untouched = linear_to_srgb(grey[0, :, 0]) < 0.97
@@ -116,16 +113,13 @@ def test_recovery_goes_over_smoothly_and_leaves_what_is_not_clipped() -> None:
     assert found[0, -1, 0] == pytest.approx(4.0) and (np.diff(found[0, :, 0]) >= 0).all()
 
 
-def test_the_same_view_is_a_lens_of_another_length() -> None:
+def test_the_same_view_is_a_lens_of_another_length_and_asks_the_photograph(files: dict[str, Path]) -> None:
     """A phone of 4.2 mm on 5.6 mm sees what 27 mm sees on 36 mm."""
     phone = Photograph(np.zeros((4, 4, 3), np.float32), focal_length_mm=4.2, sensor_width_mm=5.6)
     found = seen_like(replace(LENS, sensor_width_mm=36.0), phone, Path("phone.jpg"))
     assert found.focal_length_mm == pytest.approx(27.0) and found.f_number == LENS.f_number
     with pytest.raises(InputError, match="--same-view"):
         seen_like(LENS, Photograph(np.zeros((4, 4, 3), np.float32)), Path("phone.jpg"))
-
-
-def test_same_view_asks_the_photograph(files: dict[str, Path]) -> None:
     with pytest.raises(InputError, match="does not tell its focal length"):
         run(files, "a.exr", "--same-view")
 

@@ -21,27 +21,14 @@ from mrbokeh.renderers.bank.lattice import SIDES, BankLattice
 from mrbokeh.renderers.bank.renderers import decompose_bank
 from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
 from mrbokeh.system.errors import InputError
-from tests.scenes.renderer_banks import (
-    BRIGHT_RIM,
-    CAT_RING,
-    HIGHS,
-    LENS,
-    bank_of,
-    discs_bank,
-    rings_bank,
-    rings_polygons,
-    slanted,
-)
+from tests.scenes.renderer_banks import BRIGHT_RIM, CAT_RING, HIGHS, LENS, bank_of, discs_bank, rings_bank, rings_polygons, slanted
 
 # Contours stray from an outline by what a pixel smooths: a share of its area that falls as its diameter grows; a soft kernel also
 # lacks what four levels cannot tell. Bounds at 12 and 30 px; measured 0.020 and 0.014 for the disc, 0.089 and 0.093 for the bright rim.
 SHAPES = {
-    "disc": (Aperture.disc(), 0.025, 0.02),
-    "heptagon": (Aperture.blades(7), 0.035, 0.025),
-    "ring": (Aperture.ring(0.5), 0.05, 0.03),
-    "heart": (Aperture.heart(), 0.055, 0.035),
-    "bright rim": (BRIGHT_RIM, 0.10, 0.11),
-}
+    "disc": (Aperture.disc(), 0.025, 0.02), "heptagon": (Aperture.blades(7), 0.035, 0.025),
+    "ring": (Aperture.ring(0.5), 0.05, 0.03), "heart": (Aperture.heart(), 0.055, 0.035), "bright rim": (BRIGHT_RIM, 0.10, 0.11),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -60,14 +47,11 @@ def test_polygons_come_near_to_a_known_kernel(shape: str) -> None:
             assert drawn.sum(axis=axis) @ away == pytest.approx(wanted.sum(axis=axis) @ away, abs=0.05)
 
 
-def test_more_levels_tell_more_of_a_soft_kernel() -> None:
+def test_more_levels_tell_more_of_a_soft_kernel_and_islands_of_noise_are_left_out() -> None:
     kernel = BRIGHT_RIM.rasterize(30.0).kernel
     errors = [fit_polygons(kernel, 30.0, levels).relative_error for levels in (1, 4, 8)]
     assert errors[0] > errors[1] > errors[2]
-
-
-def test_islands_of_noise_are_left_out() -> None:
-    """A disc whose brightness varies smoothly by 10 %, as that of a noisy measurement: fewer outlines, at most a third more error."""
+    # A disc whose brightness varies smoothly by 10 %, as that of a noisy measurement: fewer outlines, at most a third more error.
     kernel = Aperture.disc().rasterize(30.0).kernel
     noise = gaussian_filter(np.random.default_rng(0).standard_normal(kernel.shape), 1.5)
     noisy = kernel * (1.0 + 0.1 * noise / noise.std())
@@ -78,14 +62,11 @@ def test_islands_of_noise_are_left_out() -> None:
     assert every.relative_error < fit.relative_error < 4.0 / 3.0 * every.relative_error
 
 
-def test_kernels_that_are_alike_share_an_aperture() -> None:
+def test_kernels_that_are_alike_share_an_aperture_and_points_have_none() -> None:
     """Those of a disc on both sides of the focus do; those of a ring that is clipped towards the corners do not."""
     found = fit_apertures(BankLattice(discs_bank()))
     assert all(behind[0][0] is in_front[0][0] for behind, in_front in zip(*found.apertures, strict=True))
     assert not rings_polygons().is_one(1, 0)
-
-
-def test_a_kernel_that_is_a_point_has_no_polygons() -> None:
     with pytest.raises(InputError, match="more than 2 px"):
         fit_polygons(np.ones((1, 1)), 1.0)
 

@@ -14,13 +14,13 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.psf_bank import Axis, PsfBank
 from mrbokeh.psf_models.build import Combined
-from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface
 from mrbokeh.psf_models.physical_lens import PhysicalLens
 from mrbokeh.psf_models.volume import Volume
 from mrbokeh.renderers.bank.tables import BankTables
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 from mrbokeh.system.errors import InputError
+from tests.psf_models.test_physical_lens import pair
 
 HEIGHT, WIDTH = SIZE = (64, 90)
 LENS = Lens(focal_length_mm=50.0, f_number=0.7, focus_distance_m=0.5, sensor_width_mm=22.0)
@@ -126,9 +126,8 @@ def test_what_is_behind_a_vignetted_object_does_not_shine_through() -> None:
     """A black card before a lamp wall of 1000, where rims take up to 80 % of the light; extra channels are not darkened."""
     card = np.zeros(SIZE, np.float32)
     card[:, :40] = 1.0
-    near = Layer(
-        np.zeros((*SIZE, 3), np.float32), card, np.where(card > 0, depth_m(-6.0), np.float32(np.inf)), {"id": 7.0 * card[..., None]}
-    )
+    near_m = np.where(card > 0, depth_m(-6.0), np.float32(np.inf))
+    near = Layer(np.zeros((*SIZE, 3), np.float32), card, near_m, {"id": 7.0 * card[..., None]})
     wall = replace(white(9.0), rgb=np.full((*SIZE, 3), 1000.0, np.float32), extra={"id": np.zeros((*SIZE, 1), np.float32)})
     seen = LaplacianSpreadlets(vignetted()).render([near, wall], LENS)
     inside = np.s_[6:-6, 6:34]  # layers with holes end at the frame
@@ -141,11 +140,8 @@ def test_what_is_behind_a_vignetted_object_does_not_shine_through() -> None:
 @pytest.mark.slow
 def test_a_lens_with_rims_shades_a_white_picture_as_its_throughput_says() -> None:
     """Two achromats about a stop whose rims cut the beam to a quarter in the corners: the picture gets what is measured ray by ray."""
-    front = (Surface(60.0, 6.0, 1.6204, 13.0, 60.3), Surface(-60.0, 2.0, 1.62, 13.0, 36.4), Surface(300.0, 12.0, 1.0, 13.0))
-    behind = (Surface(-300.0, 2.0, 1.62, 13.0, 36.4), Surface(60.0, 6.0, 1.6204, 13.0, 60.3), Surface(-60.0, 0.0, 1.0, 13.0))
-    pair = LensPrescription("pair", (*front, Surface(np.inf, 12.0, 1.0, 10.0, is_stop=True), *behind))
     sensor_mm = (30.0, 30.0 * HEIGHT / WIDTH)
-    model = PhysicalLens(pair, focus_distance_m=2.0, sensor_mm=sensor_mm, image_width_px=WIDTH, nearest_m=1.5, farthest_m=3.0)
+    model = PhysicalLens(pair(13.0), focus_distance_m=2.0, sensor_mm=sensor_mm, image_width_px=WIDTH, nearest_m=1.5, farthest_m=3.0)
     depth, field = model.axes
     edges = field.from_unit(np.linspace(0.0, 1.0, 17))
     kernels = tuple(model.kernel(np.array([[2.0, 2.0], edges[i : i + 2]]), 1 << 12, i) for i in range(16))
@@ -252,24 +248,20 @@ def test_a_moving_edge_hides_what_is_behind_it_for_the_time_that_it_is_there(com
     np.testing.assert_allclose(seen[12:], share[12:], atol=0.025)
 
 
-def test_what_stands_still_has_kernels_without_motion(combined: PsfBank) -> None:
+def test_without_motion_kernels_stand_still_and_a_bank_without_it_gets_its_light_drawn_out(combined: PsfBank) -> None:
     layers = [card(30, -8.0, (0.0, 0.0)), still(10.0)]
     without = [replace(layer, extra={name: each for name, each in layer.extra.items() if name != MOTION}) for layer in layers]
     renderer = LaplacianSpreadlets(combined)
     np.testing.assert_array_equal(renderer.render(layers, LENS).rgb, renderer.render(without, LENS).rgb)
-
-
-def test_a_bank_without_motion_gets_its_light_drawn_out() -> None:
-    """A bank of a disc's kernels moves as the disc does: the same slices, the same paths."""
+    # A bank of a disc's kernels moves as the disc does: the same slices, the same paths.
     kernels = tuple(Aperture.disc().rasterize(size).kernel[..., None].astype(np.float32) for size in (6.0, 18.0))
     bank = PsfBank("discs", (Axis("diameter_px", 0.0, 24.0),), (2,), kernels, nested=False)
     layers = [card(30, 6.0, (14.0, 5.0)), still(18.0)]
     found, drawn = LaplacianSpreadlets(bank).render(layers, LENS), ScatterReference().render(layers, LENS)
     assert psnr(found.rgb, drawn.rgb) > 45.0
-
-
-def test_blur_beyond_the_bank_is_one_sentence(combined: PsfBank) -> None:
-    with pytest.raises(InputError, match=r"up to 32 px, but this picture has 50\.0 px: .*--diameter"):
-        LaplacianSpreadlets(combined).render([still(-50.0)], LENS)
-    with pytest.raises(InputError, match=r"motion up to 40 px, but this picture has 60\.0 px: .*--motion"):
-        LaplacianSpreadlets(combined).render([card(30, 5.0, (60.0, 0.0)), still(9.0)], LENS)
+    for layers, said in (
+        ([still(-50.0)], r"up to 32 px, but this picture has 50\.0 px: .*--diameter"),
+        ([card(30, 5.0, (60.0, 0.0)), still(9.0)], r"motion up to 40 px, but this picture has 60\.0 px: .*--motion"),
+    ):
+        with pytest.raises(InputError, match=said):
+            LaplacianSpreadlets(combined).render(layers, LENS)

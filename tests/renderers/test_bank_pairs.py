@@ -5,8 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
-from typer.testing import CliRunner
 
 from datasets_scripts.bank_pairs import FARTHEST_M, NEAREST_M, PairsPlan, main, make_bank_pairs, random_layers
 from mrbokeh.images.image_metrics import psnr
@@ -19,6 +17,7 @@ from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.stacks.focal_stack_dataset import file_troubles, read_focal_stack_dataset
 from mrbokeh.system.errors import InputError
+from tests.scenes.command_line import printed_by
 from training.data.dataset import read_pair
 
 PLAN = PairsPlan(scenes=2, focuses=2, width_px=64, height_px=40)
@@ -33,17 +32,7 @@ def fixture_bank() -> PsfBank:
     return PsfBank("measured", (axis,), counts, kernels, nested=False)
 
 
-def test_scenes_have_one_wall_and_depths_within_the_range() -> None:
-    for seed in range(4):
-        layers = random_layers((40, 64), np.random.default_rng(seed))
-        assert len(layers) >= 4 and (layers[-1].alpha == 1.0).all()
-        for layer in layers:
-            seen_m = layer.depth_m[layer.alpha > 0]
-            assert (seen_m >= np.float32(NEAREST_M)).all() and (seen_m <= np.float32(FARTHEST_M)).all()
-            assert set(np.unique(layer.alpha)) <= {0.0, 1.0}
-
-
-def test_a_set_is_what_the_bank_makes_of_its_scenes(tmp_path: Path, bank: PsfBank) -> None:
+def test_a_set_is_what_the_bank_makes_of_its_scenes_with_one_wall_and_depths_within_the_range(tmp_path: Path, bank: PsfBank) -> None:
     """Slices are nearer to the ring by its own aperture than to a disc; the largest blur is nearly the bank's; training reads it."""
     dataset = make_bank_pairs(bank, tmp_path / "set", PLAN)
     assert read_focal_stack_dataset(tmp_path / "set") == dataset
@@ -59,6 +48,13 @@ def test_a_set_is_what_the_bank_makes_of_its_scenes(tmp_path: Path, bank: PsfBan
     assert psnr(seen, ring, 1.0) > psnr(seen, disc, 1.0) + 6.0
     pair = read_pair(stack, 1)
     assert pair.target.shape == (40, 64, 3) and np.abs(pair.coc_px).max() <= 10.0
+    for seed in range(4):
+        layers = random_layers((40, 64), np.random.default_rng(seed))
+        assert len(layers) >= 4 and (layers[-1].alpha == 1.0).all()
+        for layer in layers:
+            seen_m = layer.depth_m[layer.alpha > 0]
+            assert (seen_m >= np.float32(NEAREST_M)).all() and (seen_m <= np.float32(FARTHEST_M)).all()
+            assert set(np.unique(layer.alpha)) <= {0.0, 1.0}
 
 
 def test_an_interrupted_set_goes_on_and_another_is_refused(tmp_path: Path, bank: PsfBank) -> None:
@@ -79,12 +75,8 @@ def test_an_interrupted_set_goes_on_and_another_is_refused(tmp_path: Path, bank:
 
 
 def test_the_command_says_what_it_made_or_what_is_wrong(tmp_path: Path, bank: PsfBank) -> None:
-    app = typer.Typer()
-    app.command()(main)
     write_bank(tmp_path / "bank", bank)
-    words = ["--out", str(tmp_path / "set"), "--scenes", "1", "--focuses", "1", "--width", "32", "--height", "24"]
-    made = CliRunner().invoke(app, [str(tmp_path / "bank"), *words])
-    assert made.exit_code == 0 and "1 stacks" in made.output
+    words = ["--out", tmp_path / "set", "--scenes", 1, "--focuses", 1, "--width", 32, "--height", 24]
+    assert "1 stacks" in printed_by(main, tmp_path / "bank", *words)
     assert read_lens(tmp_path / "set" / "lens.json").focal_length_mm == 50.0
-    wrong = CliRunner().invoke(app, [str(tmp_path / "none"), *words])
-    assert wrong.exit_code == 2 and "bank of PSFs" in wrong.output
+    assert "bank of PSFs" in printed_by(main, tmp_path / "none", *words, exit_code=2)

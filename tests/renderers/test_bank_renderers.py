@@ -170,7 +170,7 @@ def test_a_symmetric_bank_is_turned_with_the_field(symmetric: PsfBank) -> None:
         assert psnr(seen / expected.max(), np.pad(expected, (33 - len(expected)) // 2) / expected.max()) > least, name
 
 
-def test_a_renderer_is_sent_to_another_process_without_its_tables() -> None:
+def test_a_bank_travels_without_its_tables_and_those_of_motion_and_depth_are_refused() -> None:
     """What it was made with travels, and nothing that rendering left in it; the copy makes the same picture to the bit."""
     bank, scene = discs_bank(), slanted(-12.0, 14.0)
     made: dict[str, Any] = {"layering": FEW, "threads": 1, "integration": "pyramid", "sparsification": None, "dense_up_to_px": 8.0}
@@ -182,9 +182,6 @@ def test_a_renderer_is_sent_to_another_process_without_its_tables() -> None:
     copy = pickle.loads(sent)
     assert type(copy) is LaplacianSpreadlets and {name: getattr(copy, name) for name in made} == made
     np.testing.assert_array_equal(copy.render(scene, LENS).rgb, picture.rgb)
-
-
-def test_banks_of_motion_and_depth_are_refused_with_one_sentence() -> None:
     axes = (Axis("diameter_px", 0.0, 10.0), Axis("motion_px", 0.0, 4.0))
     moving = PsfBank("combined", axes, (1, 1), (np.ones((1, 1, 1), np.float32),), "motion")
     with pytest.raises(InputError, match="laplacian takes every bank"):

@@ -19,16 +19,11 @@ def inner_laplacian(image: np.ndarray) -> np.ndarray:
     return laplacian(image)[1:-1, 1:-1]
 
 
-@pytest.mark.parametrize(
-    ("polynomial", "expected"),
-    [
-        (lambda x, y: 0 * x * y + 1, lambda x, y: 0 * x * y),
-        (lambda x, y: x**2 + y**2, lambda x, y: 0 * x * y + 4),
-        (lambda x, y: x * (x**2 + y**2), lambda x, y: 8 * x + 0 * y),
-        (lambda x, y: 3 * x**2 * y - y**3, lambda x, y: 0 * x * y),
-        (lambda x, y: ((x + 1j * y) ** 7).real, lambda x, y: 0 * x * y),
-    ],
-)
+@pytest.mark.parametrize(("polynomial", "expected"), [
+    (lambda x, y: 0 * x * y + 1, lambda x, y: 0 * x * y), (lambda x, y: x**2 + y**2, lambda x, y: 0 * x * y + 4),
+    (lambda x, y: x * (x**2 + y**2), lambda x, y: 8 * x + 0 * y), (lambda x, y: 3 * x**2 * y - y**3, lambda x, y: 0 * x * y),
+    (lambda x, y: ((x + 1j * y) ** 7).real, lambda x, y: 0 * x * y),
+])  # fmt: skip
 def test_the_stencil_has_the_true_laplacian_of_cubic_and_harmonic_polynomials(polynomial, expected) -> None:
     y, x = np.mgrid[-5:6, -5:6].astype(np.float64)
     found = laplacian(polynomial(x, y))[2:-2, 2:-2]
@@ -60,14 +55,13 @@ def test_a_light_of_a_million_leaves_the_dark_as_it_is_in_double_precision() -> 
     assert errors[1] > 1e-4
 
 
-def test_the_number_of_threads_changes_no_bit() -> None:
+def test_the_number_of_threads_changes_no_bit_and_integration_is_linear() -> None:
     source = np.random.default_rng(3).normal(size=(600, 540, 2))
     np.testing.assert_array_equal(integrate(source, 1), integrate(source, 3))
-
-
-def test_integration_is_linear() -> None:
     one, other = np.random.default_rng(4).normal(size=(2, 40, 50, 1))
     np.testing.assert_allclose(integrate(2.0 * one - other), 2.0 * integrate(one) - integrate(other), atol=1e-11)
+    with pytest.raises(InputError, match="at least 3 x 3"):
+        integrate(np.zeros((2, 9, 1)))
 
 
 @pytest.mark.parametrize("diameter_px", [40.0, 120.0])
@@ -90,8 +84,3 @@ def test_the_pyramid_integrates_the_light_of_a_constant_field_on_all_its_levels(
         near = image[..., 0] > 0
         assert (found * columns)[near].sum() / found[near].sum() == pytest.approx((image[..., 0] * columns).sum() / image.sum(), abs=0.15)
         assert (found * rows)[near].sum() / found[near].sum() == pytest.approx((image[..., 0] * rows).sum() / image.sum(), abs=0.15)
-
-
-def test_too_small_a_picture_is_refused() -> None:
-    with pytest.raises(InputError, match="at least 3 x 3"):
-        integrate(np.zeros((2, 9, 1)))

@@ -105,13 +105,10 @@ def test_linear_in_radiance(dense_up_to_px: float) -> None:
     np.testing.assert_allclose(scaled, 1000.0 * one, rtol=1e-5, atol=1e-3)
 
 
-def test_the_number_of_threads_changes_no_bit_of_sparse_sums() -> None:
+def test_the_number_of_threads_changes_no_bit_and_the_pyramid_is_a_worse_integration() -> None:
     values, coc_px = picture(7, (240, 120)), slope_px(-36.0, 40.0, (240, 120))
     one, three = (LaplacianSpreadlets(threads=threads).sum_kernels(values, coc_px, PENTAGON) for threads in (1, 3))
     np.testing.assert_array_equal(one, three)
-
-
-def test_the_pyramid_is_another_integration_and_a_worse_one() -> None:
     values, coc_px = picture(8), slope_px(30.0, 50.0)
     dense = LaplacianSpreadlets().sum_kernels(values, coc_px, DISC, densely=True)
     exact, pyramid = (LaplacianSpreadlets(integration=name).sum_kernels(values, coc_px, DISC) for name in ("exact", "pyramid"))
@@ -127,10 +124,7 @@ def test_splatting_agrees_with_its_plain_twin() -> None:
     splat(found, values, cells, points, (-8, -8))
     splat_reference(plain, values, cells, points, (-8, -8))
     np.testing.assert_allclose(found, plain, atol=1e-12)
-
-
-def test_neighbours_of_one_kernel_agree_with_the_plain_twin() -> None:
-    """Runs of one cell go two pixels at a time where points lie apart; tiles and strips end amid the picture."""
+    # Runs of one cell go two pixels at a time where points lie apart; tiles and strips end amid the picture.
     rng = np.random.default_rng(14)
     kernels = [sparsify(DISC.rasterize(size).kernel, UNRELAXED) for size in (11.0, 14.0)]
     points = joined_points([by_rows(each) for each in kernels])
@@ -324,15 +318,6 @@ def test_a_bank_of_an_apertures_kernels_is_the_aperture(coc_px: float) -> None:
     np.testing.assert_allclose(densely, reference, atol=4e-5)  # single precision: each of 1400 sums may round by 2**-25
 
 
-def test_a_kernel_that_was_turned_first_is_the_same_upright() -> None:
-    """What lies before the focus asks for it turned; kept unsorted for that, it was summed wrongly for what lies behind."""
-    values, far, near = picture(11), np.full(SIZE, 42.0, np.float32), np.full(SIZE, -42.0, np.float32)
-    renderer = LaplacianSpreadlets(bank_of(PENTAGON))
-    renderer.sum_bank_kernels(values, near, Place())
-    expected = LaplacianSpreadlets(bank_of(PENTAGON)).sum_bank_kernels(values, far, Place())
-    np.testing.assert_array_equal(renderer.sum_bank_kernels(values, far, Place()), expected)
-
-
 def test_kernels_are_turned_with_the_motion() -> None:
     """A bar to the right, used for a point that moves down, is a bar downwards; its light is the same."""
     bar = np.zeros((41, 41, 1), np.float32)
@@ -371,7 +356,7 @@ def test_colours_of_a_bank_take_their_own_kernels_and_coverage_too() -> None:
     np.testing.assert_allclose(found[4, 2:7, 3:6], kernels[2], atol=1e-7)
 
 
-def test_turning_a_kernel_is_turning_its_aperture() -> None:
+def test_turning_a_kernel_is_turning_its_aperture_and_one_turned_first_is_the_same_upright() -> None:
     kernel = Aperture.star().rasterize(60.0).kernel[..., None].astype(np.float32)
     found = turned_kernel(kernel, 0.7)
     truth = np.zeros_like(found[..., 0])
@@ -381,6 +366,12 @@ def test_turning_a_kernel_is_turning_its_aperture() -> None:
     assert found.sum() == pytest.approx(1.0, abs=1e-6)
     assert np.abs(found[..., 0] - truth).sum() < 0.05
     np.testing.assert_array_equal(turned_kernel(kernel, np.pi), kernel[::-1, ::-1].astype(np.float64))
+    # What lies before the focus asks for it turned; kept unsorted for that, it was summed wrongly for what lies behind.
+    values, far, near = picture(11), np.full(SIZE, 42.0, np.float32), np.full(SIZE, -42.0, np.float32)
+    renderer = LaplacianSpreadlets(bank_of(PENTAGON))
+    renderer.sum_bank_kernels(values, near, Place())
+    expected = LaplacianSpreadlets(bank_of(PENTAGON)).sum_bank_kernels(values, far, Place())
+    np.testing.assert_array_equal(renderer.sum_bank_kernels(values, far, Place()), expected)
 
 
 @pytest.mark.parametrize(("coc_px", "motion_px"), [(20.0, (0.0, 0.0)), (-20.0, (0.0, 0.0)), (12.0, (15.0, 6.0))])

@@ -168,34 +168,20 @@ def test_what_a_bar_hides_depends_on_the_time() -> None:
     assert psnr(in_parts, exact) > psnr(paper, exact) + 7.0
 
 
-def test_motion_left_out_is_the_same_where_nothing_moves() -> None:
+def test_motion_left_out_and_a_wider_spatial_filter_do_what_they_say() -> None:
     planes = [Plane(checker(12.0), 6.0)]
     np.testing.assert_array_equal(picture(planes, 4, replace(Settings(), motion=False)), picture(planes, 4))
     moving = [replace(planes[0], motion_px=(10.0, 0.0))]
     assert np.abs(picture(moving, 4, replace(Settings(), motion=False)) - picture(moving, 4)).max() > 0.02
-
-
-def test_a_wider_spatial_filter_blurs() -> None:
     planes = [Plane(checker(4.0))]
     sharp, soft = picture(planes, 8), picture(planes, 8, replace(Settings(), sigma_x_px=1.5))
     assert soft.std() < 0.8 * sharp.std() and soft.mean() == pytest.approx(sharp.mean(), rel=0.01)
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"tile_px": 30},
-        {"coc_step_px": 0.0},
-        {"sigma_x_px": 0.2},
-        {"screen_filter": "box"},
-        {"merge_tolerance": 1.0},
-        {"bandwidth": -1.0},
-        {"faint": 1.0},
-        {"part_tolerance": -0.1},
-        {"pupil_parts": 0},
-        {"shutter_parts": 17},
-    ],
-)
+@pytest.mark.parametrize("wrong", [
+    {"tile_px": 30}, {"coc_step_px": 0.0}, {"sigma_x_px": 0.2}, {"screen_filter": "box"}, {"merge_tolerance": 1.0},
+    {"bandwidth": -1.0}, {"faint": 1.0}, {"part_tolerance": -0.1}, {"pupil_parts": 0}, {"shutter_parts": 17},
+])  # fmt: skip
 def test_settings_that_cannot_be_are_refused(wrong: dict) -> None:
     with pytest.raises((InputError, TypeError)):  # jaxtyping's own check, where it runs, comes first
         Settings(**wrong)
@@ -217,7 +203,7 @@ def test_layers_that_move_are_drawn_out_along_their_motion() -> None:
     assert result.alpha[[28, 32]].sum() < 0.02 and result.alpha[30, [24, 36]].sum() < 0.02
 
 
-def test_the_shutter_and_the_pupil_of_layers_agree_with_samples_of_the_same_scene() -> None:
+def test_cat_eyes_are_refused_and_the_shutter_and_the_pupil_agree_with_samples_of_the_same_scene() -> None:
     texture = checker(8.0, angle_rad=0.2)
     y, x = np.mgrid[:SIZE_PX, :SIZE_PX] + 0.5
     rgb = texture(x.ravel(), y.ravel()).reshape(SIZE_PX, SIZE_PX, 3).astype(np.float32)
@@ -227,9 +213,6 @@ def test_the_shutter_and_the_pupil_of_layers_agree_with_samples_of_the_same_scen
     exact = truth([Plane(texture, 7.0, motion_px=(5.0, -3.0))], SIZE_PX, 512)
     inside = np.s_[8:-8, 8:-8]
     assert psnr(result[inside], exact[inside]) > 35.0
-
-
-def test_cat_eyes_and_colours_are_refused() -> None:
     lens = replace(LENS, aperture=replace(Aperture.disc(), cat_eye=0.5))
     layer = opaque(np.ones((8, 8, 3), np.float32), np.full((8, 8), 2.0, np.float32))
     with pytest.raises(InputError, match="cat_eye"):

@@ -15,11 +15,15 @@ from mrbokeh.renderers.layered_reconstruction._tile_data import STRIPS, packed_p
 from mrbokeh.renderers.layered_reconstruction._windows_numba import along_line, line_taps, pupil_filter, sums_along_x, window_guards
 
 
-def test_alpha_is_where_a_square_holds_95_percent() -> None:
+def test_constants_are_the_papers() -> None:
     """Eq. 3; the paper rounds it to 2.24."""
     alpha = footprint_sigmas(0.95)
     assert alpha == pytest.approx(2.236, abs=5e-4)
     assert erf(alpha / np.sqrt(2.0)) ** 2 == pytest.approx(0.95, abs=1e-12)
+    # Eq. 10: gamma = exp(-sqrt(2) / sigma); 1 % away at 10 px, and exact in variance at any width (the test above).
+    from mrbokeh.renderers.layered_reconstruction._gaussians_numba import feedback
+
+    assert feedback(100.0) == pytest.approx(math.exp(-math.sqrt(2.0) / 10.0), rel=1e-3)
 
 
 def impulse(size_px: int) -> np.ndarray:
@@ -45,13 +49,6 @@ def test_the_recursive_filter_keeps_light_and_has_the_variance_asked_for(varianc
     assert row.sum() == pytest.approx(1.0, rel=1e-4)
     assert (row[0, :, 0].astype(np.float64) * at**2).sum() == pytest.approx(variance_px2, rel=1e-3)
     np.testing.assert_allclose(row[0, :, 0], row[0, ::-1, 0], atol=1e-7)
-
-
-def test_the_feedback_is_the_papers_for_wide_filters() -> None:
-    """Eq. 10: gamma = exp(-sqrt(2) / sigma); 1 % away at 10 px, and exact in variance at any width (the test above)."""
-    from mrbokeh.renderers.layered_reconstruction._gaussians_numba import feedback
-
-    assert feedback(100.0) == pytest.approx(math.exp(-math.sqrt(2.0) / 10.0), rel=1e-3)
 
 
 COVARIANCES = [(9.0, 0.0, 9.0), (25.0, 0.0, 2.0), (12.0, 8.0, 9.0), (2.0, -1.5, 16.0)]

@@ -21,7 +21,7 @@ def layer(rng: np.random.Generator) -> WindowLayer:
     return WindowLayer(planes, -9.0, 8.0, 12.0, 5, 7, 10)
 
 
-def test_a_coarse_layer_is_the_mean_of_its_pixels() -> None:
+def test_a_coarse_layer_is_the_mean_of_its_pixels_and_a_cropped_one_holds_what_is_read() -> None:
     """Those of the tile lie behind bands of ceil(1/2 8/4) = 1, ceil(1/2 12/4) = 2 and ceil(9/4) + 1 = 4 coarse pixels."""
     fine = layer(np.random.default_rng(0))
     small = coarse(fine, 32, 32)
@@ -29,9 +29,6 @@ def test_a_coarse_layer_is_the_mean_of_its_pixels() -> None:
     tile = fine.planes[17:49, 15:47]
     expected = tile.reshape(8, 4, 8, 4, 5).mean(axis=(1, 3))
     np.testing.assert_allclose(small.planes[6:14, 5:13], expected, rtol=1e-5)
-
-
-def test_a_cropped_layer_holds_what_its_pixels_read() -> None:
     fine = layer(np.random.default_rng(1))
     part = cropped(fine, (4, 12, 8, 32))
     np.testing.assert_array_equal(part.planes, fine.planes[4 : 12 + 34, 8 : 32 + 30])

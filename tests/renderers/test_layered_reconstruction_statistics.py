@@ -53,13 +53,16 @@ def test_the_sheared_gaussian_is_the_rotated_one(sigmas: tuple[float, float], th
     np.testing.assert_allclose(axes(*(rotated @ rotated.T)[[0, 0, 1], [0, 1, 1]])[:2], sorted(sigmas, reverse=True), rtol=1e-6)
 
 
-def test_one_blur_and_one_motion_are_sheared_out_whole() -> None:
+def test_one_blur_and_one_motion_are_sheared_out_whole_and_slopes_to_all_sides_cancel() -> None:
     """Without spread of slopes everything is reprojected and the Gaussian has the second moments of disc and segment."""
     a, b_x, b_y, v_xx, v_xy, v_yy = sheared_filter(sums_of(np.tile([6.0, 9.0, -3.0], (50, 1))), WINDOW, 0.33, 1.0)
     assert (a, b_x, b_y) == pytest.approx((6.0, 9.0, -3.0))
     assert v_xx == pytest.approx(0.33**2 + 36.0 / 4.0 + 81.0 / 12.0)
     assert v_xy == pytest.approx(-27.0 / 12.0)
     assert v_yy == pytest.approx(0.33**2 + 36.0 / 4.0 + 9.0 / 12.0)
+    slopes = np.array([[8.0, 20.0, 0.0], [-8.0, -20.0, 0.0]] * 20)
+    a, b_x, b_y, v_xx, _, v_yy = sheared_filter(sums_of(slopes), WINDOW, 0.33, 1.0)
+    assert (a, b_x, b_y) == pytest.approx((0.0, 0.0, 0.0)) and (v_xx, v_yy) == pytest.approx((0.33**2, 0.33**2))
 
 
 def test_mixed_slopes_are_trusted_less_but_blur_as_much() -> None:
@@ -78,20 +81,11 @@ def test_mixed_slopes_are_trusted_less_but_blur_as_much() -> None:
         assert v_xx * v_yy > v_xy**2
 
 
-def test_slopes_to_all_sides_cancel_to_plain_averaging() -> None:
-    slopes = np.array([[8.0, 20.0, 0.0], [-8.0, -20.0, 0.0]] * 20)
-    a, b_x, b_y, v_xx, _, v_yy = sheared_filter(sums_of(slopes), WINDOW, 0.33, 1.0)
-    assert (a, b_x, b_y) == pytest.approx((0.0, 0.0, 0.0)) and (v_xx, v_yy) == pytest.approx((0.33**2, 0.33**2))
-
-
 # Statistics, buckets and order.
 
 
-def test_morton_order_interleaves_bits() -> None:
+def test_morton_order_interleaves_bits_and_samples_are_sorted_by_tile_and_pixel() -> None:
     assert [morton(x, y) for y in (0, 1) for x in (0, 1, 2, 3)] == [0, 1, 4, 5, 2, 3, 6, 7]
-
-
-def test_samples_are_sorted_by_tile_and_pixel() -> None:
     samples = sample_planes([Plane(even(0.5))], 40, 2)
     order, starts = np.empty(samples.count, np.int64), np.empty(25 * 16 + 1, np.int64)
     tile_order(samples.xy_px, 40, 40, 8, order, starts)
@@ -100,23 +94,17 @@ def test_samples_are_sorted_by_tile_and_pixel() -> None:
     x, y = (each[order] for each in samples.pixels())
     codes = np.array([morton(a, b) for a, b in zip(x % 8, y % 8, strict=True)]) + (y // 8 * 5 + x // 8) * 64
     assert (np.diff(codes) >= 0).all()
-
-
-def test_xorshift_is_marsaglias() -> None:
-    """The first number from the seed 2463534242 with the triple (13, 17, 5), Xorshift RNGs (2003), section 3."""
+    # The first number from the seed 2463534242 with the triple (13, 17, 5), Xorshift RNGs (2003), section 3.
     assert xorshift(2463534242) == 723471715
     assert len({seeded(0, tile) for tile in range(1000)}) == 1000
 
 
-def test_sparse_statistics_take_one_of_every_so_many() -> None:
+def test_sparse_statistics_take_one_of_every_so_many_and_sum_lonely_buckets_over_all() -> None:
     slopes = np.column_stack([np.arange(1000) // 100, np.zeros((1000, 2))]).astype(np.float32)
     light = one_tile(slopes)
     _, sums, _ = rows_of_tile(0, light, choice_of(FULL, 10), no_places(light))
     assert sums[0, 0] == 100 and sums[0, 1] == 10 * sum(range(10)), "stratified: ten from every hundred"
-
-
-def test_a_bucket_that_no_chosen_sample_saw_is_summed_over_all() -> None:
-    """3 of 1000 samples have a bucket of their own: it is there whatever is chosen, and weighs about as the chosen ones do."""
+    # 3 of 1000 samples have a bucket of their own: it is there whatever is chosen, and weighs about as the chosen ones do.
     bucket = np.zeros(1000)
     bucket[[17, 500, 501]] = 7
     slopes = np.column_stack([bucket, np.zeros((1000, 2))])
@@ -176,7 +164,7 @@ def test_cells_of_motion_have_the_side_asked_for() -> None:
     assert motion_cells(motion_px, Settings(motion=False))[2] == 1
 
 
-def test_buckets_grow_with_depth_and_cut_it_finely_near_the_focus() -> None:
+def test_buckets_cut_depth_finely_near_the_focus_and_infinity_is_the_last() -> None:
     depth_m = np.linspace(0.3, 3.0, 5000).astype(np.float32)
     coc_px = LENS.coc_px(depth_m, SIZE_PX).astype(np.float32)
     bucket, count = bucket_of(coc_px, depth_m, Settings())
@@ -186,9 +174,6 @@ def test_buckets_grow_with_depth_and_cut_it_finely_near_the_focus() -> None:
         assert np.ptp(inside) <= 0.5 + 1e-4 or inside.min() > 64.0 - 0.5 or inside.max() < -64.0 + 0.5
         # The first and the last hold 1 % of 2.7 m more, beyond the percentiles.
         assert np.ptp(depth_m[bucket == index]) <= (2.973 - 0.327) / 128 + 0.028
-
-
-def test_without_defocus_depth_alone_makes_buckets_and_infinity_is_the_last() -> None:
     depth_m = np.array([1.0, 1.0, 2.0, 5.0, np.inf], np.float32)
     bucket, _ = bucket_of(np.zeros(5, np.float32), depth_m, Settings())
     assert bucket[0] == bucket[1] < bucket[2] < bucket[3] < bucket[4]

@@ -23,16 +23,13 @@ def errors_over_blade_radius(blades: int, radii: tuple[float, ...], diameter_px:
     return np.array([aperture_errors(upright(blades, 1.0 / radius), diameter_px)[2] for radius in radii])
 
 
-def test_a_box_is_of_rank_one() -> None:
+def test_errors_are_what_the_best_approximation_misses_and_none_for_a_box() -> None:
     box = np.full((7, 7), 1.0 / 49.0)
     np.testing.assert_allclose(relative_errors(box), 0.0, atol=1e-14)
     kernel = decompose(box)
     assert kernel.rank == 1
     np.testing.assert_allclose(kernel.dense(), box, atol=1e-15)
-
-
-def test_errors_are_what_the_best_approximation_misses() -> None:
-    """Eckart and Young: the truncated SVD is the nearest matrix of its rank; its distance is measured here, not computed."""
+    # Eckart and Young: the truncated SVD is the nearest matrix of its rank; its distance is measured here, not computed.
     psf = Aperture.blades(5, 0.3).rasterize(21.0).kernel
     columns, values, rows = np.linalg.svd(psf)
     errors = relative_errors(psf)
@@ -108,13 +105,6 @@ def test_a_kernel_that_is_its_own_transpose_stores_one_set_of_vectors(aperture: 
     np.testing.assert_allclose(decompose(psf).dense(), psf, atol=1e-12)
 
 
-def test_a_kernel_that_is_not_keeps_both() -> None:
-    psf = Aperture.blades(5, 0.3).rasterize(20.0).kernel
-    kernel = decompose(psf)
-    assert not kernel.is_symmetric and kernel.columns.shape == (kernel.rank, 21)
-    np.testing.assert_allclose(kernel.dense(), psf, atol=1e-12)
-
-
 @pytest.mark.parametrize("blades", [5, 6, 7, 8])
 @pytest.mark.parametrize("diameter_px", [7.3, 17.0, 65.0])
 def test_sum_and_centroid_are_kept(blades: int, diameter_px: float) -> None:
@@ -139,12 +129,16 @@ def test_the_rank_is_the_least_that_meets_the_target() -> None:
     assert decompose(np.ones((1, 1))).dense().tolist() == [[1.0]]
 
 
-def test_scaled_vectors_share_the_weight() -> None:
+def test_scaled_vectors_share_the_weight_and_both_are_kept_without_symmetry() -> None:
     """McGraw's Section 3: u' = sqrt(s) u and v' = sqrt(s) v."""
     kernel = decompose(Aperture.blades(7).rasterize(19.0).kernel, 0.1)
     norms = np.linalg.norm(kernel.scaled_columns, axis=1), np.linalg.norm(kernel.scaled_rows, axis=1)
     np.testing.assert_allclose(norms[0] * norms[1], np.abs(kernel.weights), rtol=1e-12)
     np.testing.assert_allclose(norms[0], norms[1], rtol=1e-12)
+    psf = Aperture.blades(5, 0.3).rasterize(20.0).kernel
+    kernel = decompose(psf)
+    assert not kernel.is_symmetric and kernel.columns.shape == (kernel.rank, 21)
+    np.testing.assert_allclose(kernel.dense(), psf, atol=1e-12)
 
 
 @pytest.mark.parametrize("kernel", [np.ones((3, 4)), np.zeros((3, 3)), np.full((3, 3), np.nan)])

@@ -88,10 +88,13 @@ def test_points_of_many_diameters_keep_to_their_circles(own_kernels: int, monkey
     assert np.abs(result[outside]).max() < 1e-9
 
 
-def test_pictures_without_highlights_add_up() -> None:
+def test_pictures_without_highlights_add_up_whatever_their_channels_and_signs() -> None:
     a, b = noise(seed=1), noise(seed=2)
     apart = LowRankFilter().sum_kernels(a, SLOPE, Aperture.disc()) + LowRankFilter().sum_kernels(b, SLOPE, Aperture.disc())
     np.testing.assert_allclose(LowRankFilter().sum_kernels(a + b, SLOPE, Aperture.disc()), apart, atol=2e-6)
+    values = noise(19) - np.float32(0.5)
+    result = LowRankFilter().sum_kernels(values, SLOPE, Aperture.disc())
+    assert psnr(result, exact(values, SLOPE, Aperture.disc())) > 48.0 and result.min() < -0.01
 
 
 @pytest.mark.parametrize("per_pixel", [False, True])
@@ -149,12 +152,6 @@ def test_pixels_without_light_have_no_say() -> None:
         LowRankFilter().sum_kernels(noise(), coc_px, Aperture.disc())
 
 
-def test_any_number_of_channels_and_signs() -> None:
-    values = noise(19) - np.float32(0.5)
-    result = LowRankFilter().sum_kernels(values, SLOPE, Aperture.disc())
-    assert psnr(result, exact(values, SLOPE, Aperture.disc())) > 48.0 and result.min() < -0.01
-
-
 def test_edges_of_depth_are_masked_as_far_as_the_blur_reaches() -> None:
     """The mask reaches at least one radius and at most two (rounded up to a power of two) plus the edge itself."""
     lit = np.ones((40, 120), bool)
@@ -175,7 +172,7 @@ def test_the_paper_s_passes_agree_where_the_blur_changes_slowly(name: str, least
     np.testing.assert_allclose(result.sum(), truth.sum(), rtol=2e-3)
 
 
-def test_tilt_shift_is_the_exact_scatter_shared_out() -> None:
+def test_tilt_shift_is_the_exact_scatter_shared_out_and_refuses_what_it_cannot_blur() -> None:
     """A band in focus, blur growing to 24 px above and below; at rank 3, as in the paper."""
     rgb = cv2.GaussianBlur(noise(3), (0, 0), 1.5)
     coc_px = np.tile(np.abs(np.linspace(-24.0, 24.0, HEIGHT_PX, dtype=np.float32))[:, None], (1, WIDTH_PX))
@@ -185,9 +182,6 @@ def test_tilt_shift_is_the_exact_scatter_shared_out() -> None:
     truth = exact(wide, np.pad(coc_px, around, "symmetric"), Aperture.blades(8, np.pi / 8))[13:-13, 13:-13]
     assert psnr(result, truth[..., :3] / truth[..., 3:]) > 58.0
     np.testing.assert_allclose(tilt_shift(np.full_like(rgb, 0.3), coc_px, Aperture.disc()), 0.3, rtol=1e-5)
-
-
-def test_tilt_shift_refuses_what_it_cannot_blur() -> None:
     rgb, coc_px = noise(3), SLOPE
     with pytest.raises(InputError, match="map of diameters"):
         tilt_shift(rgb, coc_px[:-1], Aperture.disc())

@@ -23,7 +23,7 @@ from mrbokeh.stacks.exr_layers.render_channels import taken_from_channels
 from mrbokeh.system.errors import InputError
 
 LENS = Lens(focal_length_mm=50.0, f_number=0.7, focus_distance_m=0.5, sensor_width_mm=12.0)
-SIZE = (70, 110)
+SIZE = (56, 96)
 METHODS = ("scatter", "polygon", "low-rank")
 
 
@@ -39,7 +39,7 @@ def depth_of_m(coc_px: float) -> float:
 def object_layer(left: int, coc_px: float) -> Layer:
     """A textured card of 24 x 30 px whose left edge is at a column, nothing around it."""
     rgb, alpha = np.zeros((*SIZE, 3), np.float32), np.zeros(SIZE, np.float32)
-    card = np.s_[20:44, left : left + 30]
+    card = np.s_[16:40, left : left + 30]
     rgb[card], alpha[card] = np.random.default_rng(2).uniform(0.0, 2.0, (24, 30, 3)), 1.0
     return Layer(rgb, alpha, np.where(alpha > 0, depth_of_m(coc_px), np.inf).astype(np.float32))
 
@@ -87,13 +87,13 @@ def test_what_does_not_move_stays_as_it_was(renderer: Renderer) -> None:
 
 def test_a_point_in_focus_keeps_its_light_and_its_place(renderer: Renderer) -> None:
     rgb = np.zeros((*SIZE, 3), np.float32)
-    rgb[35, 55] = 1.0
+    rgb[28, 48] = 1.0
     picture = opaque(rgb, np.full(SIZE, LENS.focus_distance_m, np.float32))
     line = renderer.render([moving(picture, (10.0, -6.0))], LENS).rgb[..., 0].astype(np.float64)
     y, x = np.mgrid[: SIZE[0], : SIZE[1]]
     assert line.sum() == pytest.approx(1.0, rel=1e-4)
-    assert ((line * x).sum(), (line * y).sum()) == pytest.approx((55.0, 35.0), abs=0.01)
-    covariance = (line * (x - 55.0) * (y - 35.0)).sum()
+    assert ((line * x).sum(), (line * y).sum()) == pytest.approx((48.0, 28.0), abs=0.01)
+    covariance = (line * (x - 48.0) * (y - 28.0)).sum()
     assert covariance == pytest.approx(10.0 * -6.0 / 12.0, rel=0.02)
 
 

@@ -84,12 +84,16 @@ def test_blur_spreads_beyond_the_silhouette_by_its_radius_and_no_farther(network
     assert row[60] > 0.01 and (row[62:] == 0.0).all()
 
 
-def test_what_is_in_focus_stays(network: OnnxNetwork) -> None:
+def test_what_is_in_focus_stays_wherever_that_is(network: OnnxNetwork) -> None:
     """Up to the floor of the untrained 3 px kernel: of 0.5 % of the light, 5 ninths leave through the corner pixel of the card."""
     layer = card(0.0)
     result = network.render([layer], LENS)
     assert np.allclose(result.rgb, layer.rgb, atol=0.003) and np.allclose(result.alpha, layer.alpha, atol=0.003)
     assert np.array_equal(result.depth_m, layer.depth_m)
+    # Focused on the card, it stays sharp (up to the floor of the kernel, as above).
+    layer = card(5.0)
+    result = network.render([layer], LENS.focused_at(depth_for(5.0)))
+    assert np.allclose(result.alpha, layer.alpha, atol=0.003)
 
 
 def test_front_covers_what_is_behind(network: OnnxNetwork) -> None:
@@ -100,13 +104,10 @@ def test_front_covers_what_is_behind(network: OnnxNetwork) -> None:
     assert np.allclose(result.alpha, 1.0, atol=1e-4)
 
 
-def test_empty_layers_change_nothing(network: OnnxNetwork) -> None:
+def test_empty_layers_and_cropping_to_the_object_change_nothing(network: OnnxNetwork) -> None:
     empty = Layer(np.zeros((*SIZE, 3), np.float32), np.zeros(SIZE, np.float32), np.full(SIZE, np.inf, np.float32))
     assert np.array_equal(network.render([empty, card(3.0)], LENS).rgb, network.render([card(3.0)], LENS).rgb)
-
-
-def test_cropping_to_the_object_changes_nothing(network: OnnxNetwork) -> None:
-    """A card beside nothing and the whole picture by hand agree."""
+    # A card beside nothing and the whole picture by hand agree.
     layer = card(5.0)
     whole = network.blur(layer.rgb, np.full(SIZE, 5.0, np.float32))
     assert np.allclose(network.render([layer], LENS).rgb, whole, atol=1e-5)
@@ -121,7 +122,7 @@ def test_highlights_far_above_the_range_are_not_clipped(network: OnnxNetwork) ->
     assert np.allclose(network.blur(rgb, coc_px), 1000.0 * network.blur(rgb / 1000.0, coc_px), rtol=1e-3, atol=1e-2)
 
 
-def test_highlights_of_a_network_with_a_range_are_added_as_their_own_exposure(published: OnnxNetwork) -> None:
+def test_a_network_with_a_range_adds_highlights_and_leaves_empty_regions_empty(published: OnnxNetwork) -> None:
     """tanh ends at the radiance scale, 4: without the split nothing brighter could come out. What is black in the excess adds nothing."""
     rgb = np.full((*SIZE, 3), 0.2, np.float32)
     coc_px = np.full(SIZE, 2.0, np.float32)
@@ -133,9 +134,6 @@ def test_highlights_of_a_network_with_a_range_are_added_as_their_own_exposure(pu
     assert result.max() > 40.0
     assert np.allclose(result[:8, :8], plain[:8, :8], atol=1e-3)
     assert np.array_equal(published.blur(rgb, coc_px), plain)
-
-
-def test_empty_regions_stay_empty_even_where_black_does_not_come_out_black(published: OnnxNetwork) -> None:
     result = published.render([card(4.0)], LENS)
     assert (result.alpha[:10] == 0).all() and (result.rgb[:10] == 0).all()
 
@@ -157,20 +155,7 @@ def test_the_trained_lens_may_be_held_upright(network: OnnxNetwork) -> None:
         network.render([cut], replace(upright, sensor_height_mm=1.5 * long_mm))
 
 
-def test_another_focus_is_welcome(network: OnnxNetwork) -> None:
-    """Focused on the card, it stays sharp (up to the floor of the kernel, as above)."""
-    layer = card(5.0)
-    result = network.render([layer], LENS.focused_at(depth_for(5.0)))
-    assert np.allclose(result.alpha, layer.alpha, atol=0.003)
-
-
-def test_more_blur_than_trained_is_refused_with_what_to_do(network: OnnxNetwork) -> None:
-    """9 px against 7: at 7/9 of 96 px, 74 px, it would fit."""
-    with pytest.raises(InputError, match=r"up to 7\.0 px.*9\.0 px at a width of 96 px.*at most 74 px wide, or train again"):
-        network.render([card(9.0)], LENS)
-
-
-def test_other_widths_work_while_the_blur_fits(network: OnnxNetwork) -> None:
+def test_other_widths_work_while_the_blur_fits_and_more_is_refused_with_what_to_do(network: OnnxNetwork) -> None:
     """Twice the width doubles the circle of confusion: 3 px become 6, 5 become 10."""
     small = card(3.0)
     planes = (small.rgb, small.alpha, small.depth_m)
@@ -179,6 +164,9 @@ def test_other_widths_work_while_the_blur_fits(network: OnnxNetwork) -> None:
     wide = replace(Layer(*large), depth_m=np.where(large[1] > 0, depth_for(5.0), np.inf).astype(np.float32))
     with pytest.raises(InputError, match="at a width of 192 px"):
         network.render([wide], LENS)
+    # 9 px against 7: at 7/9 of 96 px, 74 px, it would fit.
+    with pytest.raises(InputError, match=r"up to 7\.0 px.*9\.0 px at a width of 96 px.*at most 74 px wide, or train again"):
+        network.render([card(9.0)], LENS)
 
 
 @pytest.mark.slow

@@ -30,12 +30,9 @@ def test_it_runs_on_the_cpu_and_says_so(doubling: Path) -> None:
     np.testing.assert_array_equal(session.run(["y"], {"x": np.array([1.0, 2.0], np.float32)})[0], [2.0, 4.0])
 
 
-def test_without_a_wish_the_fastest_comes_first_and_the_cpu_last() -> None:
+def test_a_wish_is_kept_else_the_fastest_comes_first_and_the_cpu_last() -> None:
     assert _chosen(None, ALL) == ALL
     assert _chosen(None, [CPU, "AzureExecutionProvider", "CUDAExecutionProvider"]) == ["CUDAExecutionProvider", CPU]
-
-
-def test_a_wish_is_kept_and_the_cpu_computes_the_rest() -> None:
     assert _chosen(["openvino"], ALL) == ["OpenVINOExecutionProvider", CPU]
     assert _chosen(["cpu"], ALL) == [CPU]
 

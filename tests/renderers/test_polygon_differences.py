@@ -17,12 +17,9 @@ from mrbokeh.renderers.scatter_reference import scatter
 from mrbokeh.system.errors import InputError
 
 APERTURES = {
-    "octagon": Aperture.blades(8, np.pi / 8),
-    "disc": Aperture.disc(),
-    "7 blades": Aperture.blades(7, 0.1, 0.3),
-    "heart": Aperture.heart(),
-    "ring": Aperture.ring(0.5),
-}
+    "octagon": Aperture.blades(8, np.pi / 8), "disc": Aperture.disc(), "7 blades": Aperture.blades(7, 0.1, 0.3),
+    "heart": Aperture.heart(), "ring": Aperture.ring(0.5),
+}  # fmt: skip
 SUMS_ONLY = PolygonDifferences(exact_below_px=6.0, exact_highlights=False, precision="double")
 """Every kernel of 7 px or more goes through the sums."""
 RECTIFIED = PolygonDifferences(exact_highlights=False, precision="double")
@@ -214,7 +211,7 @@ def test_bands_and_parts_leave_no_seams(monkeypatch: pytest.MonkeyPatch) -> None
     np.testing.assert_allclose(DEFAULT.sum_kernels(values, coc_px, APERTURES["disc"]), whole, atol=2e-6)
 
 
-def test_pixels_without_light_have_no_say() -> None:
+def test_pixels_without_light_have_no_say_and_light_beyond_the_border_is_lost() -> None:
     values, coc_px = np.zeros((300, 300, 4), np.float32), np.full((300, 300), np.nan, np.float32)
     values[140:160, 100:130], coc_px[140:160, 100:130] = picture(20, 30), waves(20, 30, 0.0, 25.0)
     coc_px[0, 0], coc_px[0, 1] = np.inf, 1e6
@@ -224,9 +221,6 @@ def test_pixels_without_light_have_no_say() -> None:
     np.testing.assert_allclose(result[inside], small, atol=2e-6)
     assert result.sum() == pytest.approx(values.sum(), rel=1e-5)
     assert not DEFAULT.sum_kernels(np.zeros_like(values), coc_px, APERTURES["disc"]).any()
-
-
-def test_light_beyond_the_border_is_lost() -> None:
     values, coc_px = picture(50, 40), np.full((50, 40), 30.0, np.float32)
     padded = np.pad(values, ((20, 20), (20, 20), (0, 0)))
     expected = DEFAULT.sum_kernels(padded, np.full(padded.shape[:2], 30.0, np.float32), APERTURES["octagon"])[20:-20, 20:-20]

@@ -71,7 +71,7 @@ def test_light_stays_in_place_on_odd_and_even_pixels(place: tuple[int, int], dia
     assert ((spread * y).sum(), (spread * x).sum()) == pytest.approx(place, abs=2e-3)
 
 
-def test_edges_of_depth_are_not_halved() -> None:
+def test_edges_of_depth_are_not_halved_and_diameters_without_light_do_not_matter() -> None:
     """Beside a large step of diameters kernels stay as they are, bit for bit in what each pixel throws."""
     values, coc_px = picture(120, 300), np.full((120, 300), 4.0, np.float32)
     coc_px[:, 150:] = 80.0
@@ -80,9 +80,6 @@ def test_edges_of_depth_are_not_halved() -> None:
     coc_px[:, 148:152] = np.linspace(4.0, 80.0, 4)
     values[:, 142:147] = values[:, 153:158] = 0.0
     np.testing.assert_allclose(HALVED.sum_kernels(values, coc_px, OCTAGON), FULL.sum_kernels(values, coc_px, OCTAGON), atol=1e-8)
-
-
-def test_diameters_of_pixels_without_light_do_not_matter() -> None:
     values, even = picture(160, 200), np.full((160, 200), 80.0, np.float32)
     values[:, 90:110] = 0.0
     values[::7, ::5] = 0.0
@@ -92,7 +89,7 @@ def test_diameters_of_pixels_without_light_do_not_matter() -> None:
     np.testing.assert_allclose(HALVED.sum_kernels(values, wild, OCTAGON), HALVED.sum_kernels(values, even, OCTAGON), rtol=1e-5, atol=1e-8)
 
 
-def test_highlights_are_spread_whole_at_full_resolution() -> None:
+def test_highlights_are_spread_whole_and_threads_do_not_change_a_bit() -> None:
     values, coc_px = np.full((300, 300, 4), 1e-3, np.float32), np.full((300, 300), 100.0, np.float32)
     values[150, 151] = 50.0
     lamp = RENDERER.sum_kernels(values, coc_px, OCTAGON) - RENDERER.sum_kernels(np.full_like(values, 1e-3), coc_px, OCTAGON)
@@ -100,9 +97,6 @@ def test_highlights_are_spread_whole_at_full_resolution() -> None:
     reach = kernel.shape[0] // 2
     seen = lamp[150 - reach : 151 + reach, 151 - reach : 152 + reach, 0]
     np.testing.assert_allclose(seen, kernel, atol=2e-3 * kernel.max())
-
-
-def test_threads_do_not_change_a_bit() -> None:
     values, coc_px = picture(400, 360), hills(400, 360, 10.0, 150.0)
     one, three = (PolygonDifferences(halve_from_px=64.0, threads=threads).sum_kernels(values, coc_px, OCTAGON) for threads in (1, 3))
     np.testing.assert_array_equal(one, three)

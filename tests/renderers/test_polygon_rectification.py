@@ -48,13 +48,9 @@ def pentagram(count: int) -> np.ndarray:
 
 
 FIGURE_6 = {
-    "circle": polar(np.ones(64)),
-    "hexagon": polar(np.ones(6)),
-    "small heart": heart(24),
-    "large heart": heart(200),
-    "clover": clover(370),
-    "pentagram": pentagram(1072),
-}
+    "circle": polar(np.ones(64)), "hexagon": polar(np.ones(6)), "small heart": heart(24), "large heart": heart(200),
+    "clover": clover(370), "pentagram": pentagram(1072),
+}  # fmt: skip
 SMALL = {
     "dart": np.array([[-1.0, -0.93], [0.04, -0.31], [1.07, -0.9], [0.13, 1.21]]),
     "blunt heart": np.array([[0.0, -0.43], [0.52, -0.97], [1.03, -0.41], [0.0, 1.07], [-1.03, -0.41], [-0.52, -0.97]]),
@@ -193,16 +189,13 @@ def test_what_is_symmetric_stays_symmetric(name: str, elements: list[np.ndarray]
         assert all(is_image(rectify(FIGURE_6[name]), element) for element in elements), "by default, too"
 
 
-def test_turns_without_mirrors_are_kept() -> None:
+def test_symmetry_is_kept_without_mirrors_and_seen_where_vertices_do_not_mirror() -> None:
     pinwheel = polar(np.tile([1.0, 0.8, 0.5, 0.55], 4), 0.1)
     propeller = polar(np.tile([1.0, 0.7, 0.3, 0.35], 2), 0.1)
     for max_edges in (8, 12, 16):
         assert is_image(rectify(pinwheel, max_edges=max_edges, symmetry_cost=np.inf), QUARTER)
         assert is_image(rectify(propeller, max_edges=max_edges, symmetry_cost=np.inf), QUARTER @ QUARTER)
     assert not is_image(rectify(propeller, max_edges=12, symmetry_cost=np.inf), QUARTER)
-
-
-def test_symmetry_is_seen_though_the_vertices_do_not_mirror_onto_one_another() -> None:
     outline = heart(150, shift=0.37) + np.array([3.0, -2.0])
     polygon = rectify(outline, max_edges=12)
     assert is_image(polygon, MIRRORS["x"]) and encloses(polygon, outline) and is_along(polygon, PAPER_DIRECTIONS)
@@ -222,7 +215,7 @@ def test_what_is_rectified_already_comes_back_exactly(outline: np.ndarray) -> No
     assert np.sign(shapely.LinearRing(polygon).is_ccw - 0.5) == np.sign(shapely.LinearRing(outline).is_ccw - 0.5)
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(8))
 def test_ragged_outlines(seed: int) -> None:
     rng = np.random.default_rng(seed)
     outline = polar(1.0 - 0.6 * rng.random(int(rng.integers(5, 40))), rng.random()) * (0.01 + 30 * rng.random()) + rng.normal(size=2)
@@ -235,7 +228,7 @@ def test_ragged_outlines(seed: int) -> None:
     assert (np.diff(found) < 1e-9).all()
 
 
-def test_corners_that_would_overlap_across_a_gap_close_it() -> None:
+def test_corners_that_would_overlap_close_a_gap_and_a_notch_may_narrow_to_a_point() -> None:
     """Slanted edges around the upright walls (3 high, 2 apart) reach 1.5 into the gap: the smallest closed walk crosses itself."""
     slanted = ((1, 1), (1, -1))
     right = [[1.0, 4.0], [1.5, 4.5], [5.0, 1.0], [0.0, -4.0]]
@@ -245,24 +238,18 @@ def test_corners_that_would_overlap_across_a_gap_close_it() -> None:
         for symmetry_cost in (-1.0, np.inf):
             polygon = rectify(cup, slanted, max_edges, symmetry_cost=symmetry_cost)
             assert encloses(polygon, cup) and Polygon(polygon).area == pytest.approx(smallest, rel=1e-9)
-
-
-def test_a_notch_may_narrow_to_a_point() -> None:
-    """A square of 5 less a notch with a waist of 1: two triangles, 3 wide and 1.5 high, meet in the middle of the waist."""
+    # A square of 5 less a notch with a waist of 1: two triangles, 3 wide and 1.5 high, meet in the middle of the waist.
     right = [[4.0, 0.0], [5.0, 0.0], [5.0, 5.0]]
     waist = [[4.0, 3.0], [4.0, 2.0], [3.0, 2.0], [3.0, 1.0], [4.0, 1.0]]
     outline = np.array([*waist, *right, *([5.0 - x, y] for x, y in [*waist, *right][::-1])])
     assert Polygon(rectify(outline, EIGHTHS, 10)).area == pytest.approx(25.0 - 2 * 2.25, rel=1e-12)
 
 
-def test_fitted_kernels_pass_the_same_light_in_the_same_place() -> None:
+def test_fitted_kernels_and_apertures_pass_the_same_light_in_the_same_place() -> None:
     outline = heart(100)
     for polygon in (rectify(outline, max_edges=8, fit="area"), same_area_and_centroid(rectify(outline, max_edges=8), outline)):
         assert is_along(polygon, PAPER_DIRECTIONS) and area_excess(polygon, outline) == pytest.approx(0.0, abs=1e-12)
         np.testing.assert_allclose(Polygon(polygon).centroid.coords[0], Polygon(outline).centroid.coords[0], atol=1e-12)
-
-
-def test_apertures_keep_weights_areas_and_centroids() -> None:
     ring = Aperture.disc().obstructed(0.4)
     rectified = rectify_aperture(ring, max_edges=12)
     assert rectified.weights == ring.weights

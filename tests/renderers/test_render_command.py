@@ -80,26 +80,20 @@ def test_focus_on_a_pixel_and_at_its_distance_are_the_same(folder: Path) -> None
     assert np.abs(at_pixel - read_image(run(folder, *PICTURE))).max() > 0.05
 
 
-def test_layers_lie_over_the_picture_and_carry_their_channels(folder: Path) -> None:
+def test_layers_lie_over_the_picture_and_alone_keep_their_alpha_and_channels(folder: Path) -> None:
     done = read_layer(run(folder, *PICTURE, "--layer", "card.exr", "--alpha-out"), extra=True)
     assert done.alpha.min() == 1.0
     matte = done.extra["matte"][..., 0]
     assert 0.2 < matte[8, 20] < 0.8 and matte[14, 20] == pytest.approx(1.0, abs=1e-3), "a blurred card of 20 x 12 px with a soft edge"
     np.testing.assert_array_equal(done.depth_m[14, 20], np.float32(0.7))
-
-
-def test_a_layer_alone_keeps_its_alpha(folder: Path) -> None:
-    done = read_layer(run(folder, "--layer", "card.exr", "--lens", "lens.json", "--method", "scatter", "--alpha-out"))
+    done = read_layer(run(folder, "--layer", "card.exr", "--lens", "lens.json", "--method", "scatter", "--alpha-out", out="alone.exr"))
     np.testing.assert_allclose(done.rgb[..., 1], done.alpha, atol=1e-3)
     assert done.alpha.max() > 0.99 and done.alpha[0, 40] == 0.0
 
 
-def test_threads_change_nothing(folder: Path) -> None:
+def test_threads_change_nothing_and_srgb_is_read_when_it_is_said(folder: Path) -> None:
     one, two = (read_image(run(folder, *PICTURE, "--threads", n, out=f"{n}.exr")) for n in "12")
     np.testing.assert_array_equal(one, two)
-
-
-def test_an_srgb_picture_when_it_is_said_to_be_one(folder: Path) -> None:
     cv2.imwrite(str(folder / "aif.png"), np.full((HEIGHT, WIDTH, 3), 188, np.uint8))
     done = read_image(run(folder, "--srgb", *(word.replace("aif.exr", "aif.png") for word in PICTURE)))
     np.testing.assert_allclose(done, 0.5029, atol=1e-3)  # 188 of 255 in sRGB

@@ -272,25 +272,14 @@ def test_alpha_stays_a_share(renderer: Renderer) -> None:
     assert result.rgb.min() >= 0.0
 
 
-@pytest.mark.parametrize(
-    "changed",
-    [
-        {"focal_length_mm": 60.0},
-        {"f_number": 1.0},
-        {"focus_distance_m": 0.45},
-        {"sensor_width_mm": 8.0},
-        {"tilt_rad": (0.02, 0.0)},
-        {"tilt_rad": (0.0, 0.02)},
-        {"petzval_radius_mm": 20.0},
-        {"aperture": Aperture.blades(5)},
-        {"aperture": Aperture.blades(5, 0.5)},
-        {"aperture": Aperture.blades(5, 0.0, 0.5)},
-        {"aperture": replace(Aperture.disc(), cat_eye=0.5)},
-        {"aperture": replace(Aperture.disc(), spherical_aberration=0.5)},
-        {"aperture": replace(Aperture.disc(), axial_chromatic=(0.1, 0.0, -0.1))},
-        {"aperture": replace(Aperture.disc(), lateral_chromatic=(0.2, 0.0, -0.2))},
-    ],
-)
+@pytest.mark.parametrize("changed", [
+    {"focal_length_mm": 60.0}, {"f_number": 1.0}, {"focus_distance_m": 0.45}, {"sensor_width_mm": 8.0}, {"tilt_rad": (0.02, 0.0)},
+    {"tilt_rad": (0.0, 0.02)}, {"petzval_radius_mm": 20.0}, {"aperture": Aperture.blades(5)}, {"aperture": Aperture.blades(5, 0.5)},
+    {"aperture": Aperture.blades(5, 0.0, 0.5)}, {"aperture": replace(Aperture.disc(), cat_eye=0.5)},
+    {"aperture": replace(Aperture.disc(), spherical_aberration=0.5)},
+    {"aperture": replace(Aperture.disc(), axial_chromatic=(0.1, 0.0, -0.1))},
+    {"aperture": replace(Aperture.disc(), lateral_chromatic=(0.2, 0.0, -0.2))},
+])  # fmt: skip
 def test_every_parameter_of_the_lens_changes_the_picture(renderer: Renderer, changed: dict) -> None:
     layer, plain = through_the_plain_lens(name_of(renderer))
     assert np.abs(renderer.render([layer], replace(LENS, **changed)).rgb - plain).max() > 1e-3

@@ -6,12 +6,17 @@ import torch
 from training.networks.network import TileGrid, assemble, split, tile_count
 
 
-def test_tiles_of_the_papers_full_hd_frame() -> None:
+def test_every_pixel_is_covered_by_tiles_that_are_shifted_not_cut() -> None:
     """1920 x 1080, stride 140: starts 0, 140, ... below 1720, then 1720 itself (13 + 1); below 880, then 880 (7 + 1)."""
     grid = TileGrid(1080, 1920, tile_px=200, overlap_px=60)
     assert len(grid) == 14 * 8
     assert grid.origins_px[:2] == ((0, 0), (0, 140))
     assert grid.origins_px[-1] == (1080 - 200, 1920 - 200)
+    # 10 px with tiles of 4 and overlap 1: starts 0, 3, 6. 9 px: 0, 3 and the last shifted back to 5.
+    assert TileGrid(4, 10, 4, 1).origins_px == ((0, 0), (0, 3), (0, 6))
+    grid = TileGrid(4, 9, 4, 1)
+    assert grid.origins_px == ((0, 0), (0, 3), (0, 5))
+    assert tile_count(grid)[0].tolist() == [1, 1, 1, 2, 1, 2, 2, 1, 1]
 
 
 @pytest.mark.parametrize("size", [(40, 56), (41, 53), (16, 16), (9, 70), (16, 17)])
@@ -24,23 +29,12 @@ def test_assembling_what_was_split_gives_the_picture(size: tuple[int, int], over
     assert torch.allclose(assemble(tiles, grid), picture, atol=1e-6)
 
 
-def test_overlaps_are_averaged() -> None:
+def test_overlaps_are_averaged_and_channels_of_a_tile_stay_together() -> None:
     """Two tiles of 4 px over 6 px: columns 2 and 3 belong to both, so they show the mean of 1 and 3."""
     grid = TileGrid(4, 6, tile_px=4, overlap_px=2)
     tiles = torch.cat([torch.full((1, 1, 4, 4), 1.0), torch.full((1, 1, 4, 4), 3.0)], dim=1)
     assert assemble(tiles, grid)[0, 0, 0].tolist() == [1.0, 1.0, 2.0, 2.0, 3.0, 3.0]
-
-
-def test_every_pixel_is_covered_and_a_border_tile_is_shifted_not_cut() -> None:
-    """10 px with tiles of 4 and overlap 1: starts 0, 3, 6. 9 px: 0, 3 and the last shifted back to 5."""
-    assert TileGrid(4, 10, 4, 1).origins_px == ((0, 0), (0, 3), (0, 6))
-    grid = TileGrid(4, 9, 4, 1)
-    assert grid.origins_px == ((0, 0), (0, 3), (0, 5))
-    assert tile_count(grid)[0].tolist() == [1, 1, 1, 2, 1, 2, 2, 1, 1]
-
-
-def test_channels_of_a_tile_stay_together() -> None:
-    """Tile i has channels 4 i to 4 i + 3, as the grouped convolutions expect."""
+    # Tile i has channels 4 i to 4 i + 3, as the grouped convolutions expect.
     picture = torch.arange(4.0)[None, :, None, None].expand(1, 4, 8, 12)
     tiles = split(picture, TileGrid(8, 12, tile_px=8, overlap_px=4))
     assert tiles[0, :, 0, 0].tolist() == [0, 1, 2, 3] * 2

@@ -4,7 +4,6 @@ import importlib
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -26,15 +25,6 @@ from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import TorchR
 
 SIZE_PX = 45
 SHIPPED = Path(__file__).parents[1] / "data" / "samples"
-
-
-@pytest.fixture(autouse=True)
-def one_thread() -> Iterator[None]:
-    """Small pictures gain nothing from threads, which wait for one another where tests run side by side."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
 
 
 @cache
@@ -104,15 +94,10 @@ def test_lamps_and_pixels_without_samples_are_the_same() -> None:
     np.testing.assert_array_equal(found.depth_m, known.depth_m)
 
 
-@pytest.mark.parametrize(
-    ("size_px", "count", "nearest_m", "farthest_m"),
-    [
-        ((1, 1), 1, 2.0, 2.0),
-        ((20, 33), 700, np.inf, np.inf),
-        ((40, 35), 120, 0.3, 3.0),
-        pytest.param((70, 40), 500, 0.3, 3.0, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("size_px", "count", "nearest_m", "farthest_m"), [
+    ((1, 1), 1, 2.0, 2.0), ((20, 33), 700, np.inf, np.inf), ((40, 35), 120, 0.3, 3.0),
+    pytest.param((70, 40), 500, 0.3, 3.0, marks=pytest.mark.slow),
+])  # fmt: skip
 @pytest.mark.slow
 def test_few_samples_and_bare_background_are_the_same(size_px: tuple[int, int], count: int, nearest_m: float, farthest_m: float) -> None:
     """One sample, nothing but background, and less than a sample a pixel with depth and motion all by chance."""

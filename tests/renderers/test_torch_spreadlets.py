@@ -29,17 +29,8 @@ from tests.scenes.spreadlet_references import integrate_reference, splat_referen
 torch = pytest.importorskip("torch")
 
 from mrbokeh.renderers.spreadlets.torch_spreadlets import DeviceLayer, TorchSpreadlets  # noqa: E402
-from mrbokeh.renderers.spreadlets.torch_spreadlets._kernels import (  # noqa: E402
-    BankCells,
-    stands_out,
-    table_of,
-)
-from mrbokeh.renderers.spreadlets.torch_spreadlets._sums import (  # noqa: E402
-    add_light_on,
-    integrate,
-    splat,
-    splat_in_chunks,
-)
+from mrbokeh.renderers.spreadlets.torch_spreadlets._kernels import BankCells, stands_out, table_of  # noqa: E402
+from mrbokeh.renderers.spreadlets.torch_spreadlets._sums import add_light_on, integrate, splat, splat_in_chunks  # noqa: E402
 
 CPU = torch.device("cpu")
 SIZE = (48, 54)
@@ -233,15 +224,12 @@ def two_layers() -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
     return [(board, slope_px(-14.0, -6.0), motion_px()), (picture(12), slope_px(3.0, 18.0), -motion_px())]
 
 
-def test_two_layers_are_laid_over_one_another() -> None:
+def test_two_layers_are_laid_over_one_another_and_an_even_one_stays_even_beyond_the_frame() -> None:
     cpu, on_device = LaplacianSpreadlets(combined(), sparsification=None), TorchSpreadlets(combined(), "cpu", None)
     front, behind = (cpu.sum_bank_kernels(values, coc_px, Place(motion_px=motion)) for values, coc_px, motion in two_layers())
     found = on_device.picture([layer_of(*each) for each in two_layers()])
     np.testing.assert_allclose(found.numpy(), front + (1.0 - np.clip(front[..., 3:], 0, 1)) * behind, atol=3e-6)
-
-
-def test_an_even_layer_that_goes_on_beyond_the_frame_stays_even() -> None:
-    """By more than the kernels reach: as much light comes in as goes out. Without it the border darkens."""
+    # By more than the kernels reach: as much light comes in as goes out. Without it the border darkens.
     values = np.ones((*SIZE, 4), np.float32) * np.float32([0.2, 0.5, 3.0, 1.0])
     layer = layer_of(values, np.full(SIZE, 12.0, np.float32), np.broadcast_to(np.float32([6.0, 8.0]), (*SIZE, 2)).copy())
     on_device = TorchSpreadlets(combined(), "cpu", None)

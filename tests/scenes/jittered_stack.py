@@ -5,14 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from capture.merging.registration.plane_transforms import (
-    Transform,
-    about_centre,
-    chained,
-    farthest_corner_px,
-    inverse,
-    moved,
-)
+from capture.merging.registration.plane_transforms import Transform, about_centre, chained, farthest_corner_px, inverse, moved
 from datasets_scripts.scenes.desk import desk_camera
 from datasets_scripts.tracers.thin_lens import trace
 from mrbokeh.optics.camera import Camera

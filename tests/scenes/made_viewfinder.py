@@ -20,9 +20,7 @@ from viewfinder.server.site import Site
 
 WIDTH, HEIGHT = 160, 96
 # Red, green, blue of the whole picture in each view, and of the square in its middle with each lens.
-VIEW_RGB = dict(
-    zip(VIEWS, ((60, 90, 120), (120, 90, 60), (0, 0, 0), (255, 255, 255), (30, 160, 30), (160, 30, 160)), strict=True),
-)
+VIEW_RGB = dict(zip(VIEWS, ((60, 90, 120), (120, 90, 60), (0, 0, 0), (255, 255, 255), (30, 160, 30), (160, 30, 160)), strict=True))
 LENS_RGB = {"fifty": (220, 40, 30), "eighty": (30, 60, 220)}
 SQUARE = np.s_[32:64, 64:96]
 
