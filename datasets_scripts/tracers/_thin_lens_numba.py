@@ -184,6 +184,7 @@ class PackedView(NamedTuple):
     """A camera with a lens: focal (x, y) and principal point in pixels, pupil radius in metres, 1 / focus distance.
 
     footprint: side in pixels of the square over which a pixel averages. pupil_extent: half side of the square around the outlines.
+    clear: (outlines, 3) squared distance of the outline's nearest and farthest place from the middle, 1 where the middle lies within.
     """
 
     width: int
@@ -199,6 +200,7 @@ class PackedView(NamedTuple):
     vertices: np.ndarray
     starts: np.ndarray
     weights: np.ndarray
+    clear: np.ndarray
 
 
 @njit(cache=True, inline="always")
@@ -219,8 +221,12 @@ def _ray_slope(pixel: int, jitter: float, footprint: float, principal: float, fo
 @njit(cache=True, fastmath=FAST)
 def pupil_weight(view: PackedView, x: float, y: float) -> float:
     """Return the weighted sum of the outlines that hold the lens point (even-odd rule)."""
-    total = 0.0
+    total, away = 0.0, x * x + y * y
     for k in range(view.weights.shape[0]):
+        if away < view.clear[k, 0] or away > view.clear[k, 1]:
+            if away < view.clear[k, 0] and view.clear[k, 2] > 0.0:
+                total += view.weights[k]
+            continue
         inside = False
         start, stop = view.starts[k], view.starts[k + 1]
         j = stop - 1

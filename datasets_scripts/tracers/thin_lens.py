@@ -8,6 +8,7 @@ A pixel is the mean radiance over its footprint and the pupil: no vignetting, no
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Float32
@@ -115,7 +116,18 @@ def pack_view(
         vertices=vertices,
         starts=starts,
         weights=weights,
+        clear=np.array([_clear(vertices[a:b]) for a, b in pairwise(starts)]),
     )
+
+
+def _clear(outline: Float[np.ndarray, "vertices 2"]) -> tuple[float, float, float]:
+    """Return squared distances of the nearest and farthest place of an outline from the middle, a hair wider, and whether it goes round."""
+    along = np.roll(outline, -1, axis=0) - outline
+    share = np.clip(-(outline * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-300), 0.0, 1.0)
+    nearest, farthest = np.hypot(*(outline + share[:, None] * along).T).min(), np.hypot(*outline.T).max()
+    angles = np.arctan2(*np.roll(outline, -1, axis=0).T) - np.arctan2(*outline.T)
+    turns = np.rint(((angles + np.pi) % (2.0 * np.pi) - np.pi).sum() / (2.0 * np.pi))
+    return nearest**2 * (1.0 - 1e-9), farthest**2 * (1.0 + 1e-9), float(turns % 2.0)
 
 
 def pack_scene(scene: Scene, camera: Camera, view: PackedView) -> PackedScene:
@@ -166,7 +178,7 @@ def pack_scene(scene: Scene, camera: Camera, view: PackedView) -> PackedScene:
 
 def pupil_areas(view: PackedView) -> Float[np.ndarray, " outlines"]:
     """Return the area of each outline in units of the squared pupil radius (shoelace formula)."""
-    return np.array([_polygon_area(view.vertices[a:b]) for a, b in zip(view.starts[:-1], view.starts[1:], strict=True)])
+    return np.array([_polygon_area(view.vertices[a:b]) for a, b in pairwise(view.starts)])
 
 
 def _polygon_area(outline: Float[np.ndarray, "vertices 2"]) -> float:
