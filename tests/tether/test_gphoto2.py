@@ -248,12 +248,9 @@ def test_a_nikon_homes_at_the_end_error_and_counts_from_there(stop: Stop) -> Non
     assert camera.capture().steps == 1040 * stop.away
     with pytest.raises(EndStop):
         camera.focus_step(stop.away * 50000)
-
-
-def test_a_nikon_that_runs_the_other_way() -> None:
-    stand_in = nikon()
-    driver_of(stand_in, reverse_focus=True).home(Stop.infinity)
-    assert stand_in.motor.lens == 0
+    # One that runs the other way.
+    driver_of(stand_in, reverse_focus=True).home(stop)
+    assert stand_in.motor.lens == (40000 if stop is Stop.near else 0)
 
 
 def test_a_canon_needs_none_between_steps() -> None:
@@ -283,21 +280,18 @@ def test_a_busy_camera_is_asked_again_and_a_motor_that_stays_busy_named() -> Non
         camera.focus_step(10)
 
 
-def test_live_view_and_its_end() -> None:
+def test_live_view_its_end_and_the_raw_of_two_files() -> None:
     stand_in = nikon()
     camera = driver_of(stand_in)
     frame = camera.preview()
+    stand_in.files = ("DSC_0001.JPG", "DSC_0001.NEF")
+    shot = camera.capture()
+    assert (shot.name, shot.data) == ("DSC_0001.NEF", b"DSC_0001.NEF"), "the RAW of two files"
+    camera.preview()
     assert frame.shape == (16, 24, 3) and frame[8, 12, 2] > 200 > frame[8, 12, 0], "RGB, not OpenCV's order"
     assert stand_in.widgets["viewfinder"].value == 1
     camera.close()
     assert stand_in.widgets["viewfinder"].value == 0 and stand_in.exited
-
-
-def test_the_raw_of_two_files_is_taken() -> None:
-    stand_in = nikon()
-    stand_in.files = ("DSC_0001.JPG", "DSC_0001.NEF")
-    shot = driver_of(stand_in).capture()
-    assert (shot.name, shot.data) == ("DSC_0001.NEF", b"DSC_0001.NEF")
 
 
 def test_what_a_stand_in_can() -> None:
@@ -320,11 +314,8 @@ def test_a_full_configuration() -> None:
         "white balance": "Shade", "exposure time": "1/60", "ISO": "100",
     }  # fmt: skip
     assert stand_in.widgets["focusmode"].value == "AF-S", "a motor can only be driven in autofocus"
-
-
-def test_without_a_motor_the_focus_mode_becomes_manual() -> None:
-    stand_in = StandIn({"focusmode": Widget("AF-S", ("AF-S", "MF"))})
-    assert driver_of(stand_in).configure(CameraSettings()) == {"focus mode": "MF"}
+    without_motor = StandIn({"focusmode": Widget("AF-S", ("AF-S", "MF"))})
+    assert driver_of(without_motor).configure(CameraSettings()) == {"focus mode": "MF"}
 
 
 @pytest.mark.parametrize(

@@ -10,18 +10,8 @@ import numpy as np
 import pytest
 
 from capture.commands.plan import plan_command
-from capture.tether.focus_plan import (
-    MOST_SLICES,
-    FocusPlan,
-    FocusRange,
-    on_scale,
-    plan_focus,
-    plan_for_motor,
-    plan_from_json,
-    plan_to_json,
-    read_plan,
-    write_plan,
-)
+from capture.tether import focus_plan
+from capture.tether.focus_plan import FocusPlan, FocusRange, on_scale, plan_focus, plan_for_motor, plan_from_json, plan_to_json, read_plan
 from mrbokeh.optics.lens import Lens, film_plane_m, lens_distance_m
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.errors import InputError
@@ -54,14 +44,6 @@ def test_slices_by_hand() -> None:
     assert plan.largest_coc_px == pytest.approx(462.963, abs=0.001)
 
 
-@pytest.mark.parametrize("residual_px", [0.5, 1.0, 3.3])
-def test_one_slice_less_would_not_do(residual_px: float) -> None:
-    focus_range = FocusRange(0.45, 4.0)
-    plan = plan_focus(LENS, focus_range, 3000, residual_px)
-    fewer = FocusPlan(LENS, 3000, focus_range, tuple(np.linspace(plan.dioptres[0], plan.dioptres[-1], len(plan) - 1).tolist()))
-    assert plan.residual_px <= residual_px < fewer.residual_px
-
-
 def test_residual_against_brute_force() -> None:
     """Everything between near and far in the slice that shows it sharpest, as `Lens.coc_px` has it, in pixels of the slice that
     has the narrowest view (1 / breathing). Uneven slices inside the range, so that the ends count too.
@@ -84,9 +66,14 @@ def test_distances_and_breathing() -> None:
     assert from_film.near_m == pytest.approx(0.5, abs=1e-5) and math.isinf(from_film.far_m)
 
 
-def test_a_range_of_one_distance_is_one_slice() -> None:
-    plan = plan_focus(LENS, FocusRange(2.0, 2.0), 960)
-    assert plan.dioptres == (0.5,) and plan.residual_px == 0.0
+@pytest.mark.parametrize("residual_px", [0.5, 1.0, 3.3])
+def test_one_slice_less_would_not_do(residual_px: float) -> None:
+    focus_range = FocusRange(0.45, 4.0)
+    plan = plan_focus(LENS, focus_range, 3000, residual_px)
+    fewer = FocusPlan(LENS, 3000, focus_range, tuple(np.linspace(plan.dioptres[0], plan.dioptres[-1], len(plan) - 1).tolist()))
+    assert plan.residual_px <= residual_px < fewer.residual_px
+    one = plan_focus(LENS, FocusRange(2.0, 2.0), 960)
+    assert one.dioptres == (0.5,) and one.residual_px == 0.0
 
 
 def test_motor_steps() -> None:
@@ -112,7 +99,7 @@ def test_marks_of_a_scale() -> None:
 
 def test_the_plan_file_keeps_everything(tmp_path: Path) -> None:
     plan = plan_focus(LENS, FocusRange(0.5, math.inf), 960, 2.0)
-    write_plan(tmp_path / "plan.json", plan)
+    focus_plan.write_plan(tmp_path / "plan.json", plan)
     again = read_plan(tmp_path / "plan.json")
     assert plan_to_json(again) == plan_to_json(plan) and again.dioptres == plan.dioptres and again.range == plan.range
     document = json.loads((tmp_path / "plan.json").read_text())
@@ -134,7 +121,7 @@ def test_the_plan_file_keeps_everything(tmp_path: Path) -> None:
 def test_plans_that_cannot_be(near: float, far: float, width: int, residual: float, said: str) -> None:
     with pytest.raises(InputError, match=said):
         plan_focus(LENS, FocusRange(near, far), width, residual)
-    assert MOST_SLICES == 999
+    assert focus_plan.MOST_SLICES == 999
 
 
 def test_other_mistakes() -> None:
