@@ -7,8 +7,7 @@ from pathlib import Path
 
 import pytest
 
-ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("mrbokeh", "capture", "training", "viewfinder", "datasets_scripts")
+from tests.house.test_style import FILES, PACKAGES, ROOT, nodes
 
 # The levels of mrbokeh/, top first: a room imports from lower levels only; inside a room anything without a cycle.
 LEVELS = (
@@ -34,8 +33,7 @@ RENDERER_LEVELS = (
 
 
 def modules() -> dict[str, Path]:
-    files = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
-    names = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in files}
+    names = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in FILES}
     return {name.removesuffix(".__init__"): path for name, path in names.items()}
 
 
@@ -43,14 +41,18 @@ MODULES = modules()
 
 
 @cache
-def imports_of(path: Path) -> list[ast.Import | ast.ImportFrom]:
-    """Every import statement of a file, also those within functions."""
-    return [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, (ast.Import, ast.ImportFrom))]
+def imports() -> dict[Path, list[ast.Import | ast.ImportFrom]]:
+    """Every import statement of each file, also those within functions."""
+    found: dict[Path, list[ast.Import | ast.ImportFrom]] = {path: [] for path in MODULES.values()}
+    for path, node in nodes():
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            found[path].append(node)
+    return found
 
 
 def imported(path: Path) -> Iterator[str]:
     """Dotted names of our own modules that a file imports."""
-    for node in imports_of(path):
+    for node in imports()[path]:
         names = [alias.name for alias in node.names]
         if isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
@@ -126,7 +128,7 @@ def test_heavy_libraries_live_where_they_belong(library: str, homes: set[str]) -
     users = {
         module
         for module, path in MODULES.items()
-        for node in imports_of(path)
+        for node in imports()[path]
         if library in {alias.name.split(".")[0] for alias in node.names} | {(getattr(node, "module", None) or "").split(".")[0]}
     }
     twins = (

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 import pytest
@@ -18,7 +18,6 @@ from mrbokeh.tracking.charuco.board_alignment import AlignedDetector
 from mrbokeh.tracking.charuco.detector import Corners
 from mrbokeh.tracking.charuco.pose_branches import CERTAIN_DEG, PoseBranches, PoseFit, fits_of_shot
 from mrbokeh.tracking.charuco.pose_from_points import PlanePoses, poses_from_plane, turn_between_rad
-from tests.live.test_tracking_charuco import pose_from_plane
 from tests.scenes.told_parts import ImmediateDetections
 from tests.scenes.traced_board_clip import BOARD, camera_frames
 from viewfinder.frames import CameraFrame
@@ -28,8 +27,7 @@ CAMERA = Camera(640, 360, (590.0, 590.0), (320.0, 180.0))
 SMALL = CharucoBoard((CharucoGrid((6, 5), 12.0, 9.0),))
 """72 x 60 mm, 20 corners."""
 
-NOISE_PX = 0.3
-FRAMES = 60
+NOISE_PX, FRAMES = 0.3, 60
 TIMES_S = [number / 30.0 for number in range(FRAMES)]
 WORST_DEG = 3.0 * CERTAIN_DEG
 """That a pose said to be certain may be off: three times the RMS error up to which it is called so."""
@@ -89,15 +87,14 @@ def view(index: int, seed: int) -> tuple[Both, list[Camera]]:
 
 
 @cache
-def errors(track: Tracking, seeds: tuple[int, ...]) -> np.ndarray:
+def errors(track: Tracking, seeds: tuple[int, ...], of_views: range = range(len(VIEWS))) -> np.ndarray:
     """(error of the rotation in degrees, whether it is called certain, index in VIEWS) of every frame."""
     rows = []
-    for index in range(len(VIEWS)):
-        for seed in seeds:
-            both, cameras = view(index, seed)
-            for number, fit in track(both).items():
-                off_deg = np.rad2deg(turn_between_rad(fit.camera_from_world, cameras[number].camera_from_world))
-                rows.append((off_deg, fit.is_certain, index))
+    for index, seed in product(of_views, seeds):
+        both, cameras = view(index, seed)
+        for number, fit in track(both).items():
+            off_deg = np.rad2deg(turn_between_rad(fit.camera_from_world, cameras[number].camera_from_world))
+            rows.append((off_deg, fit.is_certain, index))
     return np.array(rows)
 
 
@@ -126,19 +123,17 @@ def test_no_pose_that_is_far_off_is_called_certain_in_many_shots(track: Tracking
 
 
 def test_the_same_frames_jump_without_it() -> None:
-    """These frames are hard: taking the nearer pose shows wrong ones in more than 1 of 25, tens of degrees off."""
-    off_deg = errors(nearest_to_before, (0,))[:, 0]
-    assert (off_deg > WORST_DEG).mean() > 0.04 and off_deg.max() > 30.0
+    """The frames are hard: taking the nearer pose shows wrong ones in more than 1 of 25 of all, tens of degrees off; in these alone."""
+    off_deg = errors(nearest_to_before, (0,), range(5, 12))[:, 0]
+    assert (off_deg > WORST_DEG).sum() > 0.04 * len(VIEWS) * FRAMES and off_deg.max() > 30.0
 
 
 def test_the_expected_error_is_the_error_that_there_is() -> None:
     """Where only one pose fits: RMS of the error over what was expected, of 60 frames with their own noise, 1 +- 2 / sqrt(120)."""
     seen, cameras = shot(SMALL, 0.5, 45.0, 3)
     fits = poses_of(seen, SMALL, CAMERA, TIMES_S)
-    ratios = [
-        np.rad2deg(turn_between_rad(fits[n].camera_from_world, camera.camera_from_world)) / fits[n].turn_sigma_deg
-        for n, camera in enumerate(cameras)
-    ]
+    off_deg = [np.rad2deg(turn_between_rad(fits[n].camera_from_world, camera.camera_from_world)) for n, camera in enumerate(cameras)]
+    ratios = [off / fits[n].turn_sigma_deg for n, off in enumerate(off_deg)]
     assert np.sqrt(np.mean(np.square(ratios))) == pytest.approx(1.0, abs=0.2)
 
 
@@ -154,12 +149,8 @@ def test_the_poses_of_a_clip_are_those_of_its_frames_taken_together() -> None:
 
 def test_a_single_frame_that_leaves_it_open_says_so() -> None:
     """A 6 cm grid 3 m away, tilted by 30 degrees: the other pose fits as well (perspective moves its corners by 0.1 px)."""
-    pose = np.eye(4)
-    pose[:3, :3] = Rotation.from_euler("x", 30.0, degrees=True).as_matrix()
-    pose[:3, 3] = 0.0, 0.0, 3.0
-    exact = replace(CAMERA, camera_from_world=pose).project(SMALL.corners_m)[0]
-    unsure = [pose_from_plane(SMALL.corners_m, exact + np.random.default_rng(n).normal(0.0, 0.1, exact.shape), CAMERA) for n in range(5)]
-    assert all(fit is not None and not fit.is_certain and fit.turn_sigma_deg > 10.0 for fit in unsure)
+    unsure = [PoseBranches().take(poses_of_frame(tilted(30.0, 3.0), seed=seed), 0.0) for seed in range(5)]
+    assert all(not fit.is_certain and fit.turn_sigma_deg > 10.0 for fit in unsure)
 
 
 def poses_of_frame(camera_from_world: np.ndarray, noise_px: float = 0.1, seed: int = 0) -> PlanePoses:

@@ -80,8 +80,7 @@ def test_a_turned_video_has_the_blur_of_the_level_one(tmp_path: Path, quarters: 
     assert len(said) == (1 if quarters % 2 else 0)
 
 
-@pytest.mark.parametrize("suffix", ["jpg", "png", "tif"])
-@pytest.mark.parametrize("quarters", [2, 3])
+@pytest.mark.parametrize(("suffix", "quarters"), [("jpg", 2), ("png", 3), ("tif", 3)])
 def test_turned_photographs_have_the_blur_of_the_level_ones(tmp_path: Path, suffix: str, quarters: int) -> None:
     """They come upright as for `mrbokeh composite`, and the lens with them."""
     level, turned = (photographs(tmp_path, suffix, each) for each in (0, quarters))

@@ -48,8 +48,7 @@ def square(width_px: int, height_px: int, depth_m: float = 1.0) -> Layer:
 @pytest.fixture
 def clip(tmp_path: Path) -> Path:
     """Twelve lossless frames of noise with uneven times, in milliseconds as Matroska keeps them."""
-    rng = np.random.default_rng(3)
-    path = tmp_path / "clip.mkv"
+    rng, path = np.random.default_rng(3), tmp_path / "clip.mkv"
     with VideoWriter(path, 96, 64, Fraction(25), Fraction(1, 1000)) as writer:
         for i in range(12):
             writer.write(rng.random((64, 96, 3), np.float32), (40 * i + i % 3 * 7) / 1000)
@@ -83,13 +82,10 @@ def test_every_frame_is_the_composite_of_the_library(clip: Path, settings: list[
 
 
 def test_a_range_of_frames_begins_at_time_zero(clip: Path, settings: list[str], tmp_path: Path) -> None:
-    out = tmp_path / "out.mkv"
-    run(clip, *settings, "--out", out, "--frames", "4:9")
+    run(clip, *settings, "--out", tmp_path / "out.mkv", "--frames", "4:9")
     times_s = [frame.time_s for frame in read_frames(clip)]
-    assert [frame.time_s for frame in read_frames(out)] == pytest.approx([time_s - times_s[4] for time_s in times_s[4:9]], abs=1e-9)
-
-
-def test_frames_are_parsed() -> None:
+    found_s = [frame.time_s for frame in read_frames(tmp_path / "out.mkv")]
+    assert found_s == pytest.approx([time_s - times_s[4] for time_s in times_s[4:9]], abs=1e-9)
     assert [parse_frames(text) for text in (":", "0:50", "10:", ":7")] == [(0, None), (0, 50), (10, None), (0, 7)]
     for text in ("", "5", "7:7", "9:2", "-1:4", "a:b"):
         with pytest.raises(InputError, match="START:STOP"):
@@ -98,19 +94,16 @@ def test_frames_are_parsed() -> None:
 
 def test_mistakes_end_in_a_sentence(clip: Path, settings: list[str], tmp_path: Path) -> None:
     write_layer(tmp_path / "small.exr", square(48, 32))
-    with pytest.raises(InputError, match=r"small\.exr is 48x32 px but the clip is 96x64 px"):
-        run(clip, "--layer", tmp_path / "small.exr", "--lens", tmp_path / "lens.json", "--out", tmp_path / "out.mov")
-    with pytest.raises(InputError, match="leaves nothing of"):
-        run(clip, *settings, "--out", tmp_path / "out.mov", "--frames", "40:50")
-    with pytest.raises(InputError, match="is read and would be written over"):
-        run(clip, *settings, "--out", clip)
     (tmp_path / "there.mkv").touch()
-    with pytest.raises(InputError, match="exists already"):
-        run(clip, *settings, "--out", tmp_path / "there.mkv")
-    with pytest.raises(InputError, match="expected a renderer"):
-        run(clip, *settings, "--out", tmp_path / "out.mov", "--renderer", "magic")
-    with pytest.raises(InputError, match="nothing to put into the clip"):
-        run(clip, "--lens", tmp_path / "lens.json", "--out", tmp_path / "out.mov")
+    lens, out = ("--lens", tmp_path / "lens.json"), ("--out", tmp_path / "out.mov")
+    for words, sentence in (
+        (("--layer", tmp_path / "small.exr", *lens, *out), r"small\.exr is 48x32 px but the clip is 96x64 px"),
+        ((*settings, *out, "--frames", "40:50"), "leaves nothing of"), ((*settings, "--out", clip), "is read and would be written over"),
+        ((*settings, "--out", tmp_path / "there.mkv"), "exists already"), ((*settings, *out, "--renderer", "magic"), "expected a renderer"),
+        ((*lens, *out), "nothing to put into the clip"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=sentence):
+            run(clip, *words)
     assert not list(tmp_path.glob("out.mov*"))
 
 
