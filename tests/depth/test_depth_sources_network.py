@@ -68,7 +68,7 @@ def test_the_network_sees_imagenet_codes_in_its_layout(tmp_path: Path, shape: li
     np.testing.assert_allclose(found, normalised().mean(axis=2), atol=2e-6)
 
 
-def test_a_sidecar_overrides_mean_std_and_order_of_colours(tmp_path: Path) -> None:
+def test_a_sidecar_overrides_mean_std_and_order_and_a_wrong_one_is_refused(tmp_path: Path) -> None:
     from onnx import helper
 
     pick = [helper.make_node("Gather", ["image", "first"], ["depth"], axis=1)]
@@ -77,9 +77,6 @@ def test_a_sidecar_overrides_mean_std_and_order_of_colours(tmp_path: Path) -> No
     wants = read_network_input(model)
     codes = np.random.default_rng(0).integers(0, 256, (*SIZE, 3)) / 255.0
     np.testing.assert_allclose(predicted(model, photo(), wants), (codes[..., 2] - 0.5) / 0.5, atol=2e-6)
-
-
-def test_a_wrong_sidecar_is_refused(tmp_path: Path) -> None:
     model = channel_mean(tmp_path / "m.onnx", [1, 3, 32, 48])
     for values in ({"meen": 1}, {"fit": "crop"}, {"channels": "RGBA"}, {"std": [1, 1, 0]}):
         (tmp_path / "m.json").write_text(json.dumps(values))

@@ -168,7 +168,7 @@ def test_v_of_an_st_map_runs_upwards() -> None:
     np.testing.assert_allclose(lower.undistorted_px(some_px(), CAMERA), some_px() + np.array([0.0, 10.0]), atol=1e-9)
 
 
-def test_st_maps_that_cannot_serve(tmp_path: Path) -> None:
+def test_what_is_no_distortion_is_refused(tmp_path: Path) -> None:
     uv = np.zeros((4, 1024), np.float16)
     write_exr(tmp_path / "half.exr", ExrPart({"R": uv, "G": uv, "B": uv}))
     with pytest.raises(InputError, match="half floats"):
@@ -178,9 +178,6 @@ def test_st_maps_that_cannot_serve(tmp_path: Path) -> None:
         read_st_map(tmp_path / "grey.exr")
     with pytest.raises(InputError, match="distort or undistort"):
         StMap(np.zeros((4, 4, 2)), "redistort")
-
-
-def test_values_that_are_no_distortion() -> None:
     for make, of, said in (
         (LensDistortion, ("opencv", (0.1,)), "needs 8 finite values"),
         (LensDistortion, ("division",), "out of none, opencv"),

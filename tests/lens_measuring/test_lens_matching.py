@@ -180,13 +180,6 @@ def test_sizes_are_coc_px_the_other_way(side: int, depth_m: float) -> None:
     assert 1.0 / depth_from_size(LENS, coc_px, WIDTH) == pytest.approx(1.0 / depth_m, abs=1e-9)
 
 
-def test_sizes_that_cannot_be_are_refused() -> None:
-    with pytest.raises(InputError, match="--side"):
-        effective_f_number(LENS, -10.0, 4.0, WIDTH)
-    with pytest.raises(InputError, match="--depth-m"):
-        focus_from_size(LENS, -2000.0, 4.0, WIDTH)
-
-
 def test_focus_and_effective_f_number_of_a_photograph() -> None:
     """The edge of full discs lies up to 0.15 px too far out, 1 % of their diameter."""
     picture, depth_m = linear(photograph(DISC)), lit_depth_m(1)
@@ -274,13 +267,17 @@ def require_refused(rgb: np.ndarray, said: str) -> None:
         match_lens(rgb.astype(np.float32), FACTS, largest_value=1.0)
 
 
-def test_texture_without_discs_and_two_discs_are_refused() -> None:
+def test_texture_two_discs_and_impossible_sizes_are_refused() -> None:
     noise = np.random.default_rng(0).random((HEIGHT, WIDTH, 3)).astype(np.float32)
     smooth = cv2.GaussianBlur(noise, (0, 0), 3.0)
     require_refused(noise, "found 0")
     require_refused(((smooth - smooth.min()) / np.ptp(smooth)) ** 4, "bright spots|expected at least 3")
     require_refused(np.full_like(noise, 0.3), "found 0")
     require_refused(linear(photograph(DISC, count=2)), "expected at least 3.*found 2.*night")
+    with pytest.raises(InputError, match="--side"):
+        effective_f_number(LENS, -10.0, 4.0, WIDTH)
+    with pytest.raises(InputError, match="--depth-m"):
+        focus_from_size(LENS, -2000.0, 4.0, WIDTH)
 
 
 @pytest.mark.parametrize("name", ["stacks/usb_two_layers/13.jpg", "rgbd/bokehme_3_image.jpg"])

@@ -157,22 +157,13 @@ def test_a_fifth_is_for_testing_by_scene_and_by_viewpoint(size: str) -> None:
         assert sorted(count for scene, count in tested.items() if scene not in whole) == [1] * 11 + [2] * 2
 
 
-def require_lights(kind: str) -> None:
+@pytest.mark.parametrize("kind", [pytest.param(kind, marks=pytest.mark.slow) if kind != "leaves" else kind for kind in KINDS])
+def test_scenes_have_lights_at_many_depths_are_always_the_same_and_differ_by_number(kind: str) -> None:
     scene = bokeh_scene(f"{kind}_1")
     depths_m = np.array([lamp.centre_m[2] for lamp in scene.lamps])
     assert len(depths_m) > 30 and 1 / depths_m.min() - 1 / depths_m.max() > 0.6
     assert len(scene.bodies) > 5
-
-
-def test_a_scene_has_lights_at_many_depths() -> None:
-    require_lights("leaves")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", KINDS)
-def test_scenes_are_the_same_every_time_and_differ_by_number(kind: str) -> None:
-    require_lights(kind)
-    assert bokeh_scene(f"{kind}_1").lamps == bokeh_scene(f"{kind}_1").lamps != bokeh_scene(f"{kind}_2").lamps
+    assert scene.lamps == bokeh_scene(f"{kind}_1").lamps != bokeh_scene(f"{kind}_2").lamps
 
 
 def test_unknown_names_are_refused() -> None:

@@ -75,11 +75,8 @@ def test_the_diameter_that_is_drawn(unit_radius: float) -> None:
     assert np.diff(above).min() > 0.0 and np.diff(above).max() < 0.0126, "at most 1.25 times as fast as without"
 
 
-def test_the_disc_has_the_area_of_the_disc() -> None:
+def test_the_disc_has_its_area_and_malformed_apertures_are_refused() -> None:
     assert Polygon(Aperture.disc().outlines[0]).area == pytest.approx(np.pi, rel=1e-12)
-
-
-def test_malformed_apertures_are_refused() -> None:
     for wrong, said in (
         (lambda: Aperture((np.zeros((3, 2)),), ()), "one weight per outline"),
         (lambda: Aperture((np.zeros((2, 2)),), (1.0,)), "at least 3 vertices"),

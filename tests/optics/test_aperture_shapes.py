@@ -145,7 +145,7 @@ def test_grey_is_rendered_by_levels() -> None:
     assert right / (right - starts[0] + np.diff(starts).mean() / 2) == pytest.approx(1 / 3, abs=0.005)
 
 
-def test_svg_curves_have_their_areas_and_subpaths_follow_the_even_odd_rule() -> None:
+def test_outlines_have_their_areas_whatever_they_are_written_as() -> None:
     """A parabola over its chord: 2/3 of base times height; the cubic with both controls 1 above the chord's ends: 3/5."""
     circle = Aperture.from_outline("M 30 50 a 20 20 0 1 0 40 0 a 20,20 0 1 0 -40,0 z")
     assert light(circle) / width(circle) ** 2 == pytest.approx(np.pi / 4, rel=2e-3)
@@ -156,9 +156,6 @@ def test_svg_curves_have_their_areas_and_subpaths_follow_the_even_odd_rule() -> 
     framed = Aperture.from_outline("M0 0H4V4H0Z M1 1h2v2h-2z")
     assert framed.weights == (1.0, -1.0)
     assert light(framed) / width(framed) ** 2 == pytest.approx(12 / 16)
-
-
-def test_corners_and_path_agree_and_crossings_are_resolved() -> None:
     points = [[0.0, 0.0], [4.0, 0.0], [0.0, 3.0]]
     by_points, by_path = Aperture.from_outline(points), Aperture.from_outline("M0 0 4 0 0 3Z")
     np.testing.assert_allclose(by_points.outlines[0], by_path.outlines[0], atol=1e-15)

@@ -77,15 +77,12 @@ def test_the_opening_turns_as_the_picture_does(quarters: int) -> None:
     np.testing.assert_allclose(turned.focus_dioptres(9, 9), np.rot90(heart.focus_dioptres(9, 9), quarters), atol=1e-9)
 
 
-def test_a_lens_described_upright_is_left_as_it_is_there(tmp_path: Path) -> None:
+def test_a_lens_described_upright_is_left_and_survives_its_file(tmp_path: Path) -> None:
     tall = replace(UPRIGHT, aperture=Aperture.heart())
     picture = Photograph(np.zeros((96, 64, 3), np.float32), orientation=6)
     assert lens_for_photograph(tall, picture, tmp_path) == tall
     turned = lens_for_photograph(replace(LEVEL, aperture=Aperture.heart()), picture, tmp_path)
     assert not np.allclose(turned.aperture.outlines[0], tall.aperture.outlines[0])
-
-
-def test_sensor_height_survives_the_lens_file(tmp_path: Path) -> None:
     for lens in (LEVEL, UPRIGHT):
         write_lens(tmp_path / "lens.json", lens)
         assert read_lens(tmp_path / "lens.json").sensor_height_mm == lens.sensor_height_mm

@@ -74,10 +74,18 @@ def test_the_nearest_kernel_is_that_of_the_cell_and_is_turned_in_front_of_the_fo
     np.testing.assert_array_equal(*still)
 
 
-def test_light_that_is_absorbed_is_kept_track_of() -> None:
+def test_absorbed_light_is_kept_track_of_and_shown_on_the_sheet() -> None:
     np.testing.assert_allclose(random_bank(light=0.6).throughput, 0.6, rtol=1e-5)
     with pytest.raises(InputError, match="must sum to 1"):
         random_bank(light=1.1)
+
+    def titles(bank: PsfBank) -> str:
+        return " ".join(axes.get_title() for axes in draw_bank(bank).axes)
+
+    assert "each of which shares" in titles(random_bank()) and "width of the kernels" in titles(random_bank())
+    assert "light that arrives" in titles(random_bank(light=0.5))
+    row = PsfBank("m", (INFINITE,), (3,), (np.ones((1, 1, 1), np.float32),) * 3, nested=False)
+    assert "width of the cells" in titles(row)
 
 
 def test_what_is_not_a_bank() -> None:
@@ -172,13 +180,3 @@ def test_kernels_as_pictures_in_colour_and_grey(tmp_path: Path) -> None:
     bank = random_bank(1)
     export_bank(bank, tmp_path / "grey", "exr")
     np.testing.assert_array_equal(read_image(tmp_path / "grey" / "00003.exr"), np.repeat(bank.kernels[3], 3, axis=2))
-
-
-def test_the_sheet_shows_what_the_bank_has() -> None:
-    def titles(bank: PsfBank) -> str:
-        return " ".join(axes.get_title() for axes in draw_bank(bank).axes)
-
-    assert "each of which shares" in titles(random_bank()) and "width of the kernels" in titles(random_bank())
-    assert "light that arrives" in titles(random_bank(light=0.5))
-    row = PsfBank("m", (INFINITE,), (3,), (np.ones((1, 1, 1), np.float32),) * 3, nested=False)
-    assert "width of the cells" in titles(row)

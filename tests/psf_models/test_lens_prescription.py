@@ -60,7 +60,7 @@ def test_a_symmetric_lens_is_read_with_its_stop_and_has_symmetric_planes_and_pup
     assert lens.entrance_pupil_mm[1] == pytest.approx(12.0 / (1.0 - 6.0 / 60.0), rel=0.01)
 
 
-def test_weak_thin_lens_follows_the_lensmakers_formula() -> None:
+def test_weak_and_turned_lenses_follow_the_lensmakers_formula(tmp_path: Path) -> None:
     """1/f = (n - 1)(1/R1 - 1/R2); a thickness t adds -(n - 1)^2 t / (n R1 R2), so f grows by t (n - 1) / (2 n R) to first order."""
     assert thin_lens(1000.0, 0.0).focal_length_mm == pytest.approx(1000.0, rel=1e-12)
     thick = thin_lens(1000.0, 3.0)
@@ -68,6 +68,13 @@ def test_weak_thin_lens_follows_the_lensmakers_formula() -> None:
     # Principal planes of a thin equi-convex lens of n = 1.5 lie a third of the thickness inside.
     assert thick.paraxial.front_principal_mm == pytest.approx(1.0, rel=2e-3)
     assert thick.paraxial.rear_principal_mm == pytest.approx(2.0, rel=2e-3)
+    # A table turned round twice is the table; its first column counts from the other end, media move to the other side.
+    lens = read_prescription(written(tmp_path, "30 4 1.6 10\ninf 2 1.7 10\n-80 0 1 12\n"))
+    table, turned = lens.optics_table(), lens.reversed_table()
+    np.testing.assert_allclose(turned[:, 0], [0.0, 2.0, 6.0])
+    np.testing.assert_allclose(turned[:, 1], [1.0 / 80.0, 0.0, -1.0 / 30.0])
+    np.testing.assert_allclose(turned[:, 2], table[::-1, 2])
+    np.testing.assert_allclose(turned[:, 3:], [table[1, 3:], table[0, 3:], [1.0, 0.0]])
 
 
 @pytest.mark.parametrize(("focal_mm", "f_number"), [(50.0, 4.0), (85.0, 2.8), (20.0, 8.0)])
@@ -91,16 +98,6 @@ def test_sensor_moves_out_for_near_focus_and_lenses_are_stopped_down() -> None:
     assert lens.stopped_down(11.0).f_number == pytest.approx(11.0)
     with pytest.raises(InputError, match="opens to f/4 only"):
         lens.stopped_down(2.0)
-
-
-def test_turned_round_lens_is_the_same_lens(tmp_path: Path) -> None:
-    """A table turned round twice is the table; its first column counts from the other end, media move to the other side."""
-    lens = read_prescription(written(tmp_path, "30 4 1.6 10\ninf 2 1.7 10\n-80 0 1 12\n"))
-    table, turned = lens.optics_table(), lens.reversed_table()
-    np.testing.assert_allclose(turned[:, 0], [0.0, 2.0, 6.0])
-    np.testing.assert_allclose(turned[:, 1], [1.0 / 80.0, 0.0, -1.0 / 30.0])
-    np.testing.assert_allclose(turned[:, 2], table[::-1, 2])
-    np.testing.assert_allclose(turned[:, 3:], [table[1, 3:], table[0, 3:], [1.0, 0.0]])
 
 
 def test_cauchy_gives_index_and_abbe_number_back() -> None:
@@ -163,16 +160,13 @@ def test_published_lenses_are_free_from_axial_colour(shared_data: Path, name: st
     assert read_prescription(shared_data / "lens" / "prescriptions" / f"{name}.dat").axial_colour_mm == pytest.approx(0.0, abs=1e-6)
 
 
-def test_a_lens_of_one_glass_keeps_the_edge(tmp_path: Path) -> None:
+def test_abbe_numbers_are_estimated_by_power_and_one_glass_keeps_the_edge(tmp_path: Path) -> None:
     """Nothing to correct with: crown for its two collecting elements; f / V is the axial colour of thin lenses."""
     lens = read_prescription(written(tmp_path, PAIR))
     crown = estimated_abbe_number(1.5, True)
     assert [each.abbe_number for each in lens.surfaces if each.index > 1.0] == [crown, crown]
     assert lens.axial_colour_mm == pytest.approx(lens.focal_length_mm / crown, rel=0.15)
-
-
-def test_abbe_numbers_are_estimated_by_power_and_stated_ones_left_alone(tmp_path: Path) -> None:
-    """A doublet with its flint stated: only the crown is estimated, so that red and blue meet."""
+    # A doublet with its flint stated: only the crown is estimated, so that red and blue meet.
     lens = read_prescription(written(tmp_path, "30 4 1.62 10\n-25 2 1.62 30.0 10\n-200 1 1 10\n"))
     assert lens.surfaces[1].abbe_number == 30.0 and 30.0 < lens.surfaces[0].abbe_number <= estimated_abbe_number(1.62, True)
     # A cemented doublet: the collecting element gets crown, the diverging one flint; air and stops nothing.

@@ -87,7 +87,7 @@ def test_compiled_tracing_is_the_plain_one(with_rims: bool) -> None:
     assert passed > (20 if with_rims else 250)
 
 
-def test_a_ray_sent_back_goes_back_its_way() -> None:
+def test_rays_go_back_their_way_and_total_reflection_blocks() -> None:
     forward, back = pair(30.0).optics_table(), pair(30.0).reversed_table()
     length_mm, passed = forward[-1, 0], 0
     for ray in random_rays(200, 3):
@@ -100,10 +100,7 @@ def test_a_ray_sent_back_goes_back_its_way() -> None:
             assert_allclose(home[3:], ray[3:], atol=1e-10)
             assert_allclose(np.cross(home[:3] - ray[:3], ray[3:]), 0.0, atol=1e-8)  # on the same line
     assert passed > 50
-
-
-def test_total_reflection_blocks() -> None:
-    """From glass of 1.7 into air beyond arcsin(1 / 1.7) = 36 degrees."""
+    # From glass of 1.7 into air beyond arcsin(1 / 1.7) = 36 degrees.
     table = np.array([[0.0, 0.0, 400.0, 1.0, 0.0]])
     for degrees, passes in ((35.9, True), (36.1, False)):
         angle = np.deg2rad(degrees)
@@ -227,7 +224,7 @@ def test_open_share_is_the_count_of_unblocked_rays() -> None:
         assert model.throughput(6.0, eccentricity) == pytest.approx(counted, abs=0.015)
 
 
-def test_cat_eyes_close_towards_the_corner() -> None:
+def test_cat_eyes_close_towards_the_corner_but_wide_rims_close_nothing() -> None:
     """Open share and width along the field fall, width across stays longer: the opening is a cat's eye."""
     model = lens(16.0)
     shares = [model.throughput(20.0, each) for each in (0.0, 0.25, 0.5, 0.75, 1.0)]
@@ -239,10 +236,7 @@ def test_cat_eyes_close_towards_the_corner() -> None:
         widths.append((np.ptp(np.nonzero(lit.any(axis=0))[0]) + 1, np.ptp(np.nonzero(lit.any(axis=1))[0]) + 1))
     assert abs(widths[0][0] - widths[0][1]) <= 1
     assert widths[1][0] < 0.8 * widths[1][1]
-
-
-def test_wide_rims_close_nothing_and_light_in_focus_stays_together() -> None:
-    """With rims far outside the beam only the iris is left: the projected pupil stays open within a few per cent."""
+    # With rims far outside the beam only the iris is left: the projected pupil stays open within a few per cent.
     assert lens(30.0).throughput(20.0, 0.4) == pytest.approx(1.0, abs=0.03)
     model = PhysicalLens(pair(), focus_distance_m=2.0, image_width_px=1000, f_number=11.0)
     kernel = model.kernel(at(2.0), RAYS, 0)
@@ -298,13 +292,6 @@ def test_wavelengths_are_spread_over_their_band() -> None:
     assert len(np.unique(places[:, :, 0])) == 12 and weights.min() > 0.0
 
 
-def test_off_the_axis_the_simple_lens_smears() -> None:
-    """Coma, astigmatism and a curved field: in focus in the middle, a blur of many pixels in the corner."""
-    model = PhysicalLens(focus_distance_m=2.0, f_number=8.0)
-    middle, corner = (mean_square_radius_px2(model.kernel(at(2.0, each), RAYS, 0)[:, :, 1].astype(np.float64)) for each in (0.0, 1.0))
-    assert corner > 25.0 * middle
-
-
 def test_prefiltering_is_the_mean_over_the_box() -> None:
     model = lens()
     box = np.array([[3.0, 4.0], [0.3, 0.5]])
@@ -319,7 +306,7 @@ def test_prefiltering_is_the_mean_over_the_box() -> None:
     assert whole.sum() == pytest.approx(total.sum(), rel=0.01)
 
 
-def test_more_rays_than_a_chunk_are_no_seam_and_the_grid_has_the_papers_number_of_samples() -> None:
+def test_chunks_leave_no_seam_and_off_the_axis_the_simple_lens_smears() -> None:
     """Rays come in chunks of 65,536; a kernel of 100,000 differs from one of 65,536 by noise only."""
     few, many = lens().kernel(at(6.0), 65536, 0), lens().kernel(at(6.0), 100000, 0)
     assert few.shape == many.shape and np.abs(few - many).sum() < 0.06 * few.sum()
@@ -327,6 +314,10 @@ def test_more_rays_than_a_chunk_are_no_seam_and_the_grid_has_the_papers_number_o
     model = lens()
     assert len(NestedGrid(model.counts)) == pytest.approx(4000, abs=5)
     assert [axis.exponent for axis in model.axes] == [2.5, 1.2] and model.turns == "field" and model.channels == 3
+    # Coma, astigmatism and a curved field: in focus in the middle, a blur of many pixels in the corner.
+    model = PhysicalLens(focus_distance_m=2.0, f_number=8.0)
+    middle, corner = (mean_square_radius_px2(model.kernel(at(2.0, each), RAYS, 0)[:, :, 1].astype(np.float64)) for each in (0.0, 1.0))
+    assert corner > 25.0 * middle
 
 
 def test_a_bank_ends_where_the_lens_goes_black() -> None:

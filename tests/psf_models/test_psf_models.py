@@ -101,12 +101,6 @@ def test_the_average_over_a_box_is_the_mean_of_its_points(name: str) -> None:
     assert np.abs(total - averaged).sum(axis=(0, 1)).max() < 0.004
 
 
-def test_a_box_of_no_size_is_a_point() -> None:
-    for model, ends in MODELS.values():
-        point = np.array(ends)[:, 0]
-        np.testing.assert_allclose(model.kernel(np.stack([point, point], axis=1), 0, 0), model.exact(point), atol=1e-7)
-
-
 @pytest.mark.parametrize(("diameter_px", "motion_px"), [(10.0, 7.0), (3.0, 20.0), (20.0, 2.0), (1.5, 0.7), (7.3, 30.2), (31.0, 31.0)])
 def test_the_capsule_against_area_sampling(diameter_px: float, motion_px: float) -> None:
     """The share of the shutter in which a disc covers a point, averaged over 24 x 24 points of each pixel.
@@ -125,7 +119,7 @@ def test_the_capsule_against_area_sampling(diameter_px: float, motion_px: float)
     assert np.abs(kernel - expected).sum() < 0.004
 
 
-def test_limits_of_the_capsule() -> None:
+def test_limits_of_the_capsule_and_boxes_of_no_size() -> None:
     """Without motion a disc, without defocus a line of even light, with neither the pixel itself."""
     model = Combined()
     still, disc = model.exact(np.array([21.0, 0.0])), SimpleLens().exact(np.array([21.0]))
@@ -135,6 +129,9 @@ def test_limits_of_the_capsule() -> None:
     assert line[3].sum() == 0.0
     np.testing.assert_array_equal(model.exact(np.array([0.0, 0.0])), np.ones((1, 1, 1), np.float32))
     np.testing.assert_array_equal(model.exact(np.array([0.5, 0.4])), np.ones((1, 1, 1), np.float32))
+    for model, ends in MODELS.values():
+        point = np.array(ends)[:, 0]
+        np.testing.assert_allclose(model.kernel(np.stack([point, point], axis=1), 0, 0), model.exact(point), atol=1e-7)
 
 
 @pytest.mark.parametrize("name", ["disc", "ring", "capsule over a cell"])

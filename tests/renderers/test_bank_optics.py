@@ -68,25 +68,20 @@ def test_light_of_a_kernel_wider_than_the_circle_of_confusion_is_all_there(mist:
     assert seen.alpha.sum(dtype=np.float64) == pytest.approx(1.0, abs=1e-4)
 
 
-def test_the_veil_of_one_slice_is_not_cut_where_another_begins(mist: PsfBank) -> None:
-    """A lamp far behind and one in focus: their light adds up to what their kernels let through, less what the near one hides.
-
-    Both veils spread over 41 x 41 pixels; where they overlap, the near lamp covers less than 1e-4 of the pupil.
-    """
+def test_an_absorbing_medium_darkens_a_scene_once_and_its_veil_is_not_cut_at_slices(mist: PsfBank) -> None:
+    """Evenly white and of one distance: every colour is what the kernel sums to, and alpha stays 1."""
+    seen = LaplacianSpreadlets(mist).render([white(5.0)], LENS)
+    light = mist.throughput[int(mist.nearest(np.array([depth_m(5.0)[0, 0]], np.float64)))]
+    np.testing.assert_allclose(seen.rgb, np.broadcast_to(light, (*SIZE, 3)), rtol=2e-3)
+    np.testing.assert_array_equal(seen.alpha, 1.0)
+    # A lamp far behind and one in focus: their light adds up to what their kernels let through, less what the near one hides. Both veils
+    # spread over 41 x 41 pixels; where they overlap, the near lamp covers less than 1e-4 of the pupil.
     far, near = lone_pixel(20.0, 5.0), lone_pixel(0.0, 2.0)
     far = replace(far, rgb=np.roll(far.rgb, -25, axis=1), alpha=np.roll(far.alpha, -25, axis=1))
     both = LaplacianSpreadlets(mist).render([near, far], LENS).rgb.sum(axis=(0, 1), dtype=np.float64)
     light = mist.throughput[mist.nearest(np.array([[depth_m(0.0)[0, 0]], [depth_m(20.0)[0, 0]]], np.float64))]
     together = 2.0 * light[0] + 5.0 * light[1]
     assert (both < 1.0001 * together).all() and (both > 0.9999 * together).all()
-
-
-def test_an_absorbing_medium_darkens_an_opaque_scene_once(mist: PsfBank) -> None:
-    """Evenly white and of one distance: every colour is what the kernel sums to, and alpha stays 1."""
-    seen = LaplacianSpreadlets(mist).render([white(5.0)], LENS)
-    light = mist.throughput[int(mist.nearest(np.array([depth_m(5.0)[0, 0]], np.float64)))]
-    np.testing.assert_allclose(seen.rgb, np.broadcast_to(light, (*SIZE, 3)), rtol=2e-3)
-    np.testing.assert_array_equal(seen.alpha, 1.0)
 
 
 def vignetted(cells: int = 10, taps: int = 9) -> PsfBank:

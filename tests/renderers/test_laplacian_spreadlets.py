@@ -85,7 +85,7 @@ def test_light_of_a_sparse_area_is_kept_and_stays_in_place() -> None:
     assert np.abs(light[:20]).max() < 1e-3 * light.max()
 
 
-def test_a_lamp_shows_its_exact_disc() -> None:
+def test_a_lamp_shows_its_exact_disc_and_light_that_is_no_number_stays_none() -> None:
     """A lamp of 1e5 amid a dim picture is no sum of few points, and its rounding does not show elsewhere."""
     values, coc_px = picture(5, (192, 192)), np.full((192, 192), 42.0, np.float32)
     lamp = values.copy()
@@ -95,6 +95,12 @@ def test_a_lamp_shows_its_exact_disc() -> None:
     dense = renderer.sum_kernels(lamp, coc_px, DISC, densely=True) - renderer.sum_kernels(values, coc_px, DISC, densely=True)
     np.testing.assert_allclose(alone[..., :3], dense[..., :3], atol=2e-3 * dense.max())
     assert np.abs(alone[:60]).max() < 1e-3, "1e-8 of the lamp"
+    # Whole numbers cannot hold it: sums in double precision say so.
+    values, coc_px = picture(19), slope_px(30.0, 50.0)
+    values[40, 50, 1] = np.nan
+    found = LaplacianSpreadlets().sum_kernels(values, coc_px, DISC)
+    assert np.isnan(found[40, 50, 1])
+    assert np.isfinite(found[..., 0]).all()
 
 
 @pytest.mark.parametrize("dense_up_to_px", [24.0, 4.0])
@@ -205,15 +211,6 @@ def test_whole_numbers_are_as_good_as_double_precision(name: str) -> None:
     assert np.any(found != exact), "else the twin is no twin"
 
 
-def test_light_that_is_no_number_goes_no_other_way_than_before() -> None:
-    """Whole numbers cannot hold it: sums in double precision say so."""
-    values, coc_px = picture(19), slope_px(30.0, 50.0)
-    values[40, 50, 1] = np.nan
-    found = LaplacianSpreadlets().sum_kernels(values, coc_px, DISC)
-    assert np.isnan(found[40, 50, 1])
-    assert np.isfinite(found[..., 0]).all()
-
-
 def sums_in_whole_numbers(values: np.ndarray, cells: np.ndarray, kernels: list, ends: tuple[int, ...]) -> tuple[np.ndarray, ...]:
     """Whole numbers, over their gains, in strips that end there; and the plain sums."""
     points = joined_points([by_rows(each) for each in kernels])
@@ -228,7 +225,7 @@ def sums_in_whole_numbers(values: np.ndarray, cells: np.ndarray, kernels: list, 
     return reals.astype(np.float64), plain, gains
 
 
-def test_whole_numbers_agree_with_the_plain_twin_and_sum_to_nothing() -> None:
+def test_whole_numbers_agree_with_the_plain_twin_and_their_rounding_does_not_add_up() -> None:
     """Each pixel's points sum to 0, so all sums do, to the last bit, wherever strips end; a point is off by one rounding, 126 of them
     by less than 20 units."""
     rng = np.random.default_rng(20)
@@ -240,6 +237,13 @@ def test_whole_numbers_agree_with_the_plain_twin_and_sum_to_nothing() -> None:
     np.testing.assert_array_equal(found, again)
     assert np.all(np.abs(found - plain) * gains < 20.0 + 2.0**-23 * np.abs(plain) * gains)
     assert np.abs(plain * gains).max() > 1e6, "else 20 units were no small error"
+    # Dithers spread evenly: those of any 100 x 100 pixels leave at most a few of 10 000; all alike would leave thousands.
+    from mrbokeh.renderers.spreadlets._splat_numba import dither_of
+
+    dithers = np.array([[dither_of(x, y) for x in range(100)] for y in range(700, 800)])
+    assert np.abs(dithers).max() <= 0.5
+    for product in (0.1, 0.35, 0.5, 0.77):
+        assert abs(np.rint(product + dithers).sum() - product * dithers.size) < 10.0
 
 
 def test_no_light_is_too_much_for_whole_numbers() -> None:
@@ -261,16 +265,6 @@ def test_no_light_is_too_much_for_whole_numbers() -> None:
     assert middle == pytest.approx(0.9999 * sum(abs(weight) for _, weight in best.values()))
     assert 2.0**29 <= middle * gains[0] < 2.0**31
     assert found[2 * reach, 2 * reach, 0] == pytest.approx(middle, rel=1e-6)
-
-
-def test_rounding_of_an_even_area_does_not_add_up() -> None:
-    """Dithers spread evenly: those of any 100 x 100 pixels leave at most a few of 10 000; all alike would leave thousands."""
-    from mrbokeh.renderers.spreadlets._splat_numba import dither_of
-
-    dithers = np.array([[dither_of(x, y) for x in range(100)] for y in range(700, 800)])
-    assert np.abs(dithers).max() <= 0.5
-    for product in (0.1, 0.35, 0.5, 0.77):
-        assert abs(np.rint(product + dithers).sum() - product * dithers.size) < 10.0
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])

@@ -147,7 +147,7 @@ def test_the_window_filter_is_chance_through_a_part_of_pupil_and_shutter(
     assert out.sum() == pytest.approx(1.0, abs=1e-4)
 
 
-def test_a_segment_is_shared_out_by_length() -> None:
+def test_segments_are_shared_out_by_length_and_running_sums_forget_a_lamp() -> None:
     """Of a segment of 3 px along x one third lies in each of three pixels; of one of 2 px half in the middle, a quarter beside."""
     for length, expected in ((3.0, [1 / 3, 1 / 3, 1 / 3]), (2.0, [0.25, 0.5, 0.25]), (0.0, [1.0])):
         offsets, weights = line_taps(length, 0.0, *WHOLE)
@@ -155,6 +155,12 @@ def test_a_segment_is_shared_out_by_length() -> None:
         np.testing.assert_array_equal(offsets[:, 0], np.arange(len(expected)) - len(expected) // 2)
     offsets, weights = line_taps(4.0, 0.0, 0.0, 0.25)
     assert offsets[:, 0].tolist() == [0, 1] and weights.tolist() == [0.5, 0.5], "from 0 to 1 px: half in each of two pixels"
+    # Steps of single precision at 1e5 are 0.008, eight times the light beside the lamp: running sums must be kept in double.
+    planes = np.full((21, 101, 1), 1e-3, np.float32)
+    planes[:, 10] = 1e5
+    out = np.empty((1, 81, 1), np.float32)
+    pupil_filter(out, planes, sums_along_x(planes), pupil_spans(Aperture.disc(), 8), 5.0, 10)
+    np.testing.assert_allclose(out[0, 20:], 1e-3, rtol=1e-5)
 
 
 @pytest.mark.parametrize("aperture", [Aperture.disc(), Aperture.heart(), Aperture.ring(0.5)])
@@ -179,12 +185,3 @@ def _moments(spans: np.ndarray, power: int) -> tuple[float, float]:
     if power == 1:
         return float(weight @ mean_u), float(weight @ mean_v)
     return float(weight @ (mean_u**2 + (to_u - from_u) ** 2 / 12)), float(weight @ (mean_v**2 + height**2 / 12))
-
-
-def test_running_sums_forget_a_lamp_beside_dim_light() -> None:
-    """Steps of single precision at 1e5 are 0.008, eight times the light beside the lamp: running sums must be kept in double."""
-    planes = np.full((21, 101, 1), 1e-3, np.float32)
-    planes[:, 10] = 1e5
-    out = np.empty((1, 81, 1), np.float32)
-    pupil_filter(out, planes, sums_along_x(planes), pupil_spans(Aperture.disc(), 8), 5.0, 10)
-    np.testing.assert_allclose(out[0, 20:], 1e-3, rtol=1e-5)

@@ -149,19 +149,16 @@ def test_what_can_hardly_be_seen_has_no_partition(radius_px: float, light: float
     assert partitions.sums[-1, 0] == (np.arange(1000) < 300).sum() - few[:300].sum()
 
 
-def test_where_all_can_hardly_be_seen_nothing_is_faint() -> None:
-    slopes = np.tile([30.0, 0.0, 0.0], (2, 1))
-    light = one_tile(slopes, np.array([3, 9]))
-    partitions, _, _ = partitions_of_tile(0, light, choice_of(Settings(), 1), no_places(light))
-    assert len(partitions.sums) >= 1 and partitions.sums[:, 0].sum() == 2
-
-
-def test_cells_of_motion_have_the_side_asked_for() -> None:
+def test_cells_of_motion_have_the_side_asked_for_and_where_all_is_faint_nothing_is() -> None:
     motion_px = np.random.default_rng(0).uniform(-40.0, 40.0, (2000, 2)).astype(np.float32)
     cell, across, count = motion_cells(motion_px, Settings(motion_step_px=16.0))
     assert cell.min() >= 0 and cell.max() < count and count % across == 0
     assert max(np.ptp(motion_px[cell == index], axis=0).max() for index in np.unique(cell)) <= 16.0
     assert motion_cells(motion_px, Settings(motion=False))[2] == 1
+    slopes = np.tile([30.0, 0.0, 0.0], (2, 1))
+    light = one_tile(slopes, np.array([3, 9]))
+    partitions, _, _ = partitions_of_tile(0, light, choice_of(Settings(), 1), no_places(light))
+    assert len(partitions.sums) >= 1 and partitions.sums[:, 0].sum() == 2
 
 
 def test_buckets_cut_depth_finely_near_the_focus_and_infinity_is_the_last() -> None:

@@ -74,17 +74,14 @@ def merged_with_lights(stack: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray,
     return with_restored_lights(merged, restored), merged, lights
 
 
-def test_energy_lost_to_saturation_is_found_in_the_discs() -> None:
+def test_energy_lost_to_saturation_is_found_in_the_discs_and_light_that_fits_left_alone() -> None:
     restored, merged, lights = merged_with_lights(slices(scene()))
     assert merged.max() <= FULL
     # In slice 4 the disc of 12 px spreads the light over 94 px, 0.95 above the wall: nothing is full there.
     np.testing.assert_allclose(restored[LIGHT_AT], RADIANCE, rtol=0.03)
     away = lights.zone == 0
     np.testing.assert_array_equal(restored[away], merged[away])
-
-
-def test_a_light_that_fits_the_sensor_is_left_alone() -> None:
-    """At 1.8 it is below what fills the sensor; it stays as bright as its sharp slice shows it."""
+    # At 1.8 it is below what fills the sensor; it stays as bright as its sharp slice shows it.
     stack = slices(scene(np.array([1.8, 1.7, 1.6], np.float32)))
     restored, merged, lights = merged_with_lights(stack)
     assert len(lights) == 0

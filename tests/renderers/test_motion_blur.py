@@ -79,10 +79,13 @@ def test_a_pan_blurs_the_whole_picture(renderer: Renderer) -> None:
     assert psnr(blurred[inside], over_time(renderer, frames)[inside]) > 45.0
 
 
-def test_what_does_not_move_stays_as_it_was(renderer: Renderer) -> None:
+def test_what_does_not_move_stays_and_motion_that_does_not_fit_is_refused(renderer: Renderer) -> None:
     layers = [object_layer(40, -8.0), background(10.0)]
     still = renderer.render([moving(layer, (0.0, 0.0)) for layer in layers], LENS)
     np.testing.assert_array_equal(still.rgb, renderer.render(layers, LENS).rgb)
+    for wrong, said in ((np.zeros((3, 4, 2), np.float32), "shape"), (np.full((*SIZE, 2), np.nan, np.float32), "finite")):
+        with pytest.raises(InputError, match=said):
+            with_motion(background(0.0), wrong)
 
 
 def test_a_point_in_focus_keeps_its_light_and_its_place(renderer: Renderer) -> None:
@@ -95,12 +98,6 @@ def test_a_point_in_focus_keeps_its_light_and_its_place(renderer: Renderer) -> N
     assert ((line * x).sum(), (line * y).sum()) == pytest.approx((48.0, 28.0), abs=0.01)
     covariance = (line * (x - 48.0) * (y - 28.0)).sum()
     assert covariance == pytest.approx(10.0 * -6.0 / 12.0, rel=0.02)
-
-
-def test_motion_that_does_not_fit_is_refused() -> None:
-    for wrong, said in ((np.zeros((3, 4, 2), np.float32), "shape"), (np.full((*SIZE, 2), np.nan, np.float32), "finite")):
-        with pytest.raises(InputError, match=said):
-            with_motion(background(0.0), wrong)
 
 
 @pytest.mark.parametrize("scene", ["fence_1", "whirl_1"])

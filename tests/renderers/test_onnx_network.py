@@ -76,12 +76,17 @@ def test_light_and_coverage_are_kept_and_agree(network: OnnxNetwork, coc_px: flo
     assert result.alpha.min() >= 0.0 and result.alpha.max() <= 1.0
 
 
-def test_blur_spreads_beyond_the_silhouette_by_its_radius_and_no_farther(network: OnnxNetwork) -> None:
+def test_blur_reaches_as_far_as_its_radius_and_front_covers_what_is_behind(network: OnnxNetwork) -> None:
     """6 px of blur reach 3 px, one more is left to the sensor: the edge between columns 57 and 58 shows from 4 px before to 4 px after."""
     row = network.render([card(6.0)], LENS).alpha[32]
     assert row[59] > 0.05 and row[56] < 0.95
     assert row[52] == pytest.approx(1.0, abs=1e-3)
     assert row[60] > 0.01 and (row[62:] == 0.0).all()
+    behind = opaque(np.full((*SIZE, 3), 0.5, np.float32), np.full(SIZE, depth_for(5.0), np.float32))
+    result = network.render([card(-4.0, rgb=(0.0, 0.0, 0.0)), behind], LENS)
+    assert np.allclose(result.rgb[32, 48], 0.0, atol=1e-3)
+    assert np.allclose(result.rgb[5, 5], 0.5, atol=1e-3)
+    assert np.allclose(result.alpha, 1.0, atol=1e-4)
 
 
 def test_what_is_in_focus_stays_wherever_that_is(network: OnnxNetwork) -> None:
@@ -96,25 +101,14 @@ def test_what_is_in_focus_stays_wherever_that_is(network: OnnxNetwork) -> None:
     assert np.allclose(result.alpha, layer.alpha, atol=0.003)
 
 
-def test_front_covers_what_is_behind(network: OnnxNetwork) -> None:
-    behind = opaque(np.full((*SIZE, 3), 0.5, np.float32), np.full(SIZE, depth_for(5.0), np.float32))
-    result = network.render([card(-4.0, rgb=(0.0, 0.0, 0.0)), behind], LENS)
-    assert np.allclose(result.rgb[32, 48], 0.0, atol=1e-3)
-    assert np.allclose(result.rgb[5, 5], 0.5, atol=1e-3)
-    assert np.allclose(result.alpha, 1.0, atol=1e-4)
-
-
-def test_empty_layers_and_cropping_to_the_object_change_nothing(network: OnnxNetwork) -> None:
+def test_cropping_empty_layers_and_highlights_change_nothing_else(network: OnnxNetwork) -> None:
     empty = Layer(np.zeros((*SIZE, 3), np.float32), np.zeros(SIZE, np.float32), np.full(SIZE, np.inf, np.float32))
     assert np.array_equal(network.render([empty, card(3.0)], LENS).rgb, network.render([card(3.0)], LENS).rgb)
     # A card beside nothing and the whole picture by hand agree.
     layer = card(5.0)
     whole = network.blur(layer.rgb, np.full(SIZE, 5.0, np.float32))
     assert np.allclose(network.render([layer], LENS).rgb, whole, atol=1e-5)
-
-
-def test_highlights_far_above_the_range_are_not_clipped(network: OnnxNetwork) -> None:
-    """The gated form is linear in radiance: a light of 4000, a thousand times its scale, is blurred like any other."""
+    # The gated form is linear in radiance: a light of 4000, a thousand times its scale, is blurred like any other.
     rgb = np.zeros((*SIZE, 3), np.float32)
     rgb[32, 48] = 4000.0
     coc_px = np.full(SIZE, 6.0, np.float32)

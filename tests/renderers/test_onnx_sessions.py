@@ -24,20 +24,10 @@ def doubling(tmp_path: Path) -> Path:
     return path
 
 
-def test_it_runs_on_the_cpu_and_says_so(doubling: Path) -> None:
+def test_it_runs_on_the_cpu_and_what_is_not_there_is_said_by_name(doubling: Path) -> None:
     session = open_session(doubling, threads=1, providers=["cpu"])
     assert provider_of(session) == "cpu"
     np.testing.assert_array_equal(session.run(["y"], {"x": np.array([1.0, 2.0], np.float32)})[0], [2.0, 4.0])
-
-
-def test_a_wish_is_kept_else_the_fastest_comes_first_and_the_cpu_last() -> None:
-    assert _chosen(None, ALL) == ALL
-    assert _chosen(None, [CPU, "AzureExecutionProvider", "CUDAExecutionProvider"]) == ["CUDAExecutionProvider", CPU]
-    assert _chosen(["openvino"], ALL) == ["OpenVINOExecutionProvider", CPU]
-    assert _chosen(["cpu"], ALL) == [CPU]
-
-
-def test_a_provider_that_is_not_there_is_said_by_name(doubling: Path) -> None:
     missing = next(
         name
         for name, full in (("tensorrt", ALL[0]), ("cuda", ALL[1]), ("openvino", ALL[2]))
@@ -47,6 +37,13 @@ def test_a_provider_that_is_not_there_is_said_by_name(doubling: Path) -> None:
         open_session(doubling, providers=[missing])
     with pytest.raises(InputError, match="got 'tpu'"):
         open_session(doubling, providers=["tpu"])
+
+
+def test_a_wish_is_kept_else_the_fastest_comes_first_and_the_cpu_last() -> None:
+    assert _chosen(None, ALL) == ALL
+    assert _chosen(None, [CPU, "AzureExecutionProvider", "CUDAExecutionProvider"]) == ["CUDAExecutionProvider", CPU]
+    assert _chosen(["openvino"], ALL) == ["OpenVINOExecutionProvider", CPU]
+    assert _chosen(["cpu"], ALL) == [CPU]
 
 
 def test_no_file_and_no_network_are_said_plainly(tmp_path: Path) -> None:

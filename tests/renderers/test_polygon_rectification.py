@@ -167,11 +167,21 @@ def test_a_convex_outline_gets_all_supporting_half_planes(sides: int) -> None:
         assert polygon.symmetric_difference(expected).area < 1e-9
 
 
-def test_circumscribed_polygons_of_the_circle() -> None:
+def test_the_circle_is_circumscribed_and_symmetry_kept_without_mirrors() -> None:
     """Area n tan(pi / n) of the regular polygon around the unit circle; (1, 2) lies at 26.57 and not 22.5 degrees, so only 4 and 8."""
     circle = polar(np.ones(64))
     assert Polygon(rectify(circle, UPRIGHT, 4)).area == pytest.approx(4.0, rel=1e-12)
     assert Polygon(rectify(circle, EIGHTHS, 12)).area == pytest.approx(8.0 * np.tan(np.pi / 8.0), rel=1e-12)
+    pinwheel = polar(np.tile([1.0, 0.8, 0.5, 0.55], 4), 0.1)
+    propeller = polar(np.tile([1.0, 0.7, 0.3, 0.35], 2), 0.1)
+    for max_edges in (8, 12, 16):
+        assert is_image(rectify(pinwheel, max_edges=max_edges, symmetry_cost=np.inf), QUARTER)
+        assert is_image(rectify(propeller, max_edges=max_edges, symmetry_cost=np.inf), QUARTER @ QUARTER)
+    assert not is_image(rectify(propeller, max_edges=12, symmetry_cost=np.inf), QUARTER)
+    outline = heart(150, shift=0.37) + np.array([3.0, -2.0])
+    polygon = rectify(outline, max_edges=12)
+    assert is_image(polygon, MIRRORS["x"]) and encloses(polygon, outline) and is_along(polygon, PAPER_DIRECTIONS)
+    assert not is_image(rectify(outline, ((1, 0), (0, 1), (1, 1)), 12), MIRRORS["x"]), "directions that have no such mirror"
 
 
 @pytest.mark.parametrize(("name", "elements"), [
@@ -187,19 +197,6 @@ def test_what_is_symmetric_stays_symmetric(name: str, elements: list[np.ndarray]
     assert area_excess(rectify(FIGURE_6[name], max_edges=max_edges), FIGURE_6[name]) <= smallest + 0.05 + 1e-9, "the default's promise"
     if max_edges == 16:
         assert all(is_image(rectify(FIGURE_6[name]), element) for element in elements), "by default, too"
-
-
-def test_symmetry_is_kept_without_mirrors_and_seen_where_vertices_do_not_mirror() -> None:
-    pinwheel = polar(np.tile([1.0, 0.8, 0.5, 0.55], 4), 0.1)
-    propeller = polar(np.tile([1.0, 0.7, 0.3, 0.35], 2), 0.1)
-    for max_edges in (8, 12, 16):
-        assert is_image(rectify(pinwheel, max_edges=max_edges, symmetry_cost=np.inf), QUARTER)
-        assert is_image(rectify(propeller, max_edges=max_edges, symmetry_cost=np.inf), QUARTER @ QUARTER)
-    assert not is_image(rectify(propeller, max_edges=12, symmetry_cost=np.inf), QUARTER)
-    outline = heart(150, shift=0.37) + np.array([3.0, -2.0])
-    polygon = rectify(outline, max_edges=12)
-    assert is_image(polygon, MIRRORS["x"]) and encloses(polygon, outline) and is_along(polygon, PAPER_DIRECTIONS)
-    assert not is_image(rectify(outline, ((1, 0), (0, 1), (1, 1)), 12), MIRRORS["x"]), "directions that have no such mirror"
 
 
 @pytest.mark.parametrize("outline", [

@@ -147,12 +147,9 @@ def test_a_point_stays_within_its_circle_of_confusion(renderer: Renderer, coc_px
     assert nearest_px.max() >= abs(coc_px) / 2 - 1.5
 
 
-def test_mirrored_picture_gives_mirrored_result(renderer: Renderer) -> None:
+def test_mirrored_picture_gives_mirrored_result_and_so_does_the_near_side_of_the_focus(renderer: Renderer) -> None:
     result, mirrored = (renderer.render([flat_layer(rgb, ONES, 7.3)], LENS) for rgb in (texture(), texture()[:, ::-1]))
     np.testing.assert_allclose(mirrored.rgb, result.rgb[:, ::-1], atol=1e-5)
-
-
-def test_in_front_of_the_focus_the_aperture_is_seen_mirrored(renderer: Renderer) -> None:
     triangle = replace(LENS, aperture=Aperture.blades(3))
     behind = renderer.render([point(12.0)], triangle).alpha
     in_front = renderer.render([point(-12.0)], triangle).alpha
@@ -161,27 +158,21 @@ def test_in_front_of_the_focus_the_aperture_is_seen_mirrored(renderer: Renderer)
     assert in_front[CENTRE, CENTRE - 5] > 0 and behind[CENTRE, CENTRE - 5] == 0
 
 
-def test_linearity_in_light(renderer: Renderer) -> None:
+def test_linearity_in_light_beside_edges_and_lamps_too(renderer: Renderer) -> None:
     one, doubled = (renderer.render([flat_layer(factor * texture(1), ONES, 6.0)], LENS).rgb for factor in (1.0, 2.0))
     np.testing.assert_allclose(doubled, 2.0 * one, rtol=1e-5)
-
-
-def test_linearity_in_light_beside_edges_and_lamps(renderer: Renderer) -> None:
-    """What is filled in behind edges scales with the light as well: a power of two changes no bit but the exponent."""
+    # What is filled in behind edges scales with the light as well: a power of two changes no bit but the exponent.
     layer = SCENES["two planes"]()
     four = renderer.render([replace(layer, rgb=np.float32(4.0) * layer.rgb)], LENS).rgb
     np.testing.assert_allclose(four, 4.0 * rendered(name_of(renderer), "two planes"), rtol=1e-5, atol=1e-6)
 
 
-def test_premultiplied_white_blurs_like_its_alpha(renderer: Renderer) -> None:
+def test_an_even_field_stays_even_and_premultiplied_white_blurs_like_its_alpha(renderer: Renderer) -> None:
+    result = renderer.render([flat_layer(np.full((SIZE_PX, SIZE_PX, 3), 0.4), ONES, 10.0)], LENS)
+    np.testing.assert_allclose(result.rgb, 0.4, rtol=1e-5)  # up to the border: an opaque layer goes on beyond it
     alpha = rectangle(slice(14, 34), slice(17, 37))
     result = renderer.render([flat_layer(np.repeat(alpha[..., None], 3, 2), alpha, 9.0)], LENS)
     np.testing.assert_allclose(result.rgb, np.repeat(result.alpha[..., None], 3, 2), atol=1e-6)
-
-
-def test_an_even_field_stays_even_inside(renderer: Renderer) -> None:
-    result = renderer.render([flat_layer(np.full((SIZE_PX, SIZE_PX, 3), 0.4), ONES, 10.0)], LENS)
-    np.testing.assert_allclose(result.rgb, 0.4, rtol=1e-5)  # up to the border: an opaque layer goes on beyond it
 
 
 def check_straight_edge(renderer: Renderer, profile: np.ndarray) -> None:
@@ -196,9 +187,13 @@ def check_straight_edge(renderer: Renderer, profile: np.ndarray) -> None:
     np.testing.assert_allclose(profile[10:-10], exact[10:-10], atol=PROMISES[name_of(renderer)].straight_edge)
 
 
-def test_a_straight_edge_blurs_to_the_integral_of_the_disc(renderer: Renderer) -> None:
+def test_a_straight_edge_blurs_to_the_integral_of_the_disc_in_one_picture_too(renderer: Renderer) -> None:
     alpha = rectangle(EVERYWHERE, slice(CENTRE, None))
     check_straight_edge(renderer, renderer.render([flat_layer(np.repeat(alpha[..., None], 3, 2), alpha, 16.0)], LENS).alpha[CENTRE])
+    # One opaque picture: its left half near and black, its right half in focus and bright. Beside the edge the share of the disc that
+    # passes the near half is what a straight edge leaves, on both sides of it: what hides behind is continued.
+    rgb, depth_m = two_halves(-16.0, 0.0)
+    check_straight_edge(renderer, renderer.render([opaque(rgb, depth_m)], LENS).rgb[CENTRE, :, 0])
 
 
 def test_an_opaque_sharp_layer_hides_what_is_behind(renderer: Renderer) -> None:
@@ -242,13 +237,6 @@ def test_nothing_behind_leaks_onto_a_sharp_foreground(renderer: Renderer) -> Non
     result = renderer.render([opaque(rgb, depth_m)], LENS)
     np.testing.assert_allclose(result.rgb[:, :CENTRE], 0.0, atol=1e-6)
     np.testing.assert_allclose(result.rgb[:, CENTRE + 1 :], 1.0, atol=1e-4)  # and nothing is missing beside the edge
-
-
-def test_a_blurred_foreground_spreads_over_a_sharp_background(renderer: Renderer) -> None:
-    """One opaque picture: its left half near and black, its right half in focus and bright. Beside the edge the share of the
-    disc that passes the near half is what a straight edge leaves, on both sides of it: what hides behind is continued."""
-    rgb, depth_m = two_halves(-16.0, 0.0)
-    check_straight_edge(renderer, renderer.render([opaque(rgb, depth_m)], LENS).rgb[CENTRE, :, 0])
 
 
 @pytest.mark.parametrize("front_px", [-12.0, 12.0])

@@ -50,9 +50,13 @@ def tilted_kernel() -> np.ndarray:
     return np.dstack([kernel, kernel[::-1], np.roll(kernel, 1, axis=0)])
 
 
-def test_the_whole_laplacian_is_the_kernel() -> None:
+def test_the_whole_laplacian_is_the_kernel_and_half_a_turn_of_it_exact() -> None:
     assert relative_error(whole_laplacian(KERNEL)) < 1e-12
     assert len(whole_laplacian(KERNEL).points) < 0.4 * np.count_nonzero(KERNEL)
+    upright = whole_laplacian(tilted_kernel())
+    points, values = turned(upright.points, upright.values, np.pi)
+    expected = {tuple(point): tuple(value) for point, value in zip(-upright.points, upright.values, strict=True)}
+    assert {tuple(point): tuple(value) for point, value in zip(points, values, strict=True)} == expected
 
 
 @pytest.mark.parametrize("kernel", [KERNEL, tilted_kernel()], ids=["disc", "colours"])
@@ -77,13 +81,19 @@ def test_light_and_centroid_are_kept_exactly(kernel: np.ndarray) -> None:
         np.testing.assert_allclose(polynomial @ found.values, light, atol=1e-10 * scale * np.abs(polynomial).max())
 
 
-def test_few_points_are_nearly_the_kernel_and_more_come_nearer() -> None:
+def test_few_points_are_nearly_the_kernel_more_nearer_and_the_same_for_one_seed() -> None:
     """A tenth of the taps of a disc of 40 px, and an error of a tenth of its norm (measured: 0.090 and 0.105)."""
     found = sparsify(KERNEL, Sparsification(lloyd_steps=0, annealing_steps=0))
     assert len(found.points) < 0.1 * np.count_nonzero(KERNEL)
     assert relative_error(found) < 0.115
     errors = [relative_error(sparsify(KERNEL, Sparsification(annealing_steps=0, points_per_px=per_px))) for per_px in (0.5, 1.0, 2.0)]
     assert errors[0] > 1.5 * errors[1] > 1.5 * 1.5 * errors[2]
+    one, same, other = (sparsify(KERNEL, replace(QUICK, seed=seed)) for seed in (1, 1, 2))
+    np.testing.assert_array_equal(one.points, same.points)
+    np.testing.assert_array_equal(one.values, same.values)
+    assert one.points.shape != other.points.shape or (one.points != other.points).any()
+    small = Aperture.disc().rasterize(2.0).kernel
+    np.testing.assert_array_equal(sparsify(small, Sparsification(points_per_px=10.0)).values, whole_laplacian(small).values)
 
 
 @pytest.mark.parametrize("turn", [0, 1])
@@ -119,19 +129,15 @@ def test_the_fit_and_annealing_beat_the_sums_of_the_paper() -> None:
     assert len(annealed.points) <= len(plain.points)
 
 
-def test_the_same_seed_gives_the_same_points_and_small_kernels_come_back_whole() -> None:
-    one, same, other = (sparsify(KERNEL, replace(QUICK, seed=seed)) for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one.points, same.points)
-    np.testing.assert_array_equal(one.values, same.values)
-    assert one.points.shape != other.points.shape or (one.points != other.points).any()
-    small = Aperture.disc().rasterize(2.0).kernel
-    np.testing.assert_array_equal(sparsify(small, Sparsification(points_per_px=10.0)).values, whole_laplacian(small).values)
-
-
-def test_the_outline_of_a_disc_is_its_circumference() -> None:
+def test_the_outline_of_a_disc_is_its_circumference_and_odd_kernels_are_refused() -> None:
     """A slope of 1 px width is 1.04 to 1.1 times as long when it is measured by differences of neighbours; so is this one."""
     lengths = [outline_px(Aperture.disc().rasterize(size).kernel) / (np.pi * size) for size in (30.0, 60.0, 120.0)]
     assert min(lengths) > 1.0 and max(lengths) < 1.11
+    for shape in ((4, 4), (5, 7)):
+        with pytest.raises(InputError, match="square with an odd size"):
+            sparsify(np.ones(shape))
+    with pytest.raises(InputError, match="positive number of points"):
+        Sparsification(points_per_px=0.0)
 
 
 def test_the_values_are_the_best_for_their_points_and_those_of_the_whole_laplacian_itself() -> None:
@@ -184,13 +190,6 @@ def test_a_turned_spreadlet_keeps_light_and_centroid_and_shows_the_turned_kernel
     assert error < 0.25
 
 
-def test_half_a_turn_is_exact() -> None:
-    upright = whole_laplacian(tilted_kernel())
-    points, values = turned(upright.points, upright.values, np.pi)
-    expected = {tuple(point): tuple(value) for point, value in zip(-upright.points, upright.values, strict=True)}
-    assert {tuple(point): tuple(value) for point, value in zip(points, values, strict=True)} == expected
-
-
 def test_darts_keep_their_distance_and_cells_keep_their_sums() -> None:
     rng = np.random.default_rng(7)
     xy = np.argwhere(np.ones((30, 30), bool))
@@ -221,14 +220,6 @@ def test_spreadlets_in_a_file(tmp_path: Path) -> None:
     path.write_bytes(b"not a file of arrays")
     with pytest.raises(InputError, match="remove it"):
         read_spreadlets(path, QUICK, fingerprint(kernels))
-
-
-def test_kernels_of_other_shapes_and_a_sparsification_without_points_are_refused() -> None:
-    for shape in ((4, 4), (5, 7)):
-        with pytest.raises(InputError, match="square with an odd size"):
-            sparsify(np.ones(shape))
-    with pytest.raises(InputError, match="positive number of points"):
-        Sparsification(points_per_px=0.0)
 
 
 def test_systems_are_solved_as_lapack_does() -> None:

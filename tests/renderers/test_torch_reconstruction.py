@@ -112,13 +112,18 @@ def test_few_samples_and_bare_background_are_the_same(size_px: tuple[int, int], 
     np.testing.assert_array_equal(found.depth_m, known.depth_m)
 
 
-def test_samples_that_keep_their_pixels_are_the_same() -> None:
+def test_samples_that_keep_their_pixels_are_the_same_and_what_is_not_there_refused() -> None:
     """As `render` takes those of layers."""
     samples = fence_samples()
     task = samples, samples.rgb, samples.coc_px(LENS), LENS.aperture
     known, _ = LayeredReconstruction()._reconstructed(*task, shared_out=False)
     found, _ = TorchReconstruction().reconstruct_values(*task, shared_out=False)
     assert psnr(found, known) > 90.0 > psnr(by_torch(samples), known)
+    for device in ("tpu", "cuda:99", "mps"):
+        with pytest.raises(InputError, match="device"):
+            TorchReconstruction(device=device)
+    with pytest.raises(InputError, match="windows, sheared, direct"):
+        by_torch(fence_samples(), Settings(screen_filter="texture"))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="torch sees no NVIDIA GPU")
@@ -135,14 +140,6 @@ def test_how_much_is_done_at_a_time_changes_nothing(monkeypatch: pytest.MonkeyPa
     whole = by_torch(fence_samples())
     monkeypatch.setitem(_picture.AT_ONCE, "cpu", (3000, 6000, 2000))
     np.testing.assert_allclose(by_torch(fence_samples()), whole, atol=2e-6)
-
-
-def test_devices_and_filters_that_are_not_there_are_refused() -> None:
-    for device in ("tpu", "cuda:99", "mps"):
-        with pytest.raises(InputError, match="device"):
-            TorchReconstruction(device=device)
-    with pytest.raises(InputError, match="windows, sheared, direct"):
-        by_torch(fence_samples(), Settings(screen_filter="texture"))
 
 
 @pytest.mark.parametrize("module", ["layered_reconstruction.torch_reconstruction", "spreadlets.torch_spreadlets"])

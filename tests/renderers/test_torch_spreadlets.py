@@ -177,12 +177,17 @@ def test_sums_for_plain_apertures_are_those_of_the_cpu(aperture: Aperture, integ
     np.testing.assert_allclose(found, known, atol=1e-6 if integration else 1e-5)
 
 
-def test_the_combined_bank_is_that_of_the_cpu() -> None:
+def test_combined_and_coloured_banks_are_those_of_the_cpu() -> None:
     """Whole Laplacians and taps are exact on both: what differs is the rounding to single precision, of values up to 1000."""
     values, coc_px, motion = picture(6, lamp=1e5), slope_px(-20.0, 20.0), motion_px()
     known = LaplacianSpreadlets(combined(), sparsification=None).sum_bank_kernels(values, coc_px, Place(motion_px=motion))
     found = TorchSpreadlets(combined(), "cpu", None).sum_kernels(layer_of(values, coc_px, motion)).numpy()
     np.testing.assert_allclose(found, known, rtol=3e-6, atol=3e-6)
+    values, coc_px = picture(9), slope_px(2.0, 38.0)
+    known = LaplacianSpreadlets(chromatic(), sparsification=None).sum_bank_kernels(values, coc_px, Place())
+    found = TorchSpreadlets(chromatic(), "cpu", None).sum_kernels(layer_of(values, coc_px)).numpy()
+    assert found.shape == (*SIZE, 6), "a coverage for each colour"
+    np.testing.assert_allclose(found, known, atol=3e-6)
 
 
 def test_sparse_points_differ_by_their_far_field_only() -> None:
@@ -207,14 +212,6 @@ def chromatic() -> PsfBank:
         return np.stack([np.pad(each, (side - len(each)) // 2) for each in colours], axis=2).astype(np.float32)
 
     return PsfBank("glass", (Axis("diameter_px", 0.0, 40.0, 1.0),), (2,), (kernel(10.0), kernel(30.0)), nested=False)
-
-
-def test_a_bank_of_three_colours_is_that_of_the_cpu() -> None:
-    values, coc_px = picture(9), slope_px(2.0, 38.0)
-    known = LaplacianSpreadlets(chromatic(), sparsification=None).sum_bank_kernels(values, coc_px, Place())
-    found = TorchSpreadlets(chromatic(), "cpu", None).sum_kernels(layer_of(values, coc_px)).numpy()
-    assert found.shape == (*SIZE, 6), "a coverage for each colour"
-    np.testing.assert_allclose(found, known, atol=3e-6)
 
 
 def two_layers() -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
