@@ -21,15 +21,12 @@ def fixture_samples() -> LightFieldSamples:
     return sample_planes(fence_scene(SIZE_PX), SIZE_PX, 4)
 
 
-def test_samples_of_one_plane_reproject_to_where_the_middle_of_the_lens_sees_it() -> None:
+def test_samples_lie_where_the_middle_of_the_lens_sees_them_with_the_blur_of_their_pixel(samples: LightFieldSamples) -> None:
     """The colour of each sample is the texture there: with the wrong sign of coc, uv or motion it is not."""
     texture = waves(7.0)
-    samples = sample_planes([Plane(texture, -9.0, motion_px=(5.0, -3.0))], 32, 4)
-    at = samples.positions_at_lens_centre_px(LENS).astype(np.float64)
-    np.testing.assert_allclose(samples.rgb, texture(at[:, 0], at[:, 1]), atol=1e-4)
-
-
-def test_a_tilted_focus_gives_each_sample_the_blur_of_its_pixel(samples: LightFieldSamples) -> None:
+    moving = sample_planes([Plane(texture, -9.0, motion_px=(5.0, -3.0))], 32, 4)
+    at = moving.positions_at_lens_centre_px(LENS).astype(np.float64)
+    np.testing.assert_allclose(moving.rgb, texture(at[:, 0], at[:, 1]), atol=1e-4)
     tilted = Lens(50.0, 0.7, 0.5, 12.0, tilt_rad=(0.05, 0.0))
     flat = replace(samples, depth_m=np.full(samples.count, 0.6, np.float32))
     picture = tilted.coc_px(np.full((SIZE_PX, SIZE_PX), 0.6), SIZE_PX)

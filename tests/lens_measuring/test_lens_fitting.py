@@ -289,7 +289,7 @@ def test_the_command_writes_a_bank_that_renders(tmp_path: Path) -> None:
         return CliRunner().invoke(app, [str(each) for each in arguments], catch_exceptions=False).output
 
     out = tmp_path / "lens"
-    assert "slices" in run("fit", stack.folder, "--out", out, "--regions", "1x1", "--pixels", 9000, "--diameters", "12")
+    assert "slices" in run("fit", stack.folder, "--out", out, "--regions", "1x1", "--pixels", 5000, "--diameters", "12")
     assert (out / "kernels.png").is_file() and (out / "evidence.png").is_file()
     bank = read_bank(out)
     assert (bank.model, bank.channels) == ("measured", 3)

@@ -58,7 +58,7 @@ def test_bokeh_is_the_outline_behind_focus_and_its_mirror_image_in_front(z_m: fl
     """Compare with the exact area coverage of outline x signed coc / 2, which Aperture.rasterize computes without rays."""
     lens = replace(LENS, aperture=Aperture.blades(3, rotation_rad=0.4))
     # A lamp on a pixel's centre, as a PSF has it.
-    picture = trace(lamp(0.0, 0.0, z_m, 2e-5, 1e4), camera(lens, 63), lens, 1024)[..., 0]
+    picture = trace(lamp(0.0, 0.0, z_m, 2e-5, 1e4), camera(lens, 63), lens, 512)[..., 0]
     coc_px = float(lens.coc_px(z_m, 63))
     kernel, mirrored = (lens.aperture.rasterize(sign * coc_px).kernel for sign in (1, -1))
     picture, border = picture / picture.sum(), (63 - len(kernel)) // 2
