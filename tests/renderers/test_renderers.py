@@ -275,10 +275,10 @@ def test_every_parameter_of_the_lens_changes_the_picture(renderer: Renderer, cha
 
 @cache
 def through_the_plain_lens(name: str) -> tuple[Layer, np.ndarray]:
-    """A few pixels towards a corner, 11 px out of focus, and the picture that LENS makes of them. An opening that is another over the
-    frame is made for each of its cells that has light."""
-    alpha = rectangle(slice(33, 39), slice(33, 39))
-    layer = flat_layer(texture(10) * alpha[..., None], alpha, 11.0)
+    """A few pixels towards a corner of 31 x 31, 9 px out of focus, and the picture that LENS makes of them. An opening that is another over
+    the frame is made for each of its cells that has light."""
+    alpha = rectangle(slice(20, 26), slice(20, 26))[:31, :31]
+    layer = flat_layer(texture(10)[:31, :31] * alpha[..., None], alpha, 14.0)
     return layer, RENDERERS[name].render([layer], LENS).rgb
 
 
