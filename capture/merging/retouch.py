@@ -18,7 +18,7 @@ from mrbokeh.images.image_io import require_suffix
 from mrbokeh.images.picture_codec import stored_pixels
 from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks, write_focal_stack
 from mrbokeh.system.atomic_files import require_safe_outputs
-from mrbokeh.system.errors import InputError
+from mrbokeh.system.errors import InputError, require_file
 
 MASK_SUFFIXES = (".png", ".tif", ".tiff", ".exr")
 _ALPHA, _COLOURS = 3, 3
@@ -110,8 +110,7 @@ def read_mask(path: Path, shape: tuple[int, int], orientation: int) -> Plane:
     does not, as the pictures of a stack do. What is transparent is black.
     """
     require_suffix(path, MASK_SUFFIXES, "--mask")
-    if not path.is_file():
-        raise InputError(f"--mask: expected a picture at {path}, but there is no such file")
+    require_file(path, "a picture for --mask")
     is_exr = path.suffix.lower() == ".exr"
     white = _of_exr(path) if is_exr else upright(_of_codes(path), stored_orientation(path))
     if not np.isfinite(white).all():

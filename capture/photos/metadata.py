@@ -15,7 +15,7 @@ from typing import Any
 
 from capture.photos.focus_metadata import FocusReading, Tags, at_infinity, canon_reading, number, read_focus
 from capture.photos.photo_metadata import PhotoMetadata, SensorReading, parse_time, read_sensor, sensor_of_model, stated_size_px
-from mrbokeh.system.errors import InputError
+from mrbokeh.system.errors import InputError, require_file
 
 _TAGS = (
     "FocalLength", "FNumber", "ExposureTime", "ISO", "DateTimeOriginal", "Make", "Model", "LensModel", "Orientation", "ImageWidth",
@@ -223,8 +223,7 @@ def require_whole_tiff(path: Path) -> None:
 
     Decoders notice most files cut short, but lossy tiles of a DNG can go missing without a word.
     """
-    if not path.is_file():
-        raise InputError(f"expected a photograph at {path}, but there is no such file")
+    require_file(path, "a photograph")
     size, tags = path.stat().st_size, read_tags(path)
     for offsets_name, counts_name in _BLOCKS:
         for key, offsets in tags.items():

@@ -37,7 +37,7 @@ from typing import Any
 from capture.photos.focus_metadata import FocusReading
 from capture.photos.photo_metadata import PhotoMetadata
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.system.errors import InputError
+from mrbokeh.system.errors import InputError, require_file
 
 _ORIGINS = ("lens", "film_plane")
 FOCUS_FILE = "focus.csv"
@@ -154,10 +154,9 @@ def find_sidecar(folder: Path, top: Path, file_name: str = LENS_FILE) -> Path | 
 
 def read_sidecar(path: Path) -> Sidecar:
     """Read a lens.toml. Raises InputError for unknown keys (naming the known ones) and for impossible values."""
+    require_file(path, "a sidecar file")
     try:
         document = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"expected a sidecar file at {path}, but there is no such file") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"{path} is not valid TOML: {error}") from None
     known = [each.name for each in fields(Sidecar) if each.metadata.get("key", True)]
@@ -169,10 +168,9 @@ def read_sidecar(path: Path) -> Sidecar:
 
 def read_focus_csv(path: Path) -> dict[str, StatedFocus]:
     """Return the distances of a focus.csv by file name. Raises InputError naming the line that is wrong."""
+    require_file(path, "focus distances")
     try:
         text = Path(path).read_text(encoding="utf-8-sig")
-    except FileNotFoundError:
-        raise InputError(f"expected focus distances in {path}, but there is no such file") from None
     except UnicodeDecodeError as error:
         raise InputError(f"{path} is not text in UTF-8: {error}") from None
     rows = csv.DictReader(text.splitlines(), skipinitialspace=True)

@@ -296,6 +296,8 @@ def _filmed(description: SceneDescription, rendering: RenderingOptions, seen_by:
 
 def _triple(text: str) -> tuple[float, float, float]:
     x_m, y_m, z_m = numbers_in(text, "--at expects 3 numbers with commas between", (3,))
+    if not z_m > 0.0:
+        raise InputError(f"--at: expected a place in front of the lens, with Z above 0 m, got {text!r}")
     return x_m, y_m, z_m
 
 

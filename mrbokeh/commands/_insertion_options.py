@@ -127,6 +127,10 @@ class ColourOptions:
     ] = None
     ocio: Annotated[str, typer.Option(metavar="CONFIG", help="OpenColorIO configuration: aces, aces-cg or a file.")] = "aces"
 
+    def __post_init__(self) -> None:
+        if self.ocio != "aces" and self.input_space is None and self.output_space is None:
+            raise InputError(f"--ocio {self.ocio} has no use by itself: say --input-space or --output-space, or leave it out")
+
     @property
     def of_plate(self) -> "NamedSpace | None":
         return self._space(self.input_space)

@@ -175,7 +175,7 @@ class Insertion(Protocol):
 
 
 def same_size(plate: Plate, layers: Sequence[Layer]) -> Sequence[Layer]:
-    """The layers, once each is as large as the plate. Raises InputError where one is not."""
+    """Return the layers, once each is as large as the plate and lies before the camera. Raises InputError where one does not."""
     height, width = plate.rgb.shape[:2]
     for layer in layers:
         if layer.alpha.shape != (height, width):
@@ -183,4 +183,6 @@ def same_size(plate: Plate, layers: Sequence[Layer]) -> Sequence[Layer]:
                 f"the virtual layer is {layer.width_px}x{layer.height_px} px but the photograph is {width}x{height} px: "
                 f"render or resize it to that size"
             )
+        if not layer.depth_m.min(initial=np.inf) > 0.0 and not (layer.depth_m[layer.alpha > 0] > 0.0).all():
+            raise InputError("the depth of the virtual layer must be above 0 m where it covers the picture: give metres along the axis")
     return layers

@@ -19,7 +19,7 @@ from mrbokeh.images.image_io import read_depth
 from mrbokeh.images.picture_codec import stored_pixels
 from mrbokeh.optics.camera import have_same_shape
 from mrbokeh.system.atomic_files import read_json
-from mrbokeh.system.errors import InputError
+from mrbokeh.system.errors import InputError, require_file
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -228,8 +228,9 @@ def open_depth(source: Path, photo_rgb: Rgb, settings: DepthSettings | None = No
     Raises InputError if the source cannot be read, does not say what it means, or is of another shape than the photograph.
     """
     settings = settings or DepthSettings()
-    if not source.is_file():
-        raise InputError(f"expected depth at {source}, but there is no such file")
+    require_file(source, "depth")
+    if settings.stereo is not None and source.suffix.lower() not in _ARRAYS:
+        raise InputError(f"--stereo is for a file of disparity ({', '.join(_ARRAYS)}), got {source}: leave it out")
     depth, is_soft = _read(source, photo_rgb, settings)
     _require_same_aspect(source, depth, photo_rgb)
     filled = with_holes_filled(depth)

@@ -17,7 +17,7 @@ from mrbokeh.images.color import display_rgb8
 from mrbokeh.images.exr_io import ExrPart, in_rec709, read_exr, stated_primaries, write_exr
 from mrbokeh.images.layer import Layer
 from mrbokeh.images.picture_codec import Encoding, codes_of, linear_from_codes, stored_pixels, stored_rgb, write_stored
-from mrbokeh.system.errors import InputError
+from mrbokeh.system.errors import InputError, require_file
 
 
 def require_numbers(path: Path | str, planes: Mapping[str, np.ndarray]) -> None:
@@ -151,7 +151,13 @@ def read_depth(path: Path | str) -> Float32[np.ndarray, "height width"]:
     depth_m = channels[name].astype(np.float32)
     if np.isnan(depth_m).any():
         raise InputError(f"{path}: {int(np.isnan(depth_m).sum())} pixels of {name} are NaN: write inf (or 0) where there is background")
+    if not (depth_m > 0).any():
+        raise InputError(f"{path}: expected metres above 0 in {name}, but the largest is {depth_m.max():g}: is it depth along the axis?")
     return np.where(depth_m > 0, depth_m, np.float32(np.inf))
+
+
+LARGEST_ALPHA_ERROR = 0.1
+"""Filters of renderers overshoot by a few hundredths."""
 
 
 def read_layer(path: Path | str, *, extra: bool = False) -> Layer:
@@ -167,6 +173,8 @@ def read_layer(path: Path | str, *, extra: bool = False) -> Layer:
     channels = {name: pixels for part in [*reversed(of_one_view), colour] for name, pixels in part.channels.items()}
     rgb = in_rec709(ExrPart(channels).stacked("RGB"), stated_primaries(colour, parts), path)
     alpha = channels.get("A", np.ones(rgb.shape[:2])).astype(np.float32)
+    if alpha.min(initial=0.0) < -LARGEST_ALPHA_ERROR or alpha.max(initial=0.0) > 1.0 + LARGEST_ALPHA_ERROR:
+        raise InputError(f"{path}: expected alpha from 0 to 1, but A goes from {alpha.min():g} to {alpha.max():g}")
     depth_name = next((name for name in _DEPTH_NAMES if name in channels), None)
     depth = (np.zeros(rgb.shape[:2]) if depth_name is None else channels[depth_name]).astype(np.float32)
     require_depth_ahead(path, str(depth_name), depth[alpha > 0])
@@ -189,8 +197,7 @@ def write_layer(path: Path | str, layer: Layer, *, half: bool = True) -> None:
 
 
 def _read_rgba(path: Path, encoding: Encoding) -> Float32[np.ndarray, "height width channels"]:
-    if not path.is_file():
-        raise InputError(f"expected a picture at {path}, but there is no such file")
+    require_file(path, "a picture")
     suffix = path.suffix.lower()
     if suffix == ".exr":
         layer = read_layer(path)

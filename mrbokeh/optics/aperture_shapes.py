@@ -42,10 +42,13 @@ def unit_disc(sides: int = CIRCLE_SIDES) -> Float64[np.ndarray, "sides 2"]:
     return regular_polygon(sides) * np.sqrt(2.0 * np.pi / (sides * np.sin(2.0 * np.pi / sides)))
 
 
+MOST_BLADES = 100
+
+
 def blades(count: int, rotation_rad: float = 0.0, curvature: float = 0.0) -> Float64[np.ndarray, "vertices 2"]:
     """Return an iris; see `mrbokeh.optics.aperture.Aperture.blades`."""
-    if count < 3:
-        raise InputError(f"an iris needs at least 3 blades, got {count}")
+    if not 3 <= count <= MOST_BLADES:
+        raise InputError(f"an iris has 3 to {MOST_BLADES} blades, got {count}")
     corners = regular_polygon(count, rotation_rad)
     return corners if curvature == 0.0 else _with_arcs(corners, curvature)
 

@@ -36,7 +36,7 @@ from mrbokeh.images.picture_codec import stored_pixels
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.atomic_files import read_json, write_json
-from mrbokeh.system.errors import InputError
+from mrbokeh.system.errors import InputError, require_file
 
 
 class _Missing:
@@ -133,8 +133,7 @@ def read_transmission(path: Path) -> Float32[np.ndarray, "height width"]:
 
     A drawing of an opening is a matte: its numbers are shares of light, without a display curve.
     """
-    if not path.is_file():
-        raise InputError(f"expected a picture of the opening at {path}, but there is no such file")
+    require_file(path, "a picture of the opening")
     pixels = stored_pixels(path)
     scaled = pixels.astype(np.float32)
     if pixels.dtype.kind != "f":

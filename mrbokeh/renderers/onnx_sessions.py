@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mrbokeh.system.errors import InputError
+from mrbokeh.system.errors import InputError, require_file
 
 if TYPE_CHECKING:
     import onnxruntime
@@ -30,8 +30,7 @@ def open_session(path: Path, threads: int = 0, providers: Sequence[str] | None =
     """
     import onnxruntime
 
-    if not Path(path).is_file():
-        raise InputError(f"expected a network at {path}, but there is no such file: make one with `mrbokeh train export RUN --out {path}`")
+    require_file(path, "a network", f": make one with `mrbokeh train export RUN --out {path}`")
     chosen = _chosen(providers, onnxruntime.get_available_providers())
     try:
         return onnxruntime.InferenceSession(str(path), _options(threads), providers=chosen)

@@ -50,6 +50,9 @@ class FocusLookup:
         return _distance(float(np.interp(position, np.arange(len(self.slices_m)), [1.0 / each for each in self.slices_m])))
 
 
+MOST_PLACES = 1000
+
+
 def parse_focus(text: str, seen: FocusLookup) -> tuple[float, ...]:
     """Return focus distances in metres, all different."""
     if not (places := _places(text, seen)) or not all(each > 0 for each in places) or len(set(places)) < len(places):
@@ -62,6 +65,8 @@ def _places(text: str, seen: FocusLookup) -> tuple[float, ...]:
     try:
         if parts := re.fullmatch(rf"({_PLACE}):({_PLACE}):(\d+)", text):
             near, far = (_place(each, seen) for each in parts.groups()[:2])
+            if int(parts[3]) > MOST_PLACES:
+                raise InputError(f"--focus: expected at most {MOST_PLACES} places, got {parts[3]}")
             return tuple(_distance(float(each)) for each in np.linspace(1.0 / near, 1.0 / far, int(parts[3])))
         if re.fullmatch(rf"(?:{_PLACE})(?:,(?:{_PLACE}))*", text):
             return tuple(_place(each, seen) for each in re.findall(_PLACE, text))

@@ -20,7 +20,7 @@ import numpy as np
 from mrbokeh.images.exr_io import ExrPart, in_rec709, read_exr, stated_primaries, write_exr
 from mrbokeh.layering.light_field_samples import LightFieldSamples
 from mrbokeh.system.atomic_files import atomic_path
-from mrbokeh.system.errors import InputError
+from mrbokeh.system.errors import InputError, require_file
 
 VERSION = 1
 CHANNELS = {
@@ -63,8 +63,7 @@ def _suffix(path: Path | str) -> str:
 
 
 def _read_npz(path: Path) -> LightFieldSamples:
-    if not path.is_file():
-        raise InputError(f"expected light field samples at {path}, but there is no such file")
+    require_file(path, "light field samples")
     try:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             held = {name: archive[name] for name in archive.files}

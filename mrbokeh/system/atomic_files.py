@@ -6,9 +6,10 @@ import shutil
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
-from mrbokeh.system.errors import InputError
+from mrbokeh.system.errors import InputError, require_file
 
 
 @contextmanager
@@ -47,12 +48,13 @@ def write_json(path: Path | str, document: Any) -> None:
 
 def read_json(path: Path | str, expected: str) -> Any:
     """Read a JSON document; `expected` says in error messages what the file should have been."""
+    require_file(path, expected)
     try:
         return json.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"expected {expected} at {path}, but there is no such file") from None
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"expected {expected} at {path}, but it is not JSON: {error}") from None
+    except RecursionError:
+        raise InputError(f"expected {expected} at {path}, but its brackets lie too deep in one another") from None
 
 
 def refuse_existing(path: Path | str, overwrite: bool) -> None:
@@ -62,7 +64,7 @@ def refuse_existing(path: Path | str, overwrite: bool) -> None:
 
 
 def require_safe_outputs(outputs: Iterable[Path | str | None], inputs: Iterable[Path | str | None], overwrite: bool) -> None:
-    """Require that outputs differ from each other and from all inputs (also through links), and do not exist yet.
+    """Require that outputs can be written, differ from each other and from all inputs (also through links), and do not exist yet.
 
     None stands for what was not asked for. Raises InputError; `overwrite` allows replacing what exists, but never what is read.
     """
@@ -74,7 +76,17 @@ def require_safe_outputs(outputs: Iterable[Path | str | None], inputs: Iterable[
             raise InputError(f"{path} is named for two results, of which the second would replace the first: give each its own name")
         written.add(_real(path))
         refuse_existing(path, overwrite)
+        _require_writable(path)
+
+
+def _require_writable(path: Path) -> None:
+    """Raise InputError if the folder of a result takes no file, before the work rather than after it."""
+    folder = next((each for each in path.absolute().parents if each.exists()), Path("/"))
+    try:
+        TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise InputError(f"cannot write {path}: {folder} takes no file ({error.strerror}): choose another folder") from None
 
 
 def _real(path: Path | str) -> Path:
-    return Path(path).resolve()
+    return Path(os.path.realpath(path))

@@ -1,5 +1,8 @@
 """Errors that the user can mend: the command line prints them as one sentence, without a traceback."""
 
+import os
+from pathlib import Path
+
 INTERRUPTED = 130
 """Exit code of a command that Ctrl-C stopped, as shells have it."""
 
@@ -9,6 +12,16 @@ FAULT = 1
 
 class InputError(ValueError):
     """Bad input. The message says what was expected, what came, and what to do next."""
+
+
+def require_file(path: Path | str, expected: str, advice: str = "") -> None:
+    """Raise InputError unless there is a file. expected: what it should be; advice: what to do, put behind the sentence."""
+    path = Path(path)
+    if path.is_dir():
+        raise InputError(f"expected {expected} at {path}, but it is a folder{advice}")
+    if not path.exists():
+        link = f"it is a link to {os.readlink(path)}, which leads nowhere" if path.is_symlink() else "there is no such file"
+        raise InputError(f"expected {expected} at {path}, but {link}{advice}")
 
 
 class MissingExtraError(InputError):

@@ -13,9 +13,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, UInt8
 
-from mrbokeh.system.errors import InputError
+from mrbokeh.system.errors import InputError, require_file
 from mrbokeh.video.color import VideoColor, color_of
 from mrbokeh.video.frames import display_bgr, has_alpha, linear_rgb, stored_alpha
+
+_LONGEST_LAST_FRAME_S = 1.0
+"""Recordings of a screen show their last frame for long."""
 
 # Decoders that say where chroma lies, and JPEG, where it lies in the middle, which is what FFmpeg takes when nobody says.
 _PLACES_CHROMA = ("h264", "hevc", "av1", "mpeg1video", "mpeg2video", "mjpeg")
@@ -26,8 +29,7 @@ def opened(path: Path, threads: int = 0) -> Iterator[tuple[Any, Any]]:
     """Open a video as (container, first video stream). threads: of the decoder, 0 leaves it to FFmpeg."""
     import av
 
-    if not Path(path).is_file():
-        raise InputError(f"expected a video at {path}, but there is no such file: check the name")
+    require_file(path, "a video", ": check the name")
     try:
         container = av.open(str(path))
     except av.FFmpegError as error:
@@ -44,15 +46,36 @@ def opened(path: Path, threads: int = 0) -> Iterator[tuple[Any, Any]]:
 
 
 def decoded(path: Path, start: int, stop: int | None) -> Iterator[tuple[Any, float]]:
-    """Yield (PyAV frame, its time in seconds) of the frames from `start` to `stop`, decoded from the beginning on."""
+    """Yield (PyAV frame, its time in seconds) of the frames from `start` to `stop`, decoded from the beginning on.
+
+    Raises InputError where they end before the file says, once all that can be decoded have been given.
+    """
     with opened(path) as (container, stream), told_as_damage(path):
-        rate = frame_rate(stream)
-        placed = chroma_placement(stream)
-        for index, frame in enumerate(map(placed, container.decode(stream))):
+        rate, time_s, told_s, cut = frame_rate(stream), 0.0, _told_end_s(container, stream), False
+
+        def frames() -> Iterator[Any]:
+            nonlocal cut
+            for packet in container.demux(stream):
+                cut |= packet.is_corrupt
+                yield from packet.decode()
+
+        for index, frame in enumerate(map(chroma_placement(stream), frames())):
             if stop is not None and index >= stop:
                 return
+            time_s = float(index / rate) if frame.pts is None else float(frame.pts * frame.time_base)
             if index >= start:
-                yield frame, float(index / rate) if frame.pts is None else float(frame.pts * frame.time_base)
+                yield frame, time_s
+        if cut or (told_s is not None and time_s + 1.0 / rate < told_s - _LONGEST_LAST_FRAME_S):
+            of_all = "" if told_s is None else f" of {told_s:.3g}"
+            raise InputError(f"{path}: its pictures end at {time_s:.3g}{of_all} s: the file is damaged or cut off")
+
+
+def _told_end_s(container: Any, stream: Any) -> float | None:
+    """Return when the pictures end as the header says, where it does."""
+    if stream.duration is not None:
+        return float((stream.duration + (stream.start_time or 0)) * stream.time_base)
+    alone = container.duration is not None and len(container.streams) == 1
+    return (container.duration + (container.start_time or 0)) * 1e-6 if alone else None
 
 
 @contextmanager

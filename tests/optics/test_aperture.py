@@ -80,7 +80,7 @@ def test_the_disc_has_its_area_and_malformed_apertures_are_refused() -> None:
     for wrong, said in (
         (lambda: Aperture((np.zeros((3, 2)),), ()), "one weight per outline"),
         (lambda: Aperture((np.zeros((2, 2)),), (1.0,)), "at least 3 vertices"),
-        (lambda: Aperture.blades(2), "3 blades"),
+        (lambda: Aperture.blades(2), "3 to 100 blades"),
         (lambda: Aperture.disc().obstructed(1.0), "below 1"),
         (lambda: Aperture((SQUARE * np.nan,), (1.0,)), "finite numbers"),
         (lambda: Aperture.disc().rasterize(np.nan), "finite diameter"),

@@ -28,7 +28,7 @@ from jaxtyping import Float64
 from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 
-from mrbokeh.system.errors import InputError
+from mrbokeh.system.errors import InputError, require_file
 
 Samples = Float64[np.ndarray, " samples"]
 
@@ -159,11 +159,10 @@ def read_focus_pull(path: Path | str) -> FocusPull:
 
 
 def _rows(path: Path) -> list[Row]:
+    require_file(path, "a table of focus distances")
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             rows: list[Row] = list(csv.DictReader(file))
-    except FileNotFoundError:
-        raise InputError(f"expected a table of focus distances at {path}, but there is no such file") from None
     except (csv.Error, UnicodeDecodeError) as error:
         raise InputError(f"expected a table (CSV) in {path}, but it is not one: {error}") from None
     if not rows:

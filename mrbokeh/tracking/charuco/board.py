@@ -33,7 +33,7 @@ from jaxtyping import Bool, Float64, Int64
 
 from mrbokeh.optics.lens import MM_PER_M
 from mrbokeh.system.atomic_files import read_json, write_json
-from mrbokeh.system.errors import InputError
+from mrbokeh.system.errors import InputError, require_file
 
 FEWEST_SQUARES = 3
 DICTIONARY = "DICT_4X4_50"
@@ -213,10 +213,9 @@ def read_board(path: Path | str) -> CharucoBoard:
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
+    require_file(path, _WHAT)
     try:
         document = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise InputError(f"expected {_WHAT} at {path}, but there is no such file") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"expected {_WHAT} at {path}, but it is not TOML: {error}") from None
     if "grids" in document:
