@@ -8,7 +8,6 @@ there is for a renderer with slices. A network takes the same time for both. Pri
 
 import argparse
 import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +25,7 @@ from mrbokeh.optics.psf_bank import PsfBank
 from mrbokeh.optics.psf_bank_file import read_bank, write_bank
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from tests.bench.machine import machine_line, memory_line
+from tests.bench.machine import in_turns, tell
 
 HEIGHT_PX, WIDTH_PX, LARGEST_PX, BLOCKS = 360, 640, 49.0, 25
 LENS = Lens(35.0, 1.0, 0.6, 23.5, aperture=Aperture.heart())
@@ -91,18 +90,6 @@ def network(folder: Path) -> Callable[[np.ndarray, np.ndarray], object]:
     return OnnxNetwork(folder / "plain.onnx").blur
 
 
-def seconds(runs: dict[str, Callable[[], object]], rounds: int) -> dict[str, tuple[float, float]]:
-    """The lowest wall and processor seconds of each, in turns."""
-    found: dict[str, list[tuple[float, float]]] = {name: [] for name in runs}
-    for number in range(rounds + 1):
-        for name, run in runs.items():
-            wall_s, used_s = time.perf_counter(), time.process_time()
-            run()
-            if number:
-                found[name].append((time.perf_counter() - wall_s, time.process_time() - used_s))
-    return {name: tuple(np.min(each, axis=0)) for name, each in found.items()}
-
-
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--only", choices=["bank"], help="leave the network out")
@@ -124,15 +111,14 @@ def main() -> None:
             }
             if blur is not None:
                 runs["plain network, N = 25"] = lambda coc_px=coc_px: blur(rgb, coc_px)  # type: ignore[misc]
-            times = seconds(runs, asked.rounds)
-            whole_s = times.get("plain network, N = 25", (np.nan, np.nan))
-            for name, (wall_s, used_s) in times.items():
-                print(f"| {picture} | {name} | {1e3 * wall_s:.0f} | {1e3 * used_s:.0f} | {whole_s[0] / wall_s:.1f} |", flush=True)
+            times = dict(zip(runs, in_turns(*runs.values(), repeats=asked.rounds, of=min), strict=True))
+            whole_ms = times["plain network, N = 25"].wall_ms if blur is not None else np.nan
+            for name, (wall_ms, cpu_ms) in times.items():
+                print(f"| {picture} | {name} | {wall_ms:.0f} | {cpu_ms:.0f} | {whole_ms / wall_ms:.1f} |", flush=True)
             seen = [each.render(layers, LENS).rgb for each in through]
             near = psnr(seen[0], seen[1], 1.0)
             print(f"{picture}: bank and opening agree to {near:.1f} dB")
-    print(machine_line())
-    print(memory_line())
+    tell()
 
 
 if __name__ == "__main__":

@@ -8,9 +8,9 @@ frames of 1080p, object and near things within a box of a tenth of the frame.
 """
 
 import sys
-import time
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +21,7 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from tests.bench.machine import machine_line, memory_line
+from tests.bench.machine import in_turns, tell
 from tests.scenes.mixed_reality_cases import BASELINES, MixedCase, card_cases, traced_cases
 
 COLUMNS = (*BASELINES, *(mode for mode in MODES if mode != "front"))
@@ -38,8 +38,7 @@ def main() -> None:
     if "--fast" not in sys.argv:
         for width, height, repeats in ((6000, 4000, 1), (1920, 1080, 3)):
             print_times(width, height, repeats)
-    print(memory_line())
-    print(machine_line())
+    tell()
 
 
 def print_table(cases: Iterator[MixedCase]) -> None:
@@ -86,12 +85,8 @@ def print_times(width: int, height: int, repeats: int) -> None:
     """Median of each mode, after a first run that compiles and fills tables."""
     plate, virtual, renderer = *_large(width, height), PolygonDifferences()
     for mode in MODES:
-        passed_s = []
-        for _ in range(repeats + 1):
-            started_s = time.perf_counter()
-            MODES[mode].insert(plate, [virtual], renderer)
-            passed_s.append(time.perf_counter() - started_s)
-        print(f"{width}x{height}, {mode}: {np.median(passed_s[1:]):.2f} s, {1.0 / np.median(passed_s[1:]):.1f} a second")
+        passed_s = in_turns(partial(MODES[mode].insert, plate, [virtual], renderer), repeats=repeats)[0].wall_ms / 1e3
+        print(f"{width}x{height}, {mode}: {passed_s:.2f} s, {1.0 / passed_s:.1f} a second")
 
 
 def _row(name: str, region: str, values: np.ndarray) -> str:

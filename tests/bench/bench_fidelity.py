@@ -17,7 +17,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.choose import BY_NAME, make_renderer
 from tests.bench.fidelity_baselines import BASELINES, gegl_lens_blur, has_gegl
-from tests.bench.machine import machine_line, memory_line
+from tests.bench.machine import tell
 from tests.scenes.fidelity_cases import CARD_RADII_PX, Case, card_cases, truth_cases
 
 Blur = Callable[[Sequence[Layer], Lens], np.ndarray]
@@ -120,8 +120,7 @@ def main() -> None:
         print(truth_table(traced))
         print(shape_table(traced))
     print("'Lights' are the pixels that a light reaches; 'energy' is what the picture has too much, as a mean and at worst.")
-    print(memory_line())
-    print(machine_line())
+    tell()
 
 
 if __name__ == "__main__":

@@ -7,11 +7,9 @@ scatter reference.
 """
 
 import os
-import statistics
 import sys
-import time
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
@@ -23,7 +21,7 @@ from mrbokeh.renderers.kernels.laplacian_tables import DENSE, WHOLE, kind_of
 from mrbokeh.renderers.kernels.spreadlets import UNRELAXED, Sparsification, Spreadlet, outline_px, sparsify, whole_laplacian
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
-from tests.bench.machine import machine_line, memory_line
+from tests.bench.machine import in_turns, tell, took
 
 REPEATS = 9
 SIZE = (540, 960)
@@ -46,17 +44,6 @@ def hills_px(size: tuple[int, int], mean_px: float) -> np.ndarray:
     return (mean_px * (1.0 + 0.4 * np.sin(x / 300.0) * np.cos(y / 200.0) + 0.01 * noise / noise.std())).astype(np.float32)
 
 
-def milliseconds(run: Callable[[], object]) -> float:
-    started_s = time.perf_counter()
-    run()
-    return 1e3 * (time.perf_counter() - started_s)
-
-
-def in_turns(*runs: Callable[[], object]) -> list[float]:
-    rounds = [[milliseconds(run) for run in runs] for _ in range(REPEATS)]
-    return [statistics.median(each) for each in zip(*rounds, strict=True)]
-
-
 def integration_rows() -> None:
     image = np.zeros((1024, 1024, 4))
     image[100:-100, 100:-100] = cv2.GaussianBlur(np.random.default_rng(2).uniform(size=(824, 824, 4)), (0, 0), 3)
@@ -66,8 +53,7 @@ def integration_rows() -> None:
     for name, run in (("exact", integrate), ("pyramid", integrate_by_pyramid)):
         for precision in (np.float64, np.float32):
             part = source.astype(precision)
-            run(part)
-            (took_ms,) = in_turns(lambda r=run, p=part: r(p))
+            took_ms = in_turns(lambda r=run, p=part: r(p), repeats=REPEATS)[0].wall_ms
             error = np.abs(run(part) - image)[image > 0]
             print(f"  {name:<8} {precision.__name__:<8} {took_ms:7.1f} ms   mean error {error.mean():.1e}, largest {error.max():.1e}")
 
@@ -80,9 +66,8 @@ def sparsification_rows() -> None:
     for fit in (False, True):
         for lloyd, annealing in ((0, 0), (50, 0), (0, 400), (50, 400)):
             settings = Sparsification(lloyd_steps=lloyd, annealing_steps=annealing, fit=fit)
-            started_s = time.perf_counter()
-            found = [sparsify(kernel, settings) for kernel in kernels]
-            each_ms = 1e3 * (time.perf_counter() - started_s) / len(kernels)
+            found: list[Spreadlet] = []
+            each_ms = took(lambda s=settings, f=found: f.extend(sparsify(kernel, s) for kernel in kernels)).wall_ms / len(kernels)
             error = float(np.mean([l1_error(each, kernel) for each, kernel in zip(found, kernels, strict=True)]))
             base = base or error
             share = np.mean([len(each.points) / np.count_nonzero(kernel) for each, kernel in zip(found, kernels, strict=True)])
@@ -111,12 +96,10 @@ def spread_rows(size: tuple[int, int]) -> None:
             ("pyramid", {"integration": "pyramid"}),
         ):
             renderer = LaplacianSpreadlets(**changed)
-            first_ms = milliseconds(lambda r=renderer, c=coc_px: r.sum_kernels(values, c, DISC))
+            first_ms = took(lambda r=renderer, c=coc_px: r.sum_kernels(values, c, DISC)).wall_ms
             dense = renderer.sum_kernels(values, coc_px, DISC, densely=True)
-            took_ms, dense_ms = in_turns(
-                lambda r=renderer, c=coc_px: r.sum_kernels(values, c, DISC),
-                lambda r=renderer, c=coc_px: r.sum_kernels(values, c, DISC, densely=True),
-            )
+            ways = [partial(renderer.sum_kernels, values, coc_px, DISC, densely=densely) for densely in (False, True)]
+            took_ms, dense_ms = (each.wall_ms for each in in_turns(*ways, repeats=REPEATS))
             found = renderer.sum_kernels(values, coc_px, DISC)
             like = f"SSIM {ssim(found[..., :3], dense[..., :3]):.4f}, {psnr(found[..., :3], dense[..., :3]):.1f} dB"
             times = f"{took_ms:7.0f} ms, dense {dense_ms:7.0f} ms: {dense_ms / took_ms:5.1f} times"
@@ -138,11 +121,10 @@ def reference_row(size: tuple[int, int]) -> None:
     """Against exact kernels of every pixel, on a quarter of the picture."""
     size = size[0] // 2, size[1] // 2
     values, coc_px = frame(size), hills_px(size, 40.0)
-    exact_ms, kept = 0.0, []
-    exact_ms = milliseconds(lambda: kept.append(ScatterReference().sum_kernels(values, coc_px, DISC)))
+    kept: list[np.ndarray] = []
+    exact_ms = took(lambda: kept.append(ScatterReference().sum_kernels(values, coc_px, DISC))).wall_ms
     renderer = LaplacianSpreadlets()
-    renderer.sum_kernels(values, coc_px, DISC)
-    (took_ms,) = in_turns(lambda: renderer.sum_kernels(values, coc_px, DISC))
+    took_ms = in_turns(lambda: renderer.sum_kernels(values, coc_px, DISC), repeats=REPEATS)[0].wall_ms
     found, exact = renderer.sum_kernels(values, coc_px, DISC)[..., :3], kept[0][..., :3]
     print(
         f"{size[1]} x {size[0]}, mean 40 px, against exact kernels ({exact_ms:.0f} ms): {exact_ms / took_ms:.0f} times as fast, "
@@ -160,8 +142,7 @@ def main() -> None:
     sparsification_rows()
     spread_rows(size)
     reference_row(size)
-    print(machine_line())
-    print(memory_line())
+    tell()
 
 
 if __name__ == "__main__":

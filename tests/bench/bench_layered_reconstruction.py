@@ -8,12 +8,9 @@ FOLDER: sets of samples as in tests/data/samples, met against their references i
 """
 
 import sys
-import time
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from statistics import median
 
 import cv2
 import numpy as np
@@ -26,7 +23,7 @@ from mrbokeh.layering.light_field_samples import LightFieldSamples
 from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
 from mrbokeh.stacks.light_field_samples_file import read_samples
-from tests.bench.machine import machine_line, memory_line
+from tests.bench.machine import in_turns, tell
 from tests.scenes.sampled_planes import LENS, Plane, checker, fence_scene, sample_planes, truth, waves
 
 SIZE_PX = 256
@@ -71,18 +68,6 @@ def scenes(size_px: int) -> dict[str, list[Plane]]:
     }
 
 
-def _milliseconds(run: Callable[[], object]) -> tuple[float, float]:
-    """Medians of the time that passes and of what all cores together spend, which other work on the machine disturbs less."""
-    run()
-    passed_s, spent_s = [], []
-    for _ in range(REPEATS):
-        started_s, spent_before_s = time.perf_counter(), time.process_time()
-        run()
-        passed_s.append(time.perf_counter() - started_s)
-        spent_s.append(time.process_time() - spent_before_s)
-    return 1e3 * median(passed_s), 1e3 * median(spent_s)
-
-
 def _non_local_means_db(raw: np.ndarray, exact: np.ndarray) -> tuple[float, float]:
     """OpenCV's (on 8 bits) and scikit-image's, at their best strength."""
     coded = (np.clip(raw, 0, 1) * 255 + 0.5).astype(np.uint8)
@@ -101,7 +86,7 @@ def _one(name: str, samples: LightFieldSamples, exact: np.ndarray) -> None:
     for variant, settings in VARIANTS.items():
         method = LayeredReconstruction(settings)
         rgb, counts = method.reconstruct_values(samples, samples.rgb, LENS)
-        passed_ms, spent_ms = _milliseconds(partial(method.reconstruct_values, samples, samples.rgb, LENS))
+        passed_ms, spent_ms = in_turns(partial(method.reconstruct_values, samples, samples.rgb, LENS), repeats=REPEATS)[0]
         print(
             f"  {variant}: {psnr(rgb, exact):.1f} dB, {passed_ms:.0f} ms ({spent_ms:.0f} ms of all cores), "
             f"partitions per tile {counts.before:.1f} -> {counts.after:.1f}"
@@ -130,7 +115,7 @@ def _set(folder: Path) -> None:
         method = LayeredReconstruction(VARIANTS[variant])
         rgb, counts = method.reconstruct_values(samples, samples.rgb, lens)
         displayed = linear_to_srgb(np.clip(rgb, 0, 1))
-        passed_ms, spent_ms = _milliseconds(partial(method.reconstruct_values, samples, samples.rgb, lens))
+        passed_ms, spent_ms = in_turns(partial(method.reconstruct_values, samples, samples.rgb, lens), repeats=REPEATS)[0]
         print(
             f"  {variant}: {psnr(rgb, exact):.1f} / {psnr(displayed, shown):.1f} dB, SSIM {ssim(displayed, shown):.3f}, {passed_ms:.0f} ms "
             f"({spent_ms:.0f} ms of all cores), partitions per tile {counts.before:.1f} -> {counts.after:.1f}"
@@ -143,8 +128,7 @@ def main() -> None:
             _set(folder)
     else:
         _planes(int(sys.argv[1]) if len(sys.argv) > 1 else SIZE_PX)
-    print(memory_line())
-    print(machine_line())
+    tell()
 
 
 def _planes(size_px: int) -> None:

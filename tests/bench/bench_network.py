@@ -10,8 +10,8 @@ is measured there is the layout alone.
 """
 
 import argparse
+import statistics
 import tempfile
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -23,7 +23,7 @@ import torch
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.onnx_network import OnnxNetwork
 from mrbokeh.renderers.onnx_sessions import PROVIDERS, open_session
-from tests.bench.machine import machine_line, memory_line
+from tests.bench.machine import in_turns, tell
 from training.export.fast_onnx import FastExported, export_fast_network, export_fast_run
 from training.export.onnx_export import export_network
 from training.fitting.run_folder import RunFacts, build_network
@@ -47,11 +47,7 @@ FAST_FORMS = {
 
 
 def _milliseconds(run: Callable[[], object], repeats: int = 3) -> float:
-    run()
-    started_s = time.perf_counter()
-    for _ in range(repeats):
-        run()
-    return 1e3 * (time.perf_counter() - started_s) / repeats
+    return in_turns(run, repeats=repeats, of=statistics.fmean)[0].wall_ms
 
 
 def _slanted_scene() -> tuple[torch.Tensor, torch.Tensor]:
@@ -128,8 +124,7 @@ def main() -> None:
     if asked.only is None and asked.run is None:
         _training_table()
     _fast_table(asked.run, asked.data, asked.form)
-    print(memory_line())
-    print(machine_line())
+    tell()
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ from mrbokeh.layering.layering import Layering
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from tests.bench.machine import machine_line
+from tests.bench.machine import in_turns, machine_line, took
 
 OCTAGON = Aperture.blades(8, np.pi / 8)
 FULL_HD, QUARTER_HD, ULTRA_HD = (1080, 1920), (360, 640), (2160, 3840)
@@ -49,21 +49,8 @@ def diameters_px(size: tuple[int, int], largest_px: float) -> np.ndarray:
     return (np.clip(hills, 0.0, 1.0) * largest_px).astype(np.float32)
 
 
-def milliseconds(run: Callable[[], object]) -> float:
-    started_s = time.perf_counter()
-    run()
-    return 1e3 * (time.perf_counter() - started_s)
-
-
-def in_turns(run: Callable[[], object], yardstick: Callable[[], object]) -> tuple[float, float]:
-    """Medians of both, in turns, so that what else the machine does falls on both alike."""
-    run(), yardstick()
-    pairs = [(milliseconds(run), milliseconds(yardstick)) for _ in range(REPEATS)]
-    return statistics.median(first for first, _ in pairs), statistics.median(second for _, second in pairs)
-
-
 def row(name: str, run: Callable[[], object], values: np.ndarray) -> float:
-    took_ms, yardstick_ms = in_turns(run, lambda: cv2.GaussianBlur(values, (0, 0), 10))
+    took_ms, yardstick_ms = (each.wall_ms for each in in_turns(run, lambda: cv2.GaussianBlur(values, (0, 0), 10), repeats=REPEATS))
     print(f"{name:<68} {took_ms:8.1f} ms  {took_ms / yardstick_ms:5.2f} of GaussianBlur ({yardstick_ms:.1f} ms)")
     return took_ms
 
@@ -94,7 +81,7 @@ def render_row() -> None:
     depth_m = (1.0 / (1.0 / lens.focus_distance_m - coc_px / lens.coc_px_per_dioptre(QUARTER_HD[1]))).astype(np.float32)
     layer, renderer = opaque(np.ascontiguousarray(values[..., :3]), depth_m), PolygonDifferences(layering=Layering(slices=8))
     renderer.render([layer], lens)
-    took_ms = [milliseconds(lambda: renderer.render([layer], lens)) for _ in range(FRAMES)]
+    took_ms = [took(lambda: renderer.render([layer], lens)).wall_ms for _ in range(FRAMES)]
     name = f"640x360, octagon, -10 to 20 px, render of 8 slices, {FRAMES} frames on end"
     print(f"{name:<68} {statistics.median(took_ms):8.1f} ms  {1e3 * FRAMES / sum(took_ms):5.1f} frames per second")
     row("the same in turns with the blur of a frame, which empties the caches", lambda: renderer.render([layer], lens), values)
@@ -122,7 +109,7 @@ def gegl_row(own_ms: float) -> None:
         write_image(source, np.ascontiguousarray(frame(FULL_HD)[..., :3]), half=False)
 
         def run(*operation: str) -> float:
-            return milliseconds(lambda: subprocess.run(["gegl", source, "-o", target, "--", *operation], check=True, capture_output=True))
+            return took(lambda: subprocess.run(["gegl", source, "-o", target, "--", *operation], check=True, capture_output=True)).wall_ms
 
         nop_ms = statistics.median(run("gegl:nop") for _ in range(REPEATS))
         took_ms = statistics.median(run("gegl:lens-blur", f"radius={GEGL_RADIUS_PX}") for _ in range(REPEATS)) - nop_ms

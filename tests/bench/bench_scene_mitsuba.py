@@ -5,7 +5,6 @@ caster's picture of it; then the change of light on the table below it. Processo
 """
 
 import sys
-import time
 from collections.abc import Callable
 from functools import partial
 
@@ -18,7 +17,7 @@ from mrbokeh.scene.gltf.gltf_loader import load_glb
 from mrbokeh.scene.light import directions
 from mrbokeh.scene.light_change import light_change
 from mrbokeh.scene.mitsuba.mitsuba_tracer import MitsubaTracer
-from tests.bench.machine import machine_line, memory_line
+from tests.bench.machine import tell, took
 from tests.conftest import SHARED_DATA
 
 CAMERA = Camera(640, 360, (620.0, 615.0), (318.0, 182.0))
@@ -40,9 +39,8 @@ def sky() -> np.ndarray:
 
 def timed(work: Callable[[], object]) -> tuple[float, float]:
     """(wall s, processor s)."""
-    wall_s, processor_s = time.perf_counter(), time.process_time()
-    work()
-    return time.perf_counter() - wall_s, time.process_time() - processor_s
+    wall_ms, cpu_ms = took(work)
+    return wall_ms / 1e3, cpu_ms / 1e3
 
 
 def main() -> None:
@@ -70,8 +68,7 @@ def main() -> None:
         wall_s, processor_s = timed(partial(light_change, renderer, scene, CAMERA, catcher))
         print(f"change of light on the table, {name}: {wall_s:.1f} s, {processor_s:.1f} s of processor")
     print(f"paths / ray caster: {paths_s / cast_processor_s:.0f} (processor)")
-    print(memory_line())
-    print(machine_line())
+    tell()
 
 
 if __name__ == "__main__":

@@ -8,6 +8,9 @@ same run, and both pictures are compared.
 
 import argparse
 import os
+import statistics
+import time
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -18,10 +21,10 @@ from mrbokeh.layering.light_field_samples import LightFieldSamples
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
 from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import DeviceSamples, TorchReconstruction
 from mrbokeh.system.torch_device import has_triton
-from tests.bench.device_timing import milliseconds
-from tests.bench.machine import machine_line, memory_line
+from tests.bench.machine import tell, took
 from tests.scenes.sampled_planes import LENS, fence_scene, sample_planes
 
+WAIT_S = 20.0
 VARIANTS = {
     "all improvements": Settings(),
     "sheared recursive filter": Settings(screen_filter="sheared"),
@@ -36,6 +39,20 @@ def fence_samples(width_px: int, height_px: int, per_pixel: int) -> LightFieldSa
     kept = (samples.xy_px < (width_px, height_px)).all(axis=1)
     names = ("xy_px", "lens_uv", "time", "rgb", "depth_m", "motion_px")
     return LightFieldSamples(width_px, height_px, *(np.ascontiguousarray(getattr(samples, name)[kept]) for name in names))
+
+
+def milliseconds(run: Callable[[], object], device: torch.device) -> float:
+    """The median of as many as there is time for, once the first is done."""
+
+    def waited() -> None:
+        run()
+        if device.type == "cuda":
+            torch.cuda.synchronize(device)
+
+    took_ms, until_s = [took(waited).wall_ms], time.perf_counter() + WAIT_S
+    while len(took_ms) < 30 and time.perf_counter() < until_s:
+        took_ms.append(took(waited).wall_ms)
+    return statistics.median(took_ms)
 
 
 def row(name: str, settings: Settings, samples: LightFieldSamples, on_device: DeviceSamples, device: torch.device) -> None:
@@ -74,8 +91,7 @@ def main() -> None:
     for variant, settings in VARIANTS.items():
         row(variant, settings, samples, on_device, device)
     row("tiles of 64 px", replace(Settings(), tile_px=64), samples, on_device, device)
-    print(machine_line())
-    print(memory_line())
+    tell()
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from mrbokeh.tracking.charuco.board_alignment import AlignedDetector, aligned_co
 from mrbokeh.tracking.charuco.detector import CharucoDetector, Grey, flow
 from mrbokeh.tracking.charuco.pose_from_points import poses_from_plane
 from mrbokeh.video.clip import read_display_frames
-from tests.bench.machine import machine_line, memory_line
+from tests.bench.machine import tell
 from tests.scenes.told_parts import ImmediateDetections
 from tests.scenes.traced_board_clip import BOARD, LENS, PoseError, camera_frames, clip_of, pose_error
 from viewfinder.frames import CameraFrame
@@ -44,8 +44,7 @@ def main() -> None:
         _traced(name, lens, frames)
     if REAL_CLIP.is_file():
         _real()
-    print(memory_line())
-    print(machine_line())
+    tell()
 
 
 def _traced(name: str, lens: Lens, frames: int) -> None:

@@ -23,7 +23,7 @@ import cv2
 import numpy as np
 
 from mrbokeh.optics.lens import Lens
-from tests.bench.machine import machine_line, memory_line
+from tests.bench.machine import tell
 from tests.bench.thread_times import ThreadTimes
 from tests.scenes.live_clip import SCENE, LiveClip, write_live_clip
 from tests.scenes.live_viewfinder import live
@@ -60,8 +60,7 @@ def main() -> None:
         theirs = {count: asyncio.run(_theirs(clip, count, asked.seconds)) for count in (1, 3)}
     for count in (1, 3):
         print(f"CPU time of the server per second, ours / plain aiortc, {_viewers(count)}: {ours[count] / theirs[count]:.2f}")
-    print(memory_line())
-    print(machine_line())
+    tell()
 
 
 def _scene(glb: Path | None) -> str:

@@ -1,10 +1,39 @@
-"""What a benchmark ran on: processor, commit and the memory it took."""
+"""What benchmarks share: how long runs take, in turns, and what they ran on: processor, commit and memory."""
 
 import os
 import platform
 import resource
+import statistics
 import subprocess
+import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
+
+
+class Took(NamedTuple):
+    """wall_ms: that passed. cpu_ms: of all cores of this process together, which other work on the machine disturbs less."""
+
+    wall_ms: float
+    cpu_ms: float
+
+
+def took(run: Callable[[], object]) -> Took:
+    wall_s, cpu_s = time.perf_counter(), time.process_time()
+    run()
+    return Took(1e3 * (time.perf_counter() - wall_s), 1e3 * (time.process_time() - cpu_s))
+
+
+def in_turns(*runs: Callable[[], object], repeats: int, of: Callable[[Sequence[float]], float] = statistics.median) -> list[Took]:
+    """Medians of each run (or `of`) after a first round that counts for nothing; in turns, so that other work falls on all alike."""
+    rounds = [[took(run) for run in runs] for _ in range(repeats + 1)][1:]
+    return [Took(*(float(of(each)) for each in zip(*of_run, strict=True))) for of_run in zip(*rounds, strict=True)]
+
+
+def tell() -> None:
+    """Print the last two lines of a benchmark."""
+    print(memory_line())
+    print(machine_line())
 
 
 def machine_line() -> str:
