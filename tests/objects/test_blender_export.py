@@ -50,14 +50,11 @@ def test_sensor_fit(size: tuple[int, int], fit: str, focal_px: float, width_mm: 
     assert found == pytest.approx((focal_px, focal_px)) and covered_mm == pytest.approx(width_mm)
 
 
-def test_shift_moves_the_picture_over_the_axis() -> None:
+def test_shift_and_tall_pixels_move_the_axis() -> None:
     """Shift counts in the fitted side: the lens moved up and right shows more of what is there, so the axis goes left and down."""
     _, principal_px, _ = intrinsics(Film(1000, 500, 50.0, 36.0, 24.0, "AUTO", 0.1, 0.05))
     assert principal_px == pytest.approx((500 - 100, 250 + 50))
-
-
-def test_tall_pixels() -> None:
-    """Pixels twice as tall as wide need half as many for the same angle."""
+    # Pixels twice as tall as wide need half as many for the same angle.
     focal_px, principal_px, _ = intrinsics(Film(1000, 250, 50.0, 36.0, 24.0, shift_y=0.1, pixel_aspect=(1.0, 2.0)))
     assert focal_px[1] == pytest.approx(focal_px[0] / 2) and principal_px == pytest.approx((500.0, 125 + 50))
 
@@ -68,26 +65,20 @@ def matrix_of(columns: np.ndarray, place: tuple[float, float, float]) -> list[li
     return pose.tolist()
 
 
-def test_a_camera_without_rotation_looks_down() -> None:
+def test_cameras_look_down_and_ahead_in_the_world_of_the_glb() -> None:
     """Blender's camera looks along its -z: at height 5 it sees the origin 5 m below. Ours: z up in Blender is -y, so it looks along +y."""
     camera = np.array(camera_from_world(matrix_of(np.eye(3), (0, 0, 5))))
     np.testing.assert_allclose(camera @ [0, 0, 0, 1], [0, 0, 5, 1])
     # Blender's +y is up in its picture: our -z in the world is Blender's +y negated.
     np.testing.assert_allclose(camera[:3, :3] @ [0, 0, 1], [0, -1, 0], atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(camera[:3, :3]), 1.0)
-
-
-def test_a_camera_that_looks_ahead() -> None:
-    """Rotated by 90 degrees about x, two metres before the origin (Blender's front view): our axes are those of the world."""
+    # Rotated by 90 degrees about x, two metres before the origin (Blender's front view): our axes are those of the world.
     turned = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]])
     camera = np.array(camera_from_world(matrix_of(turned, (0.5, -2.0, 1.0))))
     np.testing.assert_allclose(camera, [[1, 0, 0, -0.5], [0, 1, 0, 1.0], [0, 0, 1, 2.0], [0, 0, 0, 1]], atol=1e-12)
     # The scale of a camera object does not count.
     np.testing.assert_allclose(camera_from_world(matrix_of(turned * 3.0, (0.5, -2.0, 1.0))), camera, atol=1e-12)
-
-
-def test_the_world_is_that_of_the_exported_glb() -> None:
-    """glTF's exporter writes (x, z, -y); mrbokeh's loader turns that into the upright world, where a floor with z up goes as well."""
+    # glTF's exporter writes (x, z, -y); mrbokeh's loader turns that into the upright world, where a floor with z up goes as well.
     blender = np.array([1.0, 2.0, 3.0])
     in_gltf = np.array([blender[0], blender[2], -blender[1], 1.0])
     np.testing.assert_allclose((WORLD_FROM_GLTF @ in_gltf)[:3], (UPRIGHT_FROM_WORLD["+z"] @ [*blender, 1.0])[:3])
@@ -95,17 +86,7 @@ def test_the_world_is_that_of_the_exported_glb() -> None:
     np.testing.assert_allclose(np.array(looking_ahead)[:3, :3] @ (WORLD_FROM_GLTF @ in_gltf)[:3], [1, -3, 2], atol=1e-12)
 
 
-def test_points_land_where_blender_put_them() -> None:
-    """bpy_extras.object_utils.world_to_camera_view of Blender 4.2.23: a turned camera with shift and pixels 1.2 times as tall as wide."""
-    frame = json.loads((DATA / "camera_track.json").read_text())["frames"][1]
-    camera = camera_from_json(frame["camera"])
-    for point, (right, up, depth_m) in json.loads((DATA / "blender_projection.json").read_text()):
-        xy_px, ours_m = camera.project(np.array([point[0], -point[2], point[1]], np.float64))
-        np.testing.assert_allclose(xy_px, [right * camera.width_px, (1 - up) * camera.height_px], atol=1e-4)
-        assert ours_m == pytest.approx(depth_m, abs=1e-5)
-
-
-def test_the_track_has_every_frame_and_the_focus() -> None:
+def test_the_track_has_every_frame_and_the_focus_and_is_one_of_ours() -> None:
     """The ball in focus stands still at (-0.3, 1, 0.3); f/1.4; 24 frames per second from frame 1 to 3."""
     track = json.loads((DATA / "camera_track.json").read_text())
     assert (track["format"], track["version"], track["up"]) == ("mrbokeh-camera-track", 1, "-y")
@@ -114,18 +95,19 @@ def test_the_track_has_every_frame_and_the_focus() -> None:
         assert frame["time_s"] == pytest.approx(number / 24) and frame["f_number"] == pytest.approx(1.4)
         _, depth_m = camera_from_json(frame["camera"]).project(np.array([-0.3, -0.3, 1.0]))
         assert frame["focus_distance_m"] == pytest.approx(depth_m, abs=1e-5)
-
-
-def test_the_track_is_one_of_ours() -> None:
     track = read_track(DATA / "camera_track.json")
     assert (track.up, track.numbers, track.size_px) == ("-y", [1, 2, 3], (80, 56))
     assert track.at(2).f_number == pytest.approx(1.4) and track.at(2).focus_distance_m == pytest.approx(3.0391, abs=1e-4)
-
-
-def test_a_frame_reads_as_a_camera() -> None:
     frame = track_frame(7, 0.25, matrix_of(np.eye(3), (0, 0, 5)), Film(64, 48, 50.0, 36.0, 24.0))
     camera = camera_from_json(json.loads(json.dumps(frame))["camera"])
     assert (camera.width_px, camera.height_px) == (64, 48) and frame["frame"] == 7 and frame["sensor_width_mm"] == pytest.approx(36.0)
+    # bpy_extras.object_utils.world_to_camera_view of Blender 4.2.23: a turned camera with shift and pixels 1.2 times as tall as wide.
+    frame = json.loads((DATA / "camera_track.json").read_text())["frames"][1]
+    camera = camera_from_json(frame["camera"])
+    for point, (right, up, depth_m) in json.loads((DATA / "blender_projection.json").read_text()):
+        xy_px, ours_m = camera.project(np.array([point[0], -point[2], point[1]], np.float64))
+        np.testing.assert_allclose(xy_px, [right * camera.width_px, (1 - up) * camera.height_px], atol=1e-4)
+        assert ours_m == pytest.approx(depth_m, abs=1e-5)
 
 
 class _Scene:

@@ -153,7 +153,7 @@ class TestComposite:
         ratio[:3], added[:3], added[3:5], ratio[5:7] = 1.0, 0.0, 0.0, 1.0
         return LightChange(ratio, added, np.ones((9, 7), np.float32), np.full((9, 7), 2.0, np.float32)), plate
 
-    def test_over_the_plate_it_multiplies_and_adds(self) -> None:
+    def test_over_the_plate_it_multiplies_and_adds_and_an_even_loss_needs_no_plate(self) -> None:
         change, plate = self.change()
         layer = change.as_layer(plate)
         rgb = over(layer, opaque(plate, np.full((9, 7), 3.0, np.float32))).rgb
@@ -162,17 +162,12 @@ class TestComposite:
         assert layer.rgb.min() >= 0
         assert layer.alpha[5:7].min() >= LEAST_CHANGE  # light alone is covered a little, so that no renderer drops it
         assert np.array_equal(np.isinf(layer.depth_m), layer.alpha == 0)
-
-    def test_an_even_loss_needs_no_plate(self) -> None:
-        change, plate = self.change()
         even = change.evenly()
         rgb = over(even.as_layer(np.zeros_like(plate)), opaque(plate, np.full((9, 7), 3.0, np.float32))).rgb
         share = change.ratio @ np.array([0.2126, 0.7152, 0.0722], np.float32)
         # Where nothing is lost but light is added, a thousandth of the plate is covered.
         assert np.allclose(rgb, plate * share[..., None] + change.added, atol=1.1 * LEAST_CHANGE)
         assert np.array_equal(rgb[:3], plate[:3])
-
-    def test_a_plate_of_another_size_is_refused(self) -> None:
         with pytest.raises(InputError, match="shape"):
             self.change()[0].as_layer(np.zeros((3, 3, 3), np.float32))
 

@@ -99,6 +99,7 @@ def test_base_colour_is_decoded_with_the_srgb_curve_and_data_is_not(tmp_path: Pa
     assert material.metallic_roughness_texture is not None
     assert np.allclose(material.base_color_texture.texels, 0.5029, atol=1e-4)
     assert np.allclose(material.metallic_roughness_texture.texels, 188 / 255)
+    assert float(srgb_to_linear(np.array([188 / 255], np.float32))[0]) == pytest.approx(0.5029, abs=1e-4)
     assert material.base_color_texture.wrap == ("clamp", "mirror")
     assert (material.roughness, material.metallic) == (0.5, 1.0)
 
@@ -124,10 +125,8 @@ def test_vertex_colours_texture_transform_and_second_coordinates(tmp_path: Path)
     writer = GlbWriter()
     _, pixels = cv2.imencode(".png", np.repeat(np.array([[0, 0, 255, 255]], np.uint8), 2, axis=0))
     colors = np.array([[128, 255, 0, 255]] * 4, np.uint8)
-    attributes = {
-        "COLOR_0": writer.accessor(colors, "VEC4", normalized=True),
-        "TEXCOORD_1": writer.accessor(np.full((4, 2), 0.25, np.float32), "VEC2"),
-    }
+    attributes = {"COLOR_0": writer.accessor(colors, "VEC4", normalized=True)}
+    attributes["TEXCOORD_1"] = writer.accessor(np.full((4, 2), 0.25, np.float32), "VEC2")
     texture = {"index": 0, "texCoord": 1, "extensions": {"KHR_texture_transform": {"offset": [0.5, 0.0]}}}
     writer.square({"pbrMetallicRoughness": {"baseColorTexture": texture}, "extensions": {"KHR_materials_unlit": {}}}, **attributes)
     writer.json |= {"images": [{"bufferView": writer.view(pixels.tobytes()), "mimeType": "image/png"}], "textures": [{"source": 0}]}
@@ -135,17 +134,12 @@ def test_vertex_colours_texture_transform_and_second_coordinates(tmp_path: Path)
     assert np.allclose(rgb, [128 / 255, 1.0, 0.0], atol=1e-6)
 
 
-def test_lights_shine_along_minus_z_of_their_node(tmp_path: Path) -> None:
+def test_lights_shine_along_minus_z_of_their_node_and_scenes_stand_on_a_point(tmp_path: Path) -> None:
     writer = GlbWriter()
     writer.square()
-    spot = {
-        "type": "spot",
-        "intensity": 20.0,
-        "color": [1.0, 0.5, 0.25],
-        "range": 9.0,
-        "spot": {"innerConeAngle": 0.2, "outerConeAngle": 0.6},
-    }
-    writer.json["extensions"] = {"KHR_lights_punctual": {"lights": [spot]}}
+    spot = {"type": "spot", "intensity": 20.0, "color": [1.0, 0.5, 0.25], "range": 9.0}
+    cone = {"spot": {"innerConeAngle": 0.2, "outerConeAngle": 0.6}}
+    writer.json["extensions"] = {"KHR_lights_punctual": {"lights": [spot | cone]}}
     # Turned by -90 degrees about x: -z becomes -y, down in glTF, which is +y here.
     half = float(np.sqrt(0.5))
     lamp = {"translation": [1.0, 2.0, 3.0], "rotation": [-half, 0, 0, half], "extensions": {"KHR_lights_punctual": {"light": 0}}}
@@ -156,23 +150,24 @@ def test_lights_shine_along_minus_z_of_their_node(tmp_path: Path) -> None:
     assert np.allclose(light.direction, [0, 1, 0], atol=1e-7)
     assert (light.kind, light.rgb, light.range_m) == ("spot", pytest.approx((20.0, 10.0, 5.0)), pytest.approx(9.0))
     assert (light.inner_cone_rad, light.outer_cone_rad) == (0.2, 0.6)
+    scene = load_glb(writer.write(tmp_path / "stands.glb"))
+    low, high = scene.transformed(world_from_scene_placing(scene, (1.0, 0.5, 3.0), height_m=0.2, turn_rad=np.pi / 2)).bounds_m
+    assert np.allclose(low, [1.0, 0.3, 2.9])
+    assert np.allclose(high, [1.0, 0.5, 3.1])
 
 
 def animated_square(path: Path, interpolation: str, channel: str, times: list[float], values: np.ndarray) -> GltfAsset:
     writer = GlbWriter()
     writer.square()
     kind = "VEC4" if channel == "rotation" else "VEC3"
-    sampler = {
-        "input": writer.accessor(np.array(times, np.float32), "SCALAR"),
-        "output": writer.accessor(values.astype(np.float32), kind),
-        "interpolation": interpolation,
-    }
+    input_, output = writer.accessor(np.array(times, np.float32), "SCALAR"), writer.accessor(values.astype(np.float32), kind)
+    sampler = {"input": input_, "output": output, "interpolation": interpolation}
     target = {"sampler": 0, "target": {"node": 0, "path": channel}}
     writer.json["animations"] = [{"name": "go", "samplers": [sampler], "channels": [target]}]
     return GltfAsset(writer.write(path))
 
 
-def test_animation_is_sampled_linearly_stepwise_and_by_splines(tmp_path: Path) -> None:
+def test_animation_is_sampled_linearly_stepwise_by_splines_and_the_short_way(tmp_path: Path) -> None:
     way = np.array([[0, 0, 0], [2, 0, 0], [2, 4, 0]])
 
     def middle(asset: GltfAsset, time_s: float) -> np.ndarray:
@@ -180,23 +175,17 @@ def test_animation_is_sampled_linearly_stepwise_and_by_splines(tmp_path: Path) -
 
     linear = animated_square(tmp_path / "a.glb", "LINEAR", "translation", [0.0, 1.0, 2.0], way)
     assert linear.animation_durations_s == {"go": 2.0}
-    assert np.allclose(middle(linear, 0.25), [0.5, 0, 0])
-    assert np.allclose(middle(linear, 1.5), [2, -2, 0])
-    assert np.allclose(middle(linear, -1.0), [0, 0, 0])
-    assert np.allclose(middle(linear, 9.0), [2, -4, 0])
+    for time_s, place_m in ((0.25, [0.5, 0, 0]), (1.5, [2, -2, 0]), (-1.0, [0, 0, 0]), (9.0, [2, -4, 0])):
+        assert np.allclose(middle(linear, time_s), place_m)
     step = animated_square(tmp_path / "b.glb", "STEP", "translation", [0.0, 1.0, 2.0], way)
     assert np.allclose(middle(step, 0.99), [0, 0, 0])
     assert np.allclose(middle(step, 1.0), [2, 0, 0])
     # Hermite with tangents 0: the middle of a segment is the mean, a quarter of it 10/64 of the way (3 t^2 - 2 t^3).
     zero = np.zeros(3)
-    spline = animated_square(
-        tmp_path / "c.glb", "CUBICSPLINE", "translation", [0.0, 1.0], np.array([zero, way[0], zero, zero, way[1], zero])
-    )
+    bent = np.array([zero, way[0], zero, zero, way[1], zero])
+    spline = animated_square(tmp_path / "c.glb", "CUBICSPLINE", "translation", [0.0, 1.0], bent)
     assert np.allclose(middle(spline, 0.5), [1, 0, 0])
     assert np.allclose(middle(spline, 0.25), [2 * 10 / 64, 0, 0])
-
-
-def test_rotation_takes_the_short_way_at_even_speed_and_scale_flips_faces(tmp_path: Path) -> None:
     # From 0 to 90 degrees about glTF's z (given with the other sign of the quaternion): 30 degrees after a third.
     half = np.pi / 4
     turn = np.array([[0, 0, 0, 1], [0, 0, -np.sin(half), -np.cos(half)]])
@@ -245,15 +234,6 @@ def test_broken_and_unsupported_files_say_what_to_do(tmp_path: Path) -> None:
         load_glb(writer.write(tmp_path / "short.glb"))
 
 
-def test_placing_stands_a_scene_on_a_point(tmp_path: Path) -> None:
-    writer = GlbWriter()
-    writer.square()
-    scene = load_glb(writer.write(tmp_path / "square.glb"))
-    low, high = scene.transformed(world_from_scene_placing(scene, (1.0, 0.5, 3.0), height_m=0.2, turn_rad=np.pi / 2)).bounds_m
-    assert np.allclose(low, [1.0, 0.3, 2.9])
-    assert np.allclose(high, [1.0, 0.5, 3.1])
-
-
 @pytest.fixture(scope="module")
 def sky() -> Environment:
     """A small map with a bright side, so that wrong normals would show."""
@@ -296,7 +276,3 @@ def test_fox_runs(shared_data: Path) -> None:
         assert np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=-1).max() < 55.0
     with pytest.raises(InputError, match="Survey"):
         asset.scene_at(0.0, "Jump")
-
-
-def test_srgb_reference_value() -> None:
-    assert float(srgb_to_linear(np.array([188 / 255], np.float32))[0]) == pytest.approx(0.5029, abs=1e-4)

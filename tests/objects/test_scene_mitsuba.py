@@ -202,7 +202,7 @@ class TestEnvironment:
 
 @pytest.mark.usefixtures("backend")
 class TestLightPassedOn:
-    def test_closed_room_gathers_light(self) -> None:
+    def test_closed_room_gathers_light_bounce_by_bounce(self) -> None:
         # Walls of radiance E and albedo rho: E (1 + rho + rho^2 + ...) = E / (1 - rho), whatever the shape of the room. Red walls
         # so tint themselves. After 30 bounces 0.8^30 = 0.1 % of the red is missing.
         rho = np.array([0.8, 0.5, 0.2])
@@ -215,8 +215,6 @@ class TestLightPassedOn:
         layer = MitsubaTracer(samples=16, most_bounces=30).render(Scene(tuple(sides), environment=laws.DARK), SMALL)
         assert layer.alpha.min() == 1.0
         assert np.allclose(layer.rgb.mean((0, 1)), 0.1 / (1 - rho), rtol=0.01)
-
-    def test_bounces_are_counted(self) -> None:
         # The same room with one bounce: E (1 + rho); with none: E.
         wall = replace(matte(0.5, 0.5, 0.5), emissive=(1.0, 1.0, 1.0))
         room = sphere((0, 0, 0), 2.0, replace(wall, double_sided=True), rows=32)
@@ -255,14 +253,11 @@ class TestBesideTheRayCaster:
 
 @pytest.mark.usefixtures("backend")
 class TestSettings:
-    def test_seed_decides_about_the_noise(self) -> None:
+    def test_seed_decides_about_the_noise_and_many_samples_go_in_parts(self, monkeypatch: pytest.MonkeyPatch) -> None:
         scene = Scene((laws.facing_square(matte(0.5, 0.5, 0.5)),))
         first, again, other = (MitsubaTracer(samples=4, seed=seed).render(scene, SMALL).rgb for seed in (1, 1, 2))
         assert np.array_equal(first, again)
         assert not np.array_equal(first, other)
-
-    def test_many_samples_go_in_parts(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        scene = Scene((laws.facing_square(matte(0.5, 0.5, 0.5)),))
         whole = MitsubaTracer(samples=16).render(scene, SMALL).rgb
         monkeypatch.setattr("mrbokeh.scene.mitsuba.paths._RAYS_AT_ONCE", 1 << 13)
         parts = MitsubaTracer(samples=16).render(scene, SMALL).rgb

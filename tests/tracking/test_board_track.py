@@ -20,6 +20,7 @@ from mrbokeh.tracking.camera_track.board_calibration import calibrated
 from mrbokeh.tracking.camera_track.board_smoothing import Observation, steadied, steady_poses, whittaker
 from mrbokeh.tracking.camera_track.board_track import RollingCorners, TrackSettings, Undistorting, poses_of, track_board
 from mrbokeh.tracking.camera_track.formats import read_track
+from mrbokeh.tracking.camera_track.track import CameraTrack
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, write_board
 from mrbokeh.tracking.charuco.detector import Corners
 from tests.scenes.command_line import printed_by
@@ -47,6 +48,11 @@ def true_camera(number: int, width_px: int = 320) -> Camera:
     return clip_of(width_px, width_px * 9 // 16, FRAMES).camera(number)
 
 
+@cache
+def level_track(clip: Path) -> CameraTrack:
+    return track_board(clip, BOARD, true_camera(0)).track
+
+
 def test_a_traced_clip_is_tracked_and_what_is_hidden_is_bridged(clip: Path) -> None:
     """Bounds are twice what was measured: 0.10 degrees, 0.9 mm, 0.2 px for an object 5 to 15 cm above the board. Three hidden frames,
     0.13 s with a trembling hand, are bridged to within 2 px."""
@@ -61,18 +67,18 @@ def test_a_traced_clip_is_tracked_and_what_is_hidden_is_bridged(clip: Path) -> N
             assert error.turn_deg < 0.2 and error.place_mm < 1.8 and error.object_px < 0.5
 
 
-def test_longer_gaps_are_left_out_and_told(clip: Path) -> None:
-    tracked = track_board(clip, BOARD, true_camera(0), settings=TrackSettings(longest_gap=2))
+def test_longer_gaps_and_boards_that_are_not_there_are_told(clip: Path) -> None:
+    """Intrinsics of pictures twice as large serve as well."""
+    tracked = track_board(clip, BOARD, true_camera(0, 640), settings=TrackSettings(longest_gap=2))
     assert tracked.lost == HIDDEN and tracked.bridged == () and 7 not in tracked.track.frames
     with pytest.raises(InputError, match="not frame 7"):
         tracked.track.at(7)
-
-
-def test_intrinsics_follow_the_size_of_the_clip(clip: Path) -> None:
-    twice = track_board(clip, BOARD, true_camera(0, 640))
-    once = track_board(clip, BOARD, true_camera(0))
-    np.testing.assert_allclose(twice.track.at(3).camera.camera_from_world, once.track.at(3).camera.camera_from_world, atol=1e-9)
-    assert twice.track.size_px == (320, 180)
+    once = level_track(clip)
+    np.testing.assert_allclose(tracked.track.at(3).camera.camera_from_world, once.at(3).camera.camera_from_world, atol=1e-9)
+    assert tracked.track.size_px == (320, 180)
+    other = CharucoBoard((CharucoGrid((5, 5), 40.0, 30.0, first_marker=40),), "DICT_5X5_100")
+    with pytest.raises(InputError, match="found in 0 of 16 frames"):
+        track_board(clip, other, true_camera(0))
 
 
 @pytest.mark.parametrize("turn_deg", [90, -90])
@@ -80,16 +86,10 @@ def test_an_upright_clip_is_tracked_with_the_intrinsics_of_the_level_camera(clip
     """Pictures turned counter-clockwise are those of a camera that was turned clockwise (y points down)."""
     upright = track_board(turned_clip(clip, tmp_path / "upright.mkv", turn_deg), BOARD, true_camera(0)).track
     assert upright.size_px == (180, 320)
-    level, turn = track_board(clip, BOARD, true_camera(0)).track, Rotation.from_euler("z", -turn_deg, degrees=True).as_matrix()
+    level, turn = level_track(clip), Rotation.from_euler("z", -turn_deg, degrees=True).as_matrix()
     for number in (0, 3, 15):
         pose = level.at(number).camera.camera_from_world[:3]
         np.testing.assert_allclose(upright.at(number).camera.camera_from_world[:3], turn @ pose, atol=2e-3)
-
-
-def test_a_board_that_is_not_there_is_told(clip: Path) -> None:
-    other = CharucoBoard((CharucoGrid((5, 5), 40.0, 30.0, first_marker=40),), "DICT_5X5_100")
-    with pytest.raises(InputError, match="found in 0 of 16 frames"):
-        track_board(clip, other, true_camera(0))
 
 
 def test_distortion_is_taken_out_before_the_board_is_looked_for() -> None:
@@ -115,24 +115,18 @@ def dense_whittaker(values: np.ndarray, weights: np.ndarray, strength: float) ->
     return np.linalg.solve(np.diag(np.maximum(weights, 1e-9)) + strength * differences.T @ differences, weights[:, None] * values)
 
 
-@pytest.mark.parametrize("count", [4, 7, 12, 13, 40])
-def test_banded_splines_agree_with_the_dense_ones(count: int) -> None:
-    rng = np.random.default_rng(count)
-    values, weights = rng.normal(size=(count, 3)), rng.uniform(0.1, 1.0, count)
-    np.testing.assert_allclose(whittaker(values, weights, 12.5), dense_whittaker(values, weights, 12.5), atol=1e-9)
-
-
-def test_splines_keep_parabolas_and_continue_them_through_gaps() -> None:
+def test_splines_agree_with_the_dense_ones_and_keep_parabolas() -> None:
     """Third differences of a parabola vanish: nothing is smoothed, however strongly, and no lag can show."""
+    for count in (4, 7, 12, 13, 40):
+        rng = np.random.default_rng(count)
+        values, weights = rng.normal(size=(count, 3)), rng.uniform(0.1, 1.0, count)
+        np.testing.assert_allclose(whittaker(values, weights, 12.5), dense_whittaker(values, weights, 12.5), atol=1e-9)
     x = np.arange(30.0)
     values = np.stack([0.3 * x**2 - 2.0 * x, 5.0 - x], axis=1)
     weights = np.ones(30)
     weights[10:16] = 0.0
     np.testing.assert_allclose(whittaker(values * weights[:, None], weights, 1e4), values, atol=1e-3)
-
-
-def test_turning_on_and_on_is_steady() -> None:
-    """Two full turns: quaternions change sign on the way; nothing of that shows in the poses."""
+    # Two full turns: quaternions change sign on the way; nothing of that shows in the poses.
     poses = {}
     for number in range(60):
         pose = np.eye(4)
@@ -177,26 +171,21 @@ def test_smoothing_takes_noise_away_and_leaves_the_trembling_hand(motion: HandHe
     assert after < most * before
 
 
-def test_exact_poses_stay() -> None:
+def test_exact_poses_stay_and_more_smoothing_gives_calmer_ones() -> None:
     """To a hundredth of a pixel, with a hand that trembles by half a pixel."""
     corners, cameras = noisy(1e-4, 16)
     fits = poses_of(corners, BOARD, CAMERA, TIMES_S)
     steady = steadied({n: Observation(f.camera_from_world, corners[n]) for n, f in fits.items()}, BOARD, CAMERA)
     assert errors_px([steady[n] for n in range(60)], cameras) < 0.01
-
-
-def test_asked_for_more_smoothing_gives_calmer_poses() -> None:
     corners, _ = noisy(0.2, 16)
     fits = poses_of(corners, BOARD, CAMERA, TIMES_S)
     observed = {n: Observation(f.camera_from_world, corners[n].only(f.inliers)) for n, f in fits.items()}
-    rest = [
-        np.mean(np.diff(np.array([poses[n][:3, 3] for n in range(60)]), 3, axis=0) ** 2)
-        for poses in (steadied(observed, BOARD, CAMERA), steadied(observed, BOARD, CAMERA, 1.0))
-    ]
-    assert rest[1] < 0.5 * rest[0]
+    poses = (steadied(observed, BOARD, CAMERA), steadied(observed, BOARD, CAMERA, 1.0))
+    usual, calmer = (np.mean(np.diff(np.array([each[n][:3, 3] for n in range(60)]), 3, axis=0) ** 2) for each in poses)
+    assert calmer < 0.5 * usual
 
 
-def test_calibration_finds_focal_length_principal_point_and_distortion() -> None:
+def test_calibration_finds_focal_length_principal_point_and_distortion_where_there_are_angles() -> None:
     """600 px, (310, 185) with the first pixel's centre at a half, k1 = -0.15; noise of 0.1 px on 44 corners of 24 views."""
     found = calibrated(BOARD, tilted_views(BOARD, np.linspace(-40, 40, 24), 0.42, -0.15), 640, 360)
     assert found.camera.focal_px[0] == pytest.approx(600.0, rel=0.004) and found.camera.focal_px[0] == found.camera.focal_px[1]
@@ -204,14 +193,8 @@ def test_calibration_finds_focal_length_principal_point_and_distortion() -> None
     assert found.distortion["k1"] == pytest.approx(-0.15, abs=0.03)
     assert found.residual_px == pytest.approx(0.1 * np.sqrt(2.0), rel=0.05)
     assert abs(found.camera.focal_px[0] - 600.0) < 4.0 * found.focal_sigma * 600.0 + 1.0
-
-
-def test_a_lens_without_distortion_gets_none_to_speak_of() -> None:
     found = calibrated(BOARD, tilted_views(BOARD, np.linspace(-40, 40, 24), 0.42), 640, 360)
     assert abs(found.distortion.get("k1", 0.0)) < 0.02
-
-
-def test_a_board_seen_head_on_only_leaves_the_focal_length_open() -> None:
     with pytest.raises(InputError, match="too few angles"):
         calibrated(BOARD, tilted_views(BOARD, np.zeros(12), 0.42, sigma_px=0.3), 640, 360)
     with pytest.raises(InputError, match="only 2 frames"):

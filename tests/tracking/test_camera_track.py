@@ -33,58 +33,43 @@ def two_frames() -> CameraTrack:
     return CameraTrack({0: TrackedFrame(one, 1.0, 2.0, 0.0), 24: TrackedFrame(other, 3.0, 8.0, 1.0)}, "-y")
 
 
-def test_halfway_a_panning_camera_stays_on_its_tripod_and_has_turned_by_half() -> None:
+def test_halfway_a_panning_camera_stays_on_its_tripod_and_turns_the_short_way() -> None:
     """1 m and 3 m are 1 and 1/3 dioptre: halfway lies 2/3, 1.5 m. f/2 and f/8 are four stops apart: halfway lies f/4."""
     middle = two_frames().at_time(0.5)
     np.testing.assert_allclose(middle.camera.world_from_camera[:3, 3], (1.0, 2.0, 3.0), atol=1e-12)
     np.testing.assert_allclose(middle.camera.world_from_camera[:3, 2], (0.5, 0.0, np.sqrt(0.75)), atol=1e-12)
     assert middle.focus_distance_m == pytest.approx(1.5) and middle.f_number == pytest.approx(4.0) and middle.time_s == 0.5
-
-
-def test_at_its_own_times_the_track_gives_its_own_frames() -> None:
+    # From 170 to -170 degrees through 180, not through 0.
+    one, other = (camera_at((0.0, 0.0, 0.0), Rotation.from_euler("y", angle, degrees=True)) for angle in (170.0, -170.0))
+    middle = CameraTrack({0: TrackedFrame(one, time_s=0.0), 1: TrackedFrame(other, time_s=1.0)}).at_time(0.5)
+    np.testing.assert_allclose(middle.camera.world_from_camera[:3, 2], (0.0, 0.0, -1.0), atol=1e-12)
     track = two_frames()
     for number, time_s in ((0, 0.0), (24, 1.0)):
         np.testing.assert_allclose(track.at_time(time_s).camera.camera_from_world, track.at(number).camera.camera_from_world, atol=1e-15)
 
 
-def test_rotations_go_the_short_way() -> None:
-    """From 170 to -170 degrees through 180, not through 0."""
-    one, other = (camera_at((0.0, 0.0, 0.0), Rotation.from_euler("y", angle, degrees=True)) for angle in (170.0, -170.0))
-    middle = CameraTrack({0: TrackedFrame(one, time_s=0.0), 1: TrackedFrame(other, time_s=1.0)}).at_time(0.5)
-    np.testing.assert_allclose(middle.camera.world_from_camera[:3, 2], (0.0, 0.0, -1.0), atol=1e-12)
-
-
-def test_from_infinity_focus_comes_in_dioptres() -> None:
+def test_focus_comes_in_dioptres_and_what_one_frame_knows_is_not_made_up() -> None:
     frames = {n: replace(two_frames().at(0), focus_distance_m=d, time_s=float(n)) for n, d in ((0, float("inf")), (1, 2.0))}
     assert CameraTrack(frames).at_time(0.5).focus_distance_m == pytest.approx(4.0)
-
-
-def test_what_only_one_frame_knows_is_not_made_up() -> None:
     track = two_frames()
     partly = replace(track, frames={**track.frames, 24: replace(track.at(24), f_number=None)})
     assert partly.at_time(0.25).f_number is None and partly.at_time(0.25).focus_distance_m is not None
 
 
-@pytest.mark.parametrize("time_s", [-0.001, 1.001])
-def test_outside_its_time_the_track_says_so(time_s: float) -> None:
-    with pytest.raises(InputError, match=r"from 0.0000 s to 1.0000 s"):
-        two_frames().at_time(time_s)
-
-
-def test_frames_that_are_not_there_are_an_error() -> None:
+def test_outside_its_times_and_frames_the_track_says_so() -> None:
+    for time_s in (-0.001, 1.001):
+        with pytest.raises(InputError, match=r"from 0.0000 s to 1.0000 s"):
+            two_frames().at_time(time_s)
     with pytest.raises(InputError, match=r"frames 0 to 24 .but not all of them., not frame 7"):
         two_frames().at(7)
 
 
-def test_times_follow_from_a_frame_rate() -> None:
+def test_times_follow_from_a_frame_rate_and_a_fixed_camera_stands_for_every_frame() -> None:
     timed = replace(two_frames(), frames={n: replace(f, time_s=None) for n, f in two_frames().frames.items()})
     with pytest.raises(InputError, match="no times"):
         timed.at_time(0.5)
     assert timed.timed(48.0).at_time(0.5).time_s == 0.5
     assert timed.shifted(1001).numbers == [1001, 1025]
-
-
-def test_a_fixed_camera_stands_for_every_frame() -> None:
     track = fixed_track(camera_at((0.0, 0.0, -2.0), Rotation.identity()))
     assert track.at(999).camera is track.at(0).camera and track.at_time(1e6).camera is track.at(0).camera
     assert track.size_px == (640, 360) and track.resized(320, 180).at(5).camera.focal_px == (250.0, 250.0)
@@ -147,28 +132,21 @@ def test_what_a_turned_camera_sees_is_what_the_level_one_saw_turned(quarter_turn
         # Of the same shape: nobody can tell, and no lens is known that well.
         assert found.camera.principal_px == LEVEL.camera.principal_px
         found = LEVEL.turned(2)
-    np.testing.assert_allclose(
-        seen_px(found, turn.apply(POINTS_M)), turned_px(seen_px(LEVEL, POINTS_M), (640, 360), quarter_turns), atol=1e-6
-    )
+    expected = turned_px(seen_px(LEVEL, POINTS_M), (640, 360), quarter_turns)
+    np.testing.assert_allclose(seen_px(found, turn.apply(POINTS_M)), expected, atol=1e-6)
 
 
-def test_the_place_of_a_pixel_is_that_of_rot90() -> None:
+def test_another_size_of_the_same_shape_is_taken_and_another_shape_refused() -> None:
     picture = np.zeros((360, 640))
     picture[20, 600] = 1.0
     for turns in range(4):
         (row,), (column,) = np.nonzero(np.rot90(picture, turns))
         np.testing.assert_array_equal(turned_px(np.array([[600.5, 20.5]]), (640, 360), turns), [[column + 0.5, row + 0.5]])
-
-
-def test_another_size_of_the_same_shape_is_taken() -> None:
     found = intrinsics_of_clip(LEVEL, (180, 320), 3, CLIP).camera
     assert found.focal_px == (310.0, 300.0)
-
-
-@pytest.mark.parametrize(("size_px", "turns"), [((640, 480), 0), ((360, 640), 0), ((480, 640), 1)])
-def test_pictures_of_another_shape_are_refused(size_px: tuple[int, int], turns: int) -> None:
-    with pytest.raises(InputError, match=f"clip.mov .{size_px[0]}x{size_px[1]}., got those of 640x360"):
-        intrinsics_of_clip(LEVEL, size_px, turns, CLIP)
+    for size_px, turns in (((640, 480), 0), ((360, 640), 0), ((480, 640), 1)):
+        with pytest.raises(InputError, match=f"clip.mov .{size_px[0]}x{size_px[1]}., got those of 640x360"):
+            intrinsics_of_clip(LEVEL, size_px, turns, CLIP)
 
 
 CAMERA = Camera(160, 112, (100.0, 100.0), (80.5, 56.5))
@@ -178,22 +156,16 @@ def drawn_axes(at_z_m: float, up: str) -> np.ndarray:
     return with_axes(np.zeros((112, 160, 3), np.uint8), CAMERA, axes_of(up, 0.4), np.array([0.0, 0.0, at_z_m]))
 
 
-def test_axes_are_where_the_camera_sees_them() -> None:
+def test_axes_are_where_the_camera_sees_them_and_up_is_blue() -> None:
     """0.4 m to the right at 1 m is 40 px at a focal length of 100 px, and so is 0.4 m down; z runs towards the middle of the picture."""
     drawn = drawn_axes(1.0, "-z")
     assert drawn[56, 105].tolist() == [255, 40, 40] and drawn[85, 80].tolist() == [40, 220, 40]
     assert drawn[56, 80].tolist() == [60, 110, 255]
     assert drawn[56, 119:122].max() == 255 and not drawn[56, 123:].any(), "the side of the square, at 120.5"
     assert not drawn[:14].any() and drawn[16, 60:100, 0].min() > 100, "its upper side, at 16.5"
-
-
-def test_up_is_blue() -> None:
-    """-y is up in the picture of a level camera."""
+    # -y is up in the picture of a level camera.
     assert drawn_axes(2.0, "-y")[45, 80].tolist() == [60, 110, 255]
     assert not (drawn_axes(2.0, "+y")[:50, 80] == [60, 110, 255]).all(1).any()
-
-
-def test_lines_behind_the_camera_are_left_out() -> None:
     assert not drawn_axes(-1.0, "-z").any()
 
 

@@ -30,20 +30,14 @@ def test_boards_are_drawn_as_opencv_draws_them(board: CharucoBoard) -> None:
     assert np.array_equal(picture, drawn(replace(board, legacy=False))) == (board is not EVEN)
 
 
-def test_each_pattern_is_found_by_its_own_detector_only() -> None:
+def test_each_pattern_is_found_by_its_own_detector_only_however_it_is_searched() -> None:
     """48 px a square and 40 of white paper around: inner corner (i, j) lies at 40 + 48 (i, j)."""
     picture = np.pad(drawn(EVEN), 40, constant_values=255)
-    found = CharucoDetector(EVEN).detect(picture)
-    assert len(found) == 12 and len(CharucoDetector(replace(EVEN, legacy=False)).detect(picture)) < 12
-    np.testing.assert_allclose(found.xy_px, 40.0 + 2000.0 * EVEN.corners_m[found.ids, :2], atol=0.03)
-
-
-@pytest.mark.parametrize("enlarged", [1, 2, 3])
-def test_places_are_those_in_the_picture_however_it_is_searched(enlarged: int) -> None:
-    picture = np.pad(drawn(EVEN), 40, constant_values=255)
-    found = CharucoDetector(EVEN).detect_enlarged(picture, enlarged)
-    assert len(found) == 12
-    np.testing.assert_allclose(found.xy_px, 40.0 + 2000.0 * EVEN.corners_m[found.ids, :2], atol=0.03)
+    detector = CharucoDetector(EVEN)
+    assert len(CharucoDetector(replace(EVEN, legacy=False)).detect(picture)) < 12
+    for found in (detector.detect(picture), *(detector.detect_enlarged(picture, enlarged) for enlarged in (1, 2, 3))):
+        assert len(found) == 12
+        np.testing.assert_allclose(found.xy_px, 40.0 + 2000.0 * EVEN.corners_m[found.ids, :2], atol=0.03)
 
 
 def test_json_and_toml_tell_of_the_same_board(tmp_path: Path) -> None:

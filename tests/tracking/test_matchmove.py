@@ -1,6 +1,6 @@
 """Match-move: drawn rooms with true cameras; a camera on a tripod must be refused. COLMAP itself runs in the slow tests only."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -74,10 +74,8 @@ def errors(cameras: Sequence[Camera], track: CameraTrack) -> tuple[float, float]
     found = np.array([track.at(n).camera.world_from_camera[:3, 3] for n in numbers])
     scale, turn = similarity(true, found)
     off_m = scale * (found - found.mean(axis=0)) @ turn.T + true.mean(axis=0) - true
-    turns = [
-        Rotation.from_matrix(cameras[n].camera_from_world[:3, :3] @ turn @ track.at(n).camera.camera_from_world[:3, :3].T).magnitude()
-        for n in numbers
-    ]
+    poses = [(each.camera_from_world[:3, :3] for each in (cameras[n], track.at(n).camera)) for n in numbers]
+    turns = [Rotation.from_matrix(one @ turn @ other.T).magnitude() for one, other in poses]
     return float(np.sqrt(np.mean(np.sum(off_m**2, axis=1)))), float(np.degrees(max(turns)))
 
 
@@ -98,7 +96,7 @@ def test_the_motion_of_a_clip_is_that_of_its_picture(tmp_path: Path) -> None:
     assert motion[-1] == pytest.approx(380.0 * angle / 400.0, rel=0.15) and (np.diff(motion) > 0).all()
 
 
-def test_frames_between_keyframes_come_from_flow() -> None:
+def test_frames_between_keyframes_come_from_flow_from_one_end_as_well() -> None:
     """Seven frames, the outer two known: the others to within 5 mm and 0.1 degrees, with points of the model carried over 3 frames."""
     cameras = walking(25)[:7]
     model = model_of([cameras[0], cameras[-1]])
@@ -109,9 +107,6 @@ def test_frames_between_keyframes_come_from_flow() -> None:
         assert np.linalg.norm(pose.camera.world_from_camera[:3, 3] - true.world_from_camera[:3, 3]) < 0.005
         assert np.degrees(Rotation.from_matrix(motion[:3, :3]).magnitude()) < 0.1
         assert pose.residual_px < 0.5 and pose.fitting > 0.9
-
-
-def test_one_known_end_is_enough() -> None:
     cameras = walking(25)[:4]
     model = model_of([cameras[-1]])
     found = poses_between(model, [picture(camera) for camera in cameras], {3: model.views[0]})
@@ -138,7 +133,7 @@ def elsewhere(model: SparseModel) -> SparseModel:
     return replace(model.moved(turn).times(1.0 / 0.37), metres_per_unit=None)
 
 
-def test_the_world_stands_on_picked_ground_and_is_as_long_as_the_ruler() -> None:
+def test_the_world_stands_on_picked_ground_among_things_that_stand_on_it() -> None:
     """Pixels of four known points of the floor, read to 0.1 px: the first is the origin, the second lies 1.503 m along x, y is down."""
     cameras = walking(6)
     view_px = np.round(cameras[2].project(FLOOR_POINTS)[0], 1)
@@ -153,11 +148,7 @@ def test_the_world_stands_on_picked_ground_and_is_as_long_as_the_ruler() -> None
     assert np.abs(seen_px - cameras[5].project(FLOOR_POINTS[:2])[0]).max() < 0.5
     heights_m = [0.8 - camera.world_from_camera[1, 3] for camera in cameras]
     assert [-view.centre[1] for view in metric.views] == pytest.approx(heights_m, abs=0.003)
-
-
-def test_ground_finds_the_floor_among_things_that_stand_on_it() -> None:
-    """A third of the points between the picks is lifted by 5 to 40 cm."""
-    cameras = walking(6)
+    # A third of the points between the picks is lifted by 5 to 40 cm.
     model = model_of(cameras)
     lifted = np.random.default_rng(4).random(len(model.points)) < 0.33
     points = model.points - np.where(lifted, np.random.default_rng(5).uniform(0.05, 0.4, len(lifted)), 0.0)[:, None] * (0.0, 1.0, 0.0)
@@ -181,29 +172,21 @@ def test_bad_picks_are_refused() -> None:
         ruler_scale(standing.views[2], Ruler(2, floor_px[:2], -1.0))
 
 
-@pytest.mark.parametrize(
-    ("parse", "text"),
-    [
-        *((parse_ground, each) for each in ("", "0", "0:1,2/3,4", "x:1,2/3,4/5,6", "-1:1,2/3,4/5,6", "0:1,2/3,4/5")),
-        *((parse_ruler, each) for each in ("0:1,2/3,4", "0:1,2/3,4/x", "1,2/3,4/5")),
-        *((parse_frame_distance, each) for each in ("0,1", "a,b,1", "0,1,2,3")),
-    ],
-)
-def test_picks_that_cannot_be_read(parse: Callable[[str], object], text: str) -> None:
-    with pytest.raises(InputError, match="must be FRAME"):
-        parse(text)
-
-
-def test_a_ruler_needs_a_ground_and_frames_that_are_there(tmp_path: Path) -> None:
+def test_rulers_without_ground_and_resting_cameras_are_refused(tmp_path: Path) -> None:
+    for parse, texts in (
+        (parse_ground, ("", "0", "0:1,2/3,4", "x:1,2/3,4/5,6", "-1:1,2/3,4/5,6", "0:1,2/3,4/5")),
+        (parse_ruler, ("0:1,2/3,4", "0:1,2/3,4/x", "1,2/3,4/5")),
+        (parse_frame_distance, ("0,1", "a,b,1", "0,1,2,3")),
+    ):
+        for text in texts:
+            with pytest.raises(InputError, match="must be FRAME"):
+                parse(text)
     with pytest.raises(InputError, match="say with --ground"):
         MatchmoveSettings(ruler=parse_ruler("0:1,2/3,4/1"))
     clip = write_clip(tmp_path / "clip.mkv", walking(5))
     with pytest.raises(InputError, match="frames 0 to 4"):
         matchmove_clip(clip, tmp_path / "work", MatchmoveSettings(distance=(0, 5, 1.0)))
-
-
-def test_a_resting_camera_is_refused(tmp_path: Path) -> None:
-    clip = write_clip(tmp_path / "clip.mkv", walking(9)[:1] * 4)
+    clip = write_clip(tmp_path / "resting.mkv", walking(9)[:1] * 4)
     with pytest.raises(InputError, match="take a single camera"):
         matchmove_clip(clip, tmp_path / "work")
 
