@@ -18,7 +18,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.stacks.focal_stack import FocalStack, write_merged
 from mrbokeh.stacks.light_field_samples_file import read_samples, write_samples
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 # Primaries and white of the Academy's documents S-2014-004 (ACEScg) and SMPTE ST 2065-1 (ACES), of ITU-R BT.2020 and BT.709.
 ACESCG = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
@@ -99,8 +99,7 @@ def test_pixels_that_are_no_numbers_stay_what_they_are(tmp_path: Path) -> None:
     read = read_image(path)
     np.testing.assert_array_equal(read[:, 0], rgb[:, 0])
     np.testing.assert_allclose(read[0, 1:], np.array(PUBLISHED[ACESCG]).T[1:], atol=DIGITS)
-    with pytest.raises(InputError, match="2 pixels are NaN or infinite"):
-        read_linear(path)
+    refused("2 pixels are NaN or infinite", read_linear, path)
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -189,6 +188,5 @@ def test_samples_of_a_renderer_that_works_in_acescg(tmp_path: Path) -> None:
 )
 def test_primaries_that_are_no_colour_space_are_refused_with_advice(tmp_path: Path, primaries: tuple[float, ...]) -> None:
     path = write_colours(tmp_path / "odd.exr", primaries)
-    with pytest.raises(InputError, match=r"odd\.exr: expected primaries .*chromaticities.*, got .*correct the attribute, or remove it"):
-        read_image(path)
+    refused(r"odd\.exr: expected primaries .*chromaticities.*, got .*correct the attribute, or remove it", read_image, path)
     np.testing.assert_array_equal(read_camera_rgb(path), COLOURS)

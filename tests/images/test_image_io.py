@@ -8,6 +8,7 @@ from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
 from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer, write_preview
 from mrbokeh.images.layer import Layer
 from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 
 def picture(highest: float = 1.0) -> np.ndarray:
@@ -95,8 +96,7 @@ def test_highlights_of_real_files(shared_data: Path) -> None:
 
 
 def test_deep_exr_is_refused_with_advice(shared_data: Path) -> None:
-    with pytest.raises(InputError, match="flatten it first"):
-        read_exr(shared_data / "deep" / "balls_lowres.exr")
+    refused("flatten it first", read_exr, shared_data / "deep" / "balls_lowres.exr")
 
 
 @pytest.mark.parametrize(("name", "content", "message"), [

@@ -3,7 +3,7 @@ import pytest
 from skimage.metrics import structural_similarity
 
 from mrbokeh.images.image_metrics import depth_edge_mask, energy_ratio, flicker, leak, light_error, psnr, ssim
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 
 def picture(seed: int) -> np.ndarray:
@@ -36,8 +36,7 @@ def test_edge_psnr_looks_only_near_depth_edges() -> None:
 
 
 def test_edge_psnr_without_edges_says_so() -> None:
-    with pytest.raises(InputError, match="mask is empty"):
-        psnr(picture(0), picture(0), mask=depth_edge_mask(np.ones((40, 50)), 3))
+    refused("mask is empty", psnr, picture(0), picture(0), mask=depth_edge_mask(np.ones((40, 50)), 3))
 
 
 def test_energy_ratio_sees_light_beyond_white() -> None:
@@ -45,8 +44,7 @@ def test_energy_ratio_sees_light_beyond_white() -> None:
 
 
 def test_shapes_must_agree() -> None:
-    with pytest.raises(InputError, match="one shape"):
-        psnr(np.zeros((2, 2)), np.zeros((2, 3)))
+    refused("one shape", psnr, np.zeros((2, 2)), np.zeros((2, 3)))
 
 
 def test_leak_counts_only_what_is_too_much_in_the_band() -> None:
@@ -99,5 +97,4 @@ def test_flicker_compares_with_the_true_film() -> None:
     truth = [np.full((3, 3), t * t / 50.0) for t in range(5)]
     assert flicker(truth, truth) == 0.0
     assert flicker([np.full((3, 3), 0.1)] * 5, truth) == pytest.approx(0.01)
-    with pytest.raises(InputError, match="at least three"):
-        flicker(truth[:2], truth[:2])
+    refused("at least three", flicker, truth[:2], truth[:2])

@@ -5,6 +5,7 @@ import pytest
 
 from mrbokeh.images.layer import Layer, clear, flatten, opaque, over
 from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 
 def flat(rgb: tuple[float, float, float], alpha: float, depth_m: float) -> Layer:
@@ -37,8 +38,7 @@ def test_flatten_puts_the_first_layer_in_front() -> None:
 
 
 def test_flatten_of_nothing_says_what_it_wants() -> None:
-    with pytest.raises(InputError, match="at least one layer"):
-        flatten([])
+    refused("at least one layer", flatten, [])
 
 
 def test_sizes_must_agree() -> None:

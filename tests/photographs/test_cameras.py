@@ -8,9 +8,10 @@ import pytest
 import capture.tether.gphoto2_camera as cameras_module
 from capture.commands.cameras import cameras_command
 from capture.tether.gphoto2_config import explained
-from mrbokeh.system.errors import InputError, MissingExtraError
+from mrbokeh.system.errors import MissingExtraError
 from mrbokeh.system.gphoto2_library import library
 from tests.scenes.command_line import printed_by
+from tests.scenes.refusals import refused
 from tests.tether.test_gphoto2 import card, in_own_interpreter
 
 __all__ = ["card"]
@@ -32,8 +33,7 @@ def test_none_connected(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_several_connected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cameras_module, "detected", lambda: [("A", "usb:001,001"), ("B", "usb:001,002")])
-    with pytest.raises(InputError, match=r"several cameras .*A at usb:001,001, B at usb:001,002.* --camera gphoto2:PORT"):
-        cameras_module.open_camera()
+    refused(r"several cameras .*A at usb:001,001, B at usb:001,002.* --camera gphoto2:PORT", cameras_module.open_camera)
 
 
 def test_a_camera_that_another_program_holds(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -56,5 +56,4 @@ def test_without_the_library(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(MissingExtraError, match=r"pip install 'mrbokeh\[tether\]'"):
         printed_by(cameras_command)
     monkeypatch.setattr(sys, "platform", "win32")
-    with pytest.raises(InputError, match=r"does not run on Windows.*folder:DIR"):
-        library()
+    refused(r"does not run on Windows.*folder:DIR", library)

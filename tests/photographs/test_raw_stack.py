@@ -25,7 +25,7 @@ from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import read_image
 from mrbokeh.optics.camera import camera_from_json
 from mrbokeh.optics.lens import Lens, film_plane_m, lens_distance_m
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 SHIPPED = Path(__file__).resolve().parents[2] / "mrbokeh" / "demo_data" / "raw_stack"
 LENS = Lens(35.0, 2.8, 0.7, 23.5)
@@ -182,8 +182,7 @@ def test_a_stack_is_resumed_and_never_overwritten(tmp_path: Path, monkeypatch: p
     assert path.read_bytes() == first, "the seed must decide every bit"
     assert (tmp_path / "view_0" / "slice_00.dng").stat().st_mtime_ns == kept
     other = StackPlan(viewpoints=1, slices=2, width_px=48, height_px=32, samples=8, seed=2)
-    with pytest.raises(InputError, match="--overwrite"):
-        make_raw_stack(tmp_path, other)
+    refused("--overwrite", make_raw_stack, tmp_path, other)
     assert path.read_bytes() == first
     assert make_raw_stack(tmp_path, other, overwrite=True) == 3
     assert path.read_bytes() != first
@@ -213,8 +212,7 @@ def test_views_beyond_the_stacks_have_truth_only() -> None:
 
 
 def test_an_unknown_scene_is_refused() -> None:
-    with pytest.raises(InputError, match="desk, lab"):
-        truth_document(StackPlan(scene="kitchen"))
+    refused("desk, lab", truth_document, StackPlan(scene="kitchen"))
 
 
 def test_the_lab_board_is_as_large_as_stated() -> None:

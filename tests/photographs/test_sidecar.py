@@ -8,7 +8,7 @@ import pytest
 from capture.photos.photo_metadata import PhotoMetadata
 from capture.photos.sidecar import Sidecar, find_sidecar, read_sidecar, sidecar_of
 from mrbokeh.optics.lens import Lens
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 
 def write_sidecar(folder: Path, text: str) -> Path:
@@ -57,14 +57,12 @@ def test_sidecar_table_and_film_plane(tmp_path: Path) -> None:
     ],
 )
 def test_sidecar_mistakes_are_named(tmp_path: Path, text: str, message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        read_sidecar(write_sidecar(tmp_path, text))
+    refused(message, read_sidecar, write_sidecar(tmp_path, text))
 
 
 def test_sidecar_with_too_few_distances(tmp_path: Path) -> None:
     sidecar = read_sidecar(write_sidecar(tmp_path, "focus_distances_m = [1.0, 2.0]"))
-    with pytest.raises(InputError, match="lists 2 distances, but there are 3 photographs"):
-        sidecar.applied(["a", "b", "c"], [PhotoMetadata()] * 3)
+    refused("lists 2 distances, but there are 3 photographs", sidecar.applied, ["a", "b", "c"], [PhotoMetadata()] * 3)
 
 
 def test_nearest_sidecar_upwards_is_found(tmp_path: Path) -> None:
@@ -119,15 +117,13 @@ def test_distances_from_a_table(tmp_path: Path) -> None:
 )
 def test_mistakes_in_a_table_are_named_with_their_line(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "focus.csv").write_text(text)
-    with pytest.raises(InputError, match=message):
-        sidecar_of(tmp_path, tmp_path)
+    refused(message, sidecar_of, tmp_path, tmp_path)
 
 
 def test_distances_must_come_from_one_file(tmp_path: Path) -> None:
     (tmp_path / "focus.csv").write_text(CSV)
     path = write_sidecar(tmp_path, "focus_distances_m = [1.0, 2.0]")
-    with pytest.raises(InputError, match=r"both .*lens\.toml and .*focus\.csv state focus distances"):
-        sidecar_of(tmp_path, tmp_path)
+    refused(r"both .*lens\.toml and .*focus\.csv state focus distances", sidecar_of, tmp_path, tmp_path)
     assert sidecar_of(tmp_path, tmp_path, path).focus_where == str(path), "the file that was named goes before those that lie there"
     inner = tmp_path / "inner"
     inner.mkdir()

@@ -20,6 +20,7 @@ from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.stacks.capture_bundle import is_bundle, read_bundle, write_bundle
 from mrbokeh.system.errors import InputError
 from tests.scenes.command_line import mrbokeh
+from tests.scenes.refusals import refused
 from viewfinder.app.live_compositor import CompositedFrame, LiveCompositor
 from viewfinder.app.live_controls import Captures
 from viewfinder.frames import CameraFrame, FrameStatus, OutputFrame
@@ -63,8 +64,7 @@ def test_a_bundle_composites_like_its_parts(bundle: Path, tmp_path: Path) -> Non
 
 
 def test_a_folder_appears_whole_or_not_at_all(bundle: Path) -> None:
-    with pytest.raises(InputError, match="exists already"):
-        write_bundle(bundle, b"", b"", [], LENS, CAMERA, "polygon", {})
+    refused("exists already", write_bundle, bundle, b"", b"", [], LENS, CAMERA, "polygon", {})
     with pytest.raises(TypeError):
         write_bundle(bundle.parent / "two", b"", b"", [], LENS, CAMERA, "polygon", {"not JSON": object()})
     assert [path.name for path in bundle.parent.iterdir()] == ["one"]
@@ -82,8 +82,7 @@ def test_a_folder_appears_whole_or_not_at_all(bundle: Path) -> None:
 def test_broken_bundles_are_refused(bundle: Path, change: dict[str, object], sentence: str) -> None:
     path = bundle / "bundle.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
-    with pytest.raises(InputError, match=sentence):
-        read_bundle(bundle)
+    refused(sentence, read_bundle, bundle)
 
 
 SMALL, LARGE = Camera(40, 30, (50.0, 52.0), (20.0, 15.0)), Camera(160, 120, (200.0, 208.0), (80.0, 60.0))
@@ -131,8 +130,7 @@ def test_a_track_that_was_lost_just_now_does_not_cost_the_picture(compositor: Co
     captures = Captures(tmp_path, compositor, "polygon")
     assert read_bundle(tmp_path / captures.capture()).facts["sequence"] == 10
     compositor.last = moment(2.5, False, 50)
-    with pytest.raises(InputError, match="pose is not known now"):
-        captures.capture()
+    refused("pose is not known now", captures.capture)
 
 
 def test_before_the_first_picture_there_is_nothing(compositor: Compositor, tmp_path: Path) -> None:

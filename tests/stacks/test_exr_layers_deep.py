@@ -19,6 +19,7 @@ from mrbokeh.stacks.exr_layers.sequence import ExrSequence
 from mrbokeh.system.errors import InputError
 from tests.scenes.deep_pixels_reference import DeepSample, flattened, split, tidied
 from tests.scenes.deep_pixels_reference import merged as merged_samples
+from tests.scenes.refusals import refused
 
 Pixels = dict[tuple[int, int], list[DeepSample]]
 
@@ -186,13 +187,10 @@ def test_windows_and_parts(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_read_says_so(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="there is none"):
-        DeepSamples.read(tmp_path / "none.exr")
+    refused("there is none", DeepSamples.read, tmp_path / "none.exr")
     (tmp_path / "bad.exr").write_bytes(b"bad")
-    with pytest.raises(InputError, match="cannot be read as EXR"):
-        DeepSamples.read(tmp_path / "bad.exr")
-    with pytest.raises(InputError, match="cannot be read as EXR"):
-        is_deep(tmp_path / "bad.exr")
+    refused("cannot be read as EXR", DeepSamples.read, tmp_path / "bad.exr")
+    refused("cannot be read as EXR", is_deep, tmp_path / "bad.exr")
     with pytest.raises(InputError, match="1 deep samples have NaN"):
         DeepSamples.read(write_deep(tmp_path / "nan.exr", (1, 1), {(0, 0): [point(1, 0.5), point(math.nan, 0.5)]}))
     flat = write_deep(tmp_path / "noz.exr", (1, 1), {(0, 0): [point(1, 0.5)]})
@@ -201,8 +199,7 @@ def test_what_cannot_be_read_says_so(tmp_path: Path) -> None:
         OpenEXR.File([OpenEXR.Part({"type": OpenEXR.deepscanline, "compression": OpenEXR.ZIPS_COMPRESSION}, channels, "d")]).write(
             str(tmp_path / "z.exr")
         )
-    with pytest.raises(InputError, match="Z are missing"):
-        DeepSamples.read(tmp_path / "z.exr")
+    refused("Z are missing", DeepSamples.read, tmp_path / "z.exr")
 
 
 def test_a_sequence_of_deep_files_is_read_as_such(tmp_path: Path) -> None:
@@ -262,11 +259,9 @@ def test_layers_written_deep_flatten_to_the_same(tmp_path: Path, half: bool) -> 
     np.testing.assert_allclose(read.rgb, flat.rgb, rtol=tolerance, atol=tolerance)
     np.testing.assert_allclose(read.alpha, flat.alpha, atol=tolerance)
     for wrong in ([], [layers[0], Layer(flame.rgb[:3], flame.alpha[:3], flame.depth_m[:3])]):
-        with pytest.raises(InputError, match="layers of one size"):
-            write_deep_exr(tmp_path / "b.exr", wrong)
+        refused("layers of one size", write_deep_exr, tmp_path / "b.exr", wrong)
 
 
 def test_only_pictures_of_one_size_are_merged(tmp_path: Path) -> None:
     one, other = (DeepSamples.read(write_deep(tmp_path / f"{w}.exr", (1, w), {(0, 0): [point(1, 0.5)]})) for w in (1, 2))
-    with pytest.raises(InputError, match="one size"):
-        merged([one, other])
+    refused("one size", merged, [one, other])

@@ -13,9 +13,9 @@ from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.shots.inputs import Moment
 from mrbokeh.shots.layer_sources import AmongDeep, LayerFiles, sources_by_depth
 from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, cut_at, interleaved, merged, peeled
-from mrbokeh.system.errors import InputError
 from tests.scenes.command_line import printed_by
 from tests.scenes.deep_pixels_reference import DeepSample, flattened, tidied
+from tests.scenes.refusals import refused
 from tests.stacks.test_exr_layers_deep import Pixels, fog, point, random_pixels, write_deep
 
 SIZE = (6, 9)
@@ -84,10 +84,8 @@ def test_two_flat_layers_keep_their_order(tmp_path: Path) -> None:
 
 
 def test_sizes_are_compared(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="4x4 px but the deep picture is 9x6 px"):
-        interleaved([deep(tmp_path, {(0, 0): [point(1.0, 1.0)]})], [sheet(1.0, size=(4, 4))])
-    with pytest.raises(InputError, match="expected a deep picture"):
-        interleaved([], [sheet(1.0)])
+    refused("4x4 px but the deep picture is 9x6 px", interleaved, [deep(tmp_path, {(0, 0): [point(1.0, 1.0)]})], [sheet(1.0, size=(4, 4))])
+    refused("expected a deep picture", interleaved, [], [sheet(1.0)])
 
 
 def test_real_deep_pictures_by_the_command(shared_data: Path, tmp_path: Path) -> None:
@@ -134,5 +132,4 @@ def test_clips_put_deep_files_among_others_too(tmp_path: Path) -> None:
     assert [round(float(layer.depth_m[2, 3]), 1) for layer in layers] == [1.0, 3.0, 5.0]
     assert all(one is other for one, other in zip(layers, opened.layers_at(moment, None), strict=True))
     assert sources_by_depth(files[1:], ()) == (files[1],)
-    with pytest.raises(InputError, match="9x6 px but the clip is 8x6 px"):
-        opened.layers_at(Moment(0, 0.0, (8, 6)), None)
+    refused("9x6 px but the clip is 8x6 px", opened.layers_at, Moment(0, 0.0, (8, 6)), None)

@@ -10,7 +10,7 @@ from mrbokeh.compositing.plate import open_plate
 from mrbokeh.images.color import srgb_to_linear
 from mrbokeh.images.exif import as_stored, upright
 from mrbokeh.stacks.photograph import read_photograph
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 shared = pytest.mark.skipif(not DATA.is_dir(), reason="the photographs beside the project are not here")
@@ -76,5 +76,4 @@ def test_a_raw_file_is_developed() -> None:
 
 def test_without_metadata_the_lens_is_asked_for(tmp_path: Path) -> None:
     photo = saved(tmp_path / "photo.jpg", 1)
-    with pytest.raises(InputError, match=r"unknown: focal length, f-number, sensor width, focus distance.*--lens"):
-        open_plate(photo)
+    refused(r"unknown: focal length, f-number, sensor width, focus distance.*--lens", open_plate, photo)

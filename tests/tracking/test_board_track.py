@@ -15,7 +15,6 @@ from datasets_scripts.charuco_clip import HandHeld
 from mrbokeh.commands.track import app
 from mrbokeh.images.color import display_rgb8
 from mrbokeh.optics.camera import Camera, camera_to_json
-from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.board_calibration import calibrated
 from mrbokeh.tracking.camera_track.board_smoothing import Observation, steadied, steady_poses, whittaker
 from mrbokeh.tracking.camera_track.board_track import RollingCorners, TrackSettings, Undistorting, poses_of, track_board
@@ -24,6 +23,7 @@ from mrbokeh.tracking.camera_track.track import CameraTrack
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, write_board
 from mrbokeh.tracking.charuco.detector import Corners
 from tests.scenes.command_line import printed_by
+from tests.scenes.refusals import refused
 from tests.scenes.traced_board_clip import BOARD, MOTION, clip_of, pose_error, tilted_views
 from tests.scenes.video_files import filmed, turned_clip
 
@@ -71,14 +71,12 @@ def test_longer_gaps_and_boards_that_are_not_there_are_told(clip: Path) -> None:
     """Intrinsics of pictures twice as large serve as well."""
     tracked = track_board(clip, BOARD, true_camera(0, 640), settings=TrackSettings(longest_gap=2))
     assert tracked.lost == HIDDEN and tracked.bridged == () and 7 not in tracked.track.frames
-    with pytest.raises(InputError, match="not frame 7"):
-        tracked.track.at(7)
+    refused("not frame 7", tracked.track.at, 7)
     once = level_track(clip)
     np.testing.assert_allclose(tracked.track.at(3).camera.camera_from_world, once.at(3).camera.camera_from_world, atol=1e-9)
     assert tracked.track.size_px == (320, 180)
     other = CharucoBoard((CharucoGrid((5, 5), 40.0, 30.0, first_marker=40),), "DICT_5X5_100")
-    with pytest.raises(InputError, match="found in 0 of 16 frames"):
-        track_board(clip, other, true_camera(0))
+    refused("found in 0 of 16 frames", track_board, clip, other, true_camera(0))
 
 
 @pytest.mark.parametrize("turn_deg", [90, -90])
@@ -195,10 +193,8 @@ def test_calibration_finds_focal_length_principal_point_and_distortion_where_the
     assert abs(found.camera.focal_px[0] - 600.0) < 4.0 * found.focal_sigma * 600.0 + 1.0
     found = calibrated(BOARD, tilted_views(BOARD, np.linspace(-40, 40, 24), 0.42), 640, 360)
     assert abs(found.distortion.get("k1", 0.0)) < 0.02
-    with pytest.raises(InputError, match="too few angles"):
-        calibrated(BOARD, tilted_views(BOARD, np.zeros(12), 0.42, sigma_px=0.3), 640, 360)
-    with pytest.raises(InputError, match="only 2 frames"):
-        calibrated(BOARD, tilted_views(BOARD, np.array([10.0, 20.0]), 0.42), 640, 360)
+    refused("too few angles", calibrated, BOARD, tilted_views(BOARD, np.zeros(12), 0.42, sigma_px=0.3), 640, 360)
+    refused("only 2 frames", calibrated, BOARD, tilted_views(BOARD, np.array([10.0, 20.0]), 0.42), 640, 360)
 
 
 def test_the_command_writes_a_track_that_converts(clip: Path, tmp_path: Path) -> None:
@@ -207,8 +203,7 @@ def test_the_command_writes_a_track_that_converts(clip: Path, tmp_path: Path) ->
     (tmp_path / "camera.json").write_text(json.dumps(camera_to_json(true_camera(0))))
     known = ("--board", tmp_path / "board.json", "--camera", tmp_path / "camera.json", "--out", tmp_path / "track.json")
     assert "seen in 13 of 16 frames (81.2 %), 3 bridged (6-8); reprojection 0.0" in printed_by(app, "clip", clip, *known)
-    with pytest.raises(InputError, match="--overwrite"):
-        printed_by(app, "clip", clip, *known)
+    refused("--overwrite", printed_by, app, "clip", clip, *known)
     told = printed_by(app, "convert", tmp_path / "track.json", tmp_path / "track.chan", "--frame-offset", 1001)
     assert "lacks: times" in told and "16 frames, 1001 to 1016" in told
     back = (tmp_path / "track.chan", tmp_path / "back.json")
@@ -228,8 +223,7 @@ def test_the_command_writes_a_track_that_converts(clip: Path, tmp_path: Path) ->
 )
 def test_mistakes_end_in_a_sentence(clip: Path, tmp_path: Path, arguments: tuple[str, ...], says: str) -> None:
     write_board(tmp_path / "board.json", BOARD)
-    with pytest.raises(InputError, match=says):
-        printed_by(app, "clip", clip, "--board", tmp_path / "board.json", "--out", tmp_path / "track.json", *arguments)
+    refused(says, printed_by, app, "clip", clip, "--board", tmp_path / "board.json", "--out", tmp_path / "track.json", *arguments)
     assert not (tmp_path / "track.json").exists()
 
 

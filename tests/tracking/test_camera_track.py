@@ -16,6 +16,7 @@ from mrbokeh.tracking.camera_track.formats import write_track
 from mrbokeh.tracking.camera_track.track import DISTORTION_NAMES, CameraTrack, TrackedFrame, fixed_track
 from mrbokeh.tracking.world_axes import UPRIGHT_FROM_WORLD, upright_camera
 from tests.scenes.command_line import printed_by
+from tests.scenes.refusals import refused
 from tests.scenes.video_files import filmed
 
 
@@ -66,8 +67,7 @@ def test_outside_its_times_and_frames_the_track_says_so() -> None:
 
 def test_times_follow_from_a_frame_rate_and_a_fixed_camera_stands_for_every_frame() -> None:
     timed = replace(two_frames(), frames={n: replace(f, time_s=None) for n, f in two_frames().frames.items()})
-    with pytest.raises(InputError, match="no times"):
-        timed.at_time(0.5)
+    refused("no times", timed.at_time, 0.5)
     assert timed.timed(48.0).at_time(0.5).time_s == 0.5
     assert timed.shifted(1001).numbers == [1001, 1025]
     track = fixed_track(camera_at((0.0, 0.0, -2.0), Rotation.identity()))
@@ -95,10 +95,8 @@ def test_tracks_that_cannot_be_are_refused() -> None:
         ({0: one, 1: replace(one, camera=one.camera.resized(64, 36))}, "-y", "need one size"),
         ({0: mirrored}, "-y", "a rotation and a shift"),
     ):
-        with pytest.raises(InputError, match=says):
-            CameraTrack(frames, up)
-    with pytest.raises(InputError, match="lens distortion is given by k1"):
-        TrackedFrame(one.camera, distortion={"kappa": 0.1})
+        refused(says, CameraTrack, frames, up)
+    refused("lens distortion is given by k1", TrackedFrame, one.camera, distortion={"kappa": 0.1})
 
 
 LEVEL = Intrinsics(Camera(640, 360, (600.0, 620.0), (330.0, 170.0)), {"k1": -0.1, "p1": 0.01, "p2": -0.02, "k3": 0.03})
@@ -145,8 +143,7 @@ def test_another_size_of_the_same_shape_is_taken_and_another_shape_refused() -> 
     found = intrinsics_of_clip(LEVEL, (180, 320), 3, CLIP).camera
     assert found.focal_px == (310.0, 300.0)
     for size_px, turns in (((640, 480), 0), ((360, 640), 0), ((480, 640), 1)):
-        with pytest.raises(InputError, match=f"clip.mov .{size_px[0]}x{size_px[1]}., got those of 640x360"):
-            intrinsics_of_clip(LEVEL, size_px, turns, CLIP)
+        refused(f"clip.mov .{size_px[0]}x{size_px[1]}., got those of 640x360", intrinsics_of_clip, LEVEL, size_px, turns, CLIP)
 
 
 CAMERA = Camera(160, 112, (100.0, 100.0), (80.5, 56.5))

@@ -9,9 +9,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mrbokeh.optics.camera import Camera, camera_to_json
-from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.formats import FORMATS, read_track, write_track
 from mrbokeh.tracking.camera_track.track import ROTATION_ORDERS, CameraTrack, TrackedFrame, TrackOptions
+from tests.scenes.refusals import refused
 
 SIZE_PX = (640, 360)
 NAMES = {"json": "track.json", "chan": "track.chan", "nerfstudio": "transforms.json", "opentrackio": "track.jsonl"}
@@ -91,8 +91,7 @@ def test_chan_by_hand_and_in_its_order_of_rotations(tmp_path: Path) -> None:
     pose = read_track(tmp_path / "a.chan", TrackOptions(size_px=SIZE_PX)).at(0).camera.world_from_camera
     np.testing.assert_allclose(pose[:3, :3] @ np.diag([1.0, -1.0, -1.0]), about_y @ about_x @ about_z, atol=1e-12)
     (tmp_path / "a.chan").write_text("0 0 0 0 0 0 0 45\n")
-    with pytest.raises(InputError, match="--size"):
-        read_track(tmp_path / "a.chan")
+    refused("--size", read_track, tmp_path / "a.chan")
 
 
 def test_nerfstudio_by_hand(tmp_path: Path) -> None:
@@ -174,13 +173,11 @@ def test_a_cut_off_colmap_model_and_fisheyes_end_in_a_sentence(tmp_path: Path) -
     whole = (tmp_path / "images.bin").read_bytes()
     for length in (0, 5, 8, 30, 80, len(whole) - 1):
         (tmp_path / "images.bin").write_bytes(whole[:length])
-        with pytest.raises(InputError, match="cut off"):
-            read_track(tmp_path)
+        refused("cut off", read_track, tmp_path)
     (tmp_path / "fisheye").mkdir()
     (tmp_path / "fisheye" / "cameras.txt").write_text("1 OPENCV_FISHEYE 200 100 50 50 100 50 0 0 0 0\n")
     (tmp_path / "fisheye" / "images.txt").write_text("1 1 0 0 0 0 0 4 1 a.png\n\n")
-    with pytest.raises(InputError, match="OPENCV_FISHEYE: undistort"):
-        read_track(tmp_path / "fisheye")
+    refused("OPENCV_FISHEYE: undistort", read_track, tmp_path / "fisheye")
 
 
 def opentrackio_sample(**lens: object) -> dict[str, object]:
@@ -214,8 +211,7 @@ def test_opentrackio_distortion_is_in_millimetres(tmp_path: Path) -> None:
     assert told == pytest.approx({"k1": -0.1, "k4": 0.05, "k2": 0.00625, "p1": 0.001})
     backwards = [{"radial": [-4e-5]}]
     (tmp_path / "a.json").write_text(json.dumps(opentrackio_sample(distortion=backwards)))
-    with pytest.raises(InputError, match="Brown-Conrady D-U"):
-        read_track(tmp_path / "a.json")
+    refused("Brown-Conrady D-U", read_track, tmp_path / "a.json")
     assert read_track(tmp_path / "a.json", TrackOptions(keep_distortion=False)).at(0).distortion is None
 
 
@@ -261,5 +257,4 @@ def test_our_file_keeps_everything_and_a_single_camera_is_a_tripod(tmp_path: Pat
 )
 def test_mistakes_end_in_one_sentence(tmp_path: Path, name: str, text: str, says: str) -> None:
     (tmp_path / name).write_text(text)
-    with pytest.raises(InputError, match=says):
-        read_track(tmp_path / name, TrackOptions(size_px=SIZE_PX))
+    refused(says, read_track, tmp_path / name, TrackOptions(size_px=SIZE_PX))

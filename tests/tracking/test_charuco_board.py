@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, black_rectangles_mm, read_board, write_board
 from mrbokeh.tracking.charuco.detector import CharucoDetector
+from tests.scenes.refusals import refused
 
 EVEN = CharucoBoard((CharucoGrid((5, 4), 24.0, 18.0),), legacy=True)
 ODD = CharucoBoard((CharucoGrid((4, 5), 24.0, 18.0),), legacy=True)
@@ -58,5 +58,4 @@ def test_json_and_toml_tell_of_the_same_board(tmp_path: Path) -> None:
 )
 def test_what_is_no_board_is_refused_with_a_sentence(tmp_path: Path, text: str, sentence: str) -> None:
     (tmp_path / "board.toml").write_text(text)
-    with pytest.raises(InputError, match=sentence):
-        read_board(tmp_path / "board.toml")
+    refused(sentence, read_board, tmp_path / "board.toml")
