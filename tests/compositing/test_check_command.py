@@ -25,6 +25,7 @@ from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.writer import VideoWriter
+from tests.scenes.refusals import refused
 
 LENS = Lens(50.0, 2.0, 1.0, 2.2)
 SIZE = (48, 72)
@@ -176,8 +177,7 @@ def test_the_lens_tells_the_reach_where_the_blurred_layer_is_not_kept(files: dic
     write_image(files["out"], picture, half=False)
     run(files["out"], *settings, expected=1)
     assert kinds(json.loads(files["json"].read_text())) == {"leak"}
-    with pytest.raises(InputError, match="--sharp"):
-        run(files["out"], "--lens", files["lens"], expected=2)
+    refused("--sharp", run, files["out"], "--lens", files["lens"], expected=2)
 
 
 def test_layered_exr_brings_its_layers(files: dict[str, Path]) -> None:
@@ -201,8 +201,7 @@ def test_what_cannot_be_read_is_one_sentence(files: dict[str, Path], tmp_path: P
         with pytest.raises(InputError):
             run(tmp_path / path, expected=2)
     write_image(tmp_path / "small.exr", photo()[:20])
-    with pytest.raises(InputError, match="its plate 72x20 px"):
-        run(files["out"], "--against", tmp_path / "small.exr", expected=2)
+    refused("its plate 72x20 px", run, files["out"], "--against", tmp_path / "small.exr", expected=2)
 
 
 def test_codes_are_compared_as_if_all_were_encoded() -> None:
@@ -258,8 +257,7 @@ def test_layers_may_come_one_for_each_picture(tmp_path: Path) -> None:
     found = report_of(out, plate, tmp_path / "b.json", 1, "--virtual", tmp_path / "virtual")
     assert [(each["check"], each["where"]) for each in found["findings"]] == [("leak", "shot.0002.exr")]
     (tmp_path / "virtual" / "v.2.exr").unlink()
-    with pytest.raises(InputError, match="one for each"):
-        report_of(out, plate, tmp_path / "c.json", 2, "--virtual", tmp_path / "virtual")
+    refused("one for each", report_of, out, plate, tmp_path / "c.json", 2, "--virtual", tmp_path / "virtual")
 
 
 def test_one_jump_a_frozen_frame_missing_and_damaged_ones_are_found(tmp_path: Path) -> None:

@@ -19,9 +19,9 @@ from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.stacks.exr_layers.composite_exr import write_deep_exr
 from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
-from mrbokeh.system.errors import InputError
 from tests.house.test_user_mistakes import said
 from tests.scenes.composite_exr_reader import read_composite_exr
+from tests.scenes.refusals import refused
 
 HEIGHT, WIDTH = 96, 144
 LENS = Lens(35.0, 2.0, 2.0, 23.5)
@@ -84,8 +84,7 @@ def test_a_matte_with_its_distance_does_without_depth(files: Path) -> None:
     assert row[35] < 0.5 and row[60] > 0.9
     # Two neighbours of the noise, meaned over three colours, differ by 0.016 (one sigma).
     assert (np.diff(row[44:54]) > -0.07).all() and changed(picture, sharp)[50, 44:54].any()
-    with pytest.raises(InputError, match="for the mode between"):
-        put_in(files, "--matte", files / "near.png", "--near-distance", "0.8", "--mode", "over")
+    refused("for the mode between", put_in, files, "--matte", files / "near.png", "--near-distance", "0.8", "--mode", "over")
 
 
 @pytest.mark.parametrize("mode", ["front", "over", "matte", "between"])
@@ -114,10 +113,8 @@ def test_sharp_layers_go_out_as_a_deep_picture(files: Path) -> None:
     # Put in again it gives the same picture.
     again = put_in(files, card="virtual.exr")
     np.testing.assert_allclose(again, put_in(files, "--layer", files / "behind.exr"), atol=2e-3)
-    with pytest.raises(InputError, match="--deep-out: expected a name"):
-        put_in(files, "--deep-out", files / "virtual.png")
-    with pytest.raises(InputError, match="exists already"):
-        put_in(files, "--deep-out", files / "virtual.exr")
+    refused("--deep-out: expected a name", put_in, files, "--deep-out", files / "virtual.png")
+    refused("exists already", put_in, files, "--deep-out", files / "virtual.exr")
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ from mrbokeh.compositing.plate import Inserted, plate_of
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 LENS = Lens(50.0, 2.0, 1.0, 36.0)
 SIZE = (48, 64)
@@ -33,8 +33,7 @@ def test_an_object_replaces_the_photograph_where_it_touches_it_alone() -> None:
     np.testing.assert_array_equal(found.rgb[untouched], photo()[untouched])
     picture = inserted(photo(), card(1.0)).rgb
     np.testing.assert_allclose(picture[13:35, 21:43], np.broadcast_to(np.float32([0.8, 0.1, 0.1]), (22, 22, 3)), atol=1e-6)
-    with pytest.raises(InputError, match="virtual layer is 64x48 px but the photograph is 10x10 px"):
-        inserted(np.zeros((10, 10, 3), np.float32), card(1.0))
+    refused("virtual layer is 64x48 px but the photograph is 10x10 px", inserted, np.zeros((10, 10, 3), np.float32), card(1.0))
 
 
 def test_the_photographed_scene_hides_what_is_behind_it_in_part_or_whole() -> None:

@@ -16,6 +16,7 @@ from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 LENS = Lens(100.0, 1.0, 1.0, 36.0)  # 20 px of blur per dioptre at 64 px
 WIDE = Lens(50.0, 1.4, 1.0, 36.0)
@@ -55,8 +56,7 @@ def test_no_layers_or_pixels_without_virtual_light_give_the_plate_bit_for_bit(mo
     assert not found.virtual.alpha.any()
     picture = inserted(mode, [card(1.0)], plate()).rgb
     np.testing.assert_allclose(picture[16:32, 24:40], np.broadcast_to(np.float32(RED), (16, 16, 3)), atol=2e-4)
-    with pytest.raises(InputError, match="virtual layer is 10x10 px but the photograph is 64x48 px"):
-        inserted(mode, [card(1.0, size=(10, 10))], plate())
+    refused("virtual layer is 10x10 px but the photograph is 64x48 px", inserted, mode, [card(1.0, size=(10, 10))], plate())
 
 
 @each_mode
@@ -158,8 +158,7 @@ def test_the_matte_is_eroded_and_smoothed_and_without_filters_occlusion_by_depth
     photo, layer = plate(depth_m), card(1.3)
     plain = OverPhotograph().insert(photo, [layer], ScatterReference()).rgb
     np.testing.assert_allclose(SmoothedMatte(0, 0.0).insert(photo, [layer], ScatterReference()).rgb, plain, atol=1e-6)
-    with pytest.raises(InputError, match="pixels from 0 up, got erosion -1"):
-        SmoothedMatte(erode_px=-1)
+    refused("pixels from 0 up, got erosion -1", SmoothedMatte, erode_px=-1)
 
 
 @pytest.mark.parametrize("changed", [SmoothedMatte(erode_px=3), SmoothedMatte(sigma_px=2.0)])
@@ -179,5 +178,4 @@ def test_blurring_anew_needs_the_sharp_scene_and_shows_near_things_before_the_la
     np.testing.assert_allclose(picture[24, 22:28], photo.rgb[24, 22:28], atol=2e-3)
     np.testing.assert_allclose(picture[24, 35:38], np.broadcast_to(np.float32(RED), (3, 3)), atol=2e-2)
     assert DEFAULT_MODE in MODES
-    with pytest.raises(InputError, match="front, over, matte, between, rerender, got 'under'"):
-        insertion_of("under")
+    refused("front, over, matte, between, rerender, got 'under'", insertion_of, "under")

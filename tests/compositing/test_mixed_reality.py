@@ -21,9 +21,9 @@ from datasets_scripts.mixed_reality import (
 )
 from datasets_scripts.scenes.truth_scenes import make_scene
 from datasets_scripts.tracers.truth_scene import pack
-from mrbokeh.system.errors import InputError
 from tests.scenes.card_scene import FOCUS_CARD, mixed_cards
 from tests.scenes.mixed_reality_cases import traced_cases
+from tests.scenes.refusals import refused
 from tests.scenes.scalar_truth_tracer import require_mitsuba
 
 virtual_objects = cache(virtual_object)
@@ -75,8 +75,7 @@ def test_a_complete_set_is_left_alone_and_other_settings_are_refused(folder: Pat
     (view / "both" / "disc_1.exr").unlink()
     assert mixed_reality(folder, PLAN) == 1 and mixed_reality(folder, PLAN) == 0
     assert (view / "object.exr").stat().st_mtime_ns == kept and (view / "sheet.png").is_file()
-    with pytest.raises(InputError, match="made with other settings"):
-        mixed_reality(folder, replace(PLAN, samples=8))
+    refused("made with other settings", mixed_reality, folder, replace(PLAN, samples=8))
 
 
 def test_where_the_object_does_not_reach_both_pictures_are_one(folder: Path) -> None:

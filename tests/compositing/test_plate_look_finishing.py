@@ -22,6 +22,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 from tests.compositing.test_plate_look_grain import READ, SHOT, smooth_scene, unit_noise
+from tests.scenes.refusals import refused
 
 SIZE = (256, 384)
 LENS = Lens(50.0, 2.0, 1.0, 36.0)
@@ -94,10 +95,8 @@ def test_a_finishing_or_a_layer_that_is_nothing_gives_back_what_came() -> None:
     plate = scene_plate()
     with pytest.raises(InputError, match="expected the plate that was inserted into"):
         finished(put_in(plate, soft_disc()), plate_of(np.zeros((8, 8, 3), np.float32), LENS), ALL)
-    with pytest.raises(InputError, match="strength 0 to 1"):
-        LightWrap(1.5)
-    with pytest.raises(InputError, match="radius above 0"):
-        LightWrap(0.5, 0.0)
+    refused("strength 0 to 1", LightWrap, 1.5)
+    refused("radius above 0", LightWrap, 0.5, 0.0)
 
 
 def test_behind_an_insertion_untouched_pixels_are_those_of_the_plate() -> None:

@@ -10,8 +10,8 @@ from mrbokeh.compositing.plate_look.finishing import Finishing, LightWrap, LookO
 from mrbokeh.compositing.plate_look.grain import measured_grain, write_grain
 from mrbokeh.compositing.plate_look.vignetting import CameraAndLens, FlatField, RadialFalloff, lensfun_falloff
 from mrbokeh.images.image_io import write_image
-from mrbokeh.system.errors import InputError
 from tests.compositing.test_plate_look_grain import plate, smooth_scene
+from tests.scenes.refusals import refused
 
 LENS_MODEL = "Canon EF 100mm f/2.8L Macro IS USM"
 
@@ -98,14 +98,11 @@ def test_vignetting_by_coefficients_flat_field_and_lensfun_and_light_wrap(frames
     ],
 )
 def test_mistakes_are_told(options: LookOptions, message: str, frames: tuple[np.ndarray, np.ndarray]) -> None:
-    with pytest.raises(InputError, match=message):
-        finishing_of(options, frames[0])
+    refused(message, finishing_of, options, frames[0])
 
 
 def test_photographs_that_name_no_lens_are_refused(tmp_path: Path, frames: tuple[np.ndarray, np.ndarray], shared_data: Path) -> None:
     options = LookOptions(vignetting="auto")
-    with pytest.raises(InputError, match="name camera and lens"):
-        finishing_of(options, frames[0], shared_data / "exif" / "canon_450d_4.6m.jpg")
+    refused("name camera and lens", finishing_of, options, frames[0], shared_data / "exif" / "canon_450d_4.6m.jpg")
     (tmp_path / "text.jpg").write_text("no picture")
-    with pytest.raises(InputError, match="expected a photograph with Exif"):
-        finishing_of(options, frames[0], tmp_path / "text.jpg")
+    refused("expected a photograph with Exif", finishing_of, options, frames[0], tmp_path / "text.jpg")

@@ -21,6 +21,7 @@ from mrbokeh.images.image_io import write_image
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.pixel_box import Box
 from mrbokeh.system.errors import InputError, MissingExtraError
+from tests.scenes.refusals import refused
 
 FRAME = (112, 160)
 WHOLE = Box(0, 112, 0, 160)
@@ -75,12 +76,9 @@ def test_text_and_files(tmp_path: Path) -> None:
 
 def test_falloffs_that_cannot_be_are_refused() -> None:
     for text in ("", "a", "1,2,3,4", "nan"):
-        with pytest.raises(InputError, match="--vignetting: expected K1,K2,K3"):
-            RadialFalloff.parse(text)
-    with pytest.raises(InputError, match="leaves light in the corners"):
-        RadialFalloff(-1.2)
-    with pytest.raises(InputError, match="bright in the middle"):
-        flat_field_of(np.zeros((*FRAME, 3), np.float32))
+        refused("--vignetting: expected K1,K2,K3", RadialFalloff.parse, text)
+    refused("leaves light in the corners", RadialFalloff, -1.2)
+    refused("bright in the middle", flat_field_of, np.zeros((*FRAME, 3), np.float32))
 
 
 @pytest.mark.parametrize("camera", ["Canon EOS 450D", "Canon EOS 5D Mark II"])
@@ -102,8 +100,7 @@ def test_lensfun_measurements_darken_as_lensfun_says(camera: str) -> None:
 
 def test_what_lensfun_does_not_know_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("lensfunpy")
-    with pytest.raises(InputError, match="does not know the camera Nobody None"):
-        lensfun_falloff(CameraAndLens("Nobody", "None", "x"), 50.0, 2.0)
+    refused("does not know the camera Nobody None", lensfun_falloff, CameraAndLens("Nobody", "None", "x"), 50.0, 2.0)
     with pytest.raises(InputError, match="has no vignetting of Noctilux of nowhere"):
         lensfun_falloff(CameraAndLens("Canon", "Canon EOS 450D", "Noctilux of nowhere"), 50.0, 2.0)
     monkeypatch.setitem(sys.modules, "lensfunpy", None)

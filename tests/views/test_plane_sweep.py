@@ -20,9 +20,9 @@ from capture.dense.plane_sweep import (
 )
 from capture.dense.sweep_view import BRIGHTEST, SweepView, structure_of
 from mrbokeh.optics.camera import Camera
-from mrbokeh.system.errors import InputError
 from tests.scenes.dense_references import scores_of_surface
 from tests.scenes.plane_sweep_scenes import FOCAL_PX, card, traced, wall
+from tests.scenes.refusals import refused
 
 INNER = np.s_[8:-8, 12:-12]
 
@@ -82,10 +82,8 @@ def test_neighbours_of_little_parallax_come_first_and_those_of_none_are_refused(
 
     others = [moved(0.2), moved(0.001), moved(0.06)]
     assert by_parallax(view, others, (0.5, 1.5)) == [others[2], others[0], others[1]]
-    with pytest.raises(InputError, match="parallax"):
-        dioptre_planes(view, [view], (0.4, 2.0))
-    with pytest.raises(InputError, match="neighbouring view"):
-        plane_sweep(view, [], np.array([1.0]))
+    refused("parallax", dioptre_planes, view, [view], (0.4, 2.0))
+    refused("neighbouring view", plane_sweep, view, [], np.array([1.0]))
 
 
 def test_a_wall_is_found_at_its_dioptre_and_cost_is_least_there() -> None:

@@ -33,6 +33,7 @@ from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack
 from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError, MissingExtraError
 from tests.scenes.command_line import printed_by
+from tests.scenes.refusals import refused
 
 needs_colmap = pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap (extra `capture`) is not installed")
 
@@ -71,8 +72,7 @@ def test_pictures_of_one_size_share_a_camera_and_five_of_them_a_second_term(tmp_
     files = pictures_in(tmp_path)
     assert picture_cameras(files[:2], "auto")[0] == [0, 0]
     assert picture_cameras(files, "auto")[0] == [0, 1, 2]
-    with pytest.raises(InputError, match="pictures of one size"):
-        picture_cameras(files, "shared")
+    refused("pictures of one size", picture_cameras, files, "shared")
     assert camera_model_for([0] * 5, "auto") == "RADIAL"
     assert camera_model_for([0] * 5 + [1], "auto") == "SIMPLE_RADIAL"
     assert camera_model_for([0], "RADIAL") == "RADIAL"
@@ -86,8 +86,7 @@ def test_terms_of_distortion_that_were_asked_for_are_not_left_out(
         cv2.imwrite(str(tmp_path / f"{name}.png"), np.zeros((30, 40, 3), np.uint8))
     nothing_found = {"pictures": 2, "pairs": 1, "good_pairs": 0, "forward": 0.0, "low_parallax": 0.0}
     monkeypatch.setattr(colmap, "run_colmap", lambda *_: nothing_found)
-    with pytest.raises(InputError, match="0 of 1 pairs"):
-        find_picture_poses(tmp_path, tmp_path / "out", PoseSettings(camera_model=asked))
+    refused("0 of 1 pairs", find_picture_poses, tmp_path, tmp_path / "out", PoseSettings(camera_model=asked))
     job = job_from_json(read_json(tmp_path / "out" / "colmap_job.json", "the job"))
     assert (job.camera_model, job.fewest_terms) == ("SIMPLE_RADIAL", fewest_terms)
 
@@ -152,8 +151,7 @@ def test_the_death_of_colmap_is_one_sentence(tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "images" / "a.png"), np.zeros((30, 40, 3), np.uint8))
     write_json(tmp_path / "colmap_job.json", job_to_json(ColmapJob((ColmapPicture("a", "a.png", "00", 0),), (None,))))
     (tmp_path / "database.db").write_bytes(b"this is no database" * 100)
-    with pytest.raises(InputError, match=r"COLMAP stopped with .* while finding features .*database"):
-        run_colmap(tmp_path, 1)
+    refused(r"COLMAP stopped with .* while finding features .*database", run_colmap, tmp_path, 1)
 
 
 def test_the_death_of_colmap_and_its_lack_are_one_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -161,8 +159,7 @@ def test_the_death_of_colmap_and_its_lack_are_one_sentence(tmp_path: Path, monke
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(colmap, "_WORKER", "dying_worker")
     monkeypatch.setattr(colmap, "find_spec", lambda name: name)
-    with pytest.raises(InputError, match="COLMAP stopped with SIGABRT while matching"):
-        run_colmap(tmp_path, 3)
+    refused("COLMAP stopped with SIGABRT while matching", run_colmap, tmp_path, 3)
     monkeypatch.setattr(colmap, "find_spec", {}.get)
     with pytest.raises(MissingExtraError, match=r"mrbokeh\[capture\]"):
         run_colmap(tmp_path, 3)
@@ -170,22 +167,16 @@ def test_the_death_of_colmap_and_its_lack_are_one_sentence(tmp_path: Path, monke
 
 def test_mistakes_are_named_and_finished_poses_kept(tmp_path: Path) -> None:
     stack_in(tmp_path / "scene" / "a")
-    with pytest.raises(InputError, match="one stack: camera poses need at least 2"):
-        find_scene_poses(tmp_path / "scene")
-    with pytest.raises(InputError, match="found 0"):
-        find_picture_poses(tmp_path, tmp_path / "out")
-    with pytest.raises(InputError, match="there is none"):
-        find_picture_poses(tmp_path / "nowhere", tmp_path / "out")
-    with pytest.raises(InputError, match="--mapper must be one of incremental, global"):
-        PoseSettings(mapper="sequential")
-    with pytest.raises(InputError, match="either a SCENE"):
-        printed_by(poses.poses_command, tmp_path, "--images", tmp_path)
+    refused("one stack: camera poses need at least 2", find_scene_poses, tmp_path / "scene")
+    refused("found 0", find_picture_poses, tmp_path, tmp_path / "out")
+    refused("there is none", find_picture_poses, tmp_path / "nowhere", tmp_path / "out")
+    refused("--mapper must be one of incremental, global", PoseSettings, mapper="sequential")
+    refused("either a SCENE", printed_by, poses.poses_command, tmp_path, "--images", tmp_path)
     # Nothing else is in the folder, so anything but reading would fail.
     kept = tmp_path / "kept"
     write_sparse_model(kept / "reconstruction", seen_from([(0.0, 0.0, 0.0)], np.array([[0.0, 0.0, 1.0]])))
     assert find_scene_poses(kept).views[0].name == "v0"
-    with pytest.raises(InputError, match="capture ingest"):
-        find_scene_poses(kept, PoseSettings(overwrite=True))
+    refused("capture ingest", find_scene_poses, kept, PoseSettings(overwrite=True))
 
 
 @needs_colmap
@@ -278,15 +269,11 @@ def test_sparse_models_and_their_scale_survive_the_disk(tmp_path: Path) -> None:
 
 
 def test_broken_models_are_named(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="capture poses"):
-        read_sparse_model(tmp_path)
+    refused("capture poses", read_sparse_model, tmp_path)
     write_sparse_model(tmp_path, small_model())
     whole = (tmp_path / "points.npz").read_bytes()
     (tmp_path / "points.npz").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match=r"points\.npz"):
-        read_sparse_model(tmp_path)
-    with pytest.raises(InputError, match="2 views and 3 points"):
-        replace(small_model(), observations=np.array([[0, 3]]), observed_xy_px=np.zeros((1, 2)))
+    refused(r"points\.npz", read_sparse_model, tmp_path)
+    refused("2 views and 3 points", replace, small_model(), observations=np.array([[0, 3]]), observed_xy_px=np.zeros((1, 2)))
     (tmp_path / "poses.json").write_text("{}")
-    with pytest.raises(InputError, match="expected format"):
-        read_sparse_model(tmp_path)
+    refused("expected format", read_sparse_model, tmp_path)

@@ -24,8 +24,8 @@ from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.images.image_io import read_image
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
 from mrbokeh.system.atomic_files import write_json
-from mrbokeh.system.errors import InputError
 from tests.scenes.command_line import printed_by
+from tests.scenes.refusals import refused
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Made = tuple[list[Rgb], Rgb]
@@ -307,8 +307,6 @@ def test_strict_asks_for_every_gate_and_fails_on_a_fault_whatever_is_allowed(tmp
 @pytest.mark.parametrize("command", [report_command, process_command])
 def test_a_gate_that_nobody_knows_is_refused_before_the_work(command: Callable[..., None], tmp_path: Path) -> None:
     arguments = [tmp_path, *(["--out", tmp_path / "scene"] if command is process_command else [])]
-    with pytest.raises(InputError, match=r'"no seems".*"no seams"'):
-        printed_by(command, *arguments, "--strict", "--allow-absent", "no seems")
-    with pytest.raises(InputError, match="--strict"):
-        printed_by(command, *arguments, "--allow-absent", "no seams")
+    refused(r'"no seems".*"no seams"', printed_by, command, *arguments, "--strict", "--allow-absent", "no seems")
+    refused("--strict", printed_by, command, *arguments, "--allow-absent", "no seams")
     assert not (tmp_path / "report.html").exists() and not (tmp_path / "scene").exists()
