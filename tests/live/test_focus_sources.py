@@ -59,8 +59,7 @@ def test_what_a_frame_tells_holds_for_a_while() -> None:
     assert source.state(frame(0.0), None) == LensState()
     assert source.state(frame(0.1, LensState(2.0, 4.0)), None) == LensState(2.0, 4.0)
     assert source.state(frame(0.9, LensState(focus_distance_m=3.0)), None) == LensState(3.0, 4.0)
-    assert source.state(frame(1.8), None) == LensState(3.0, 4.0)
-    assert source.state(frame(2.0), None) == LensState()
+    assert source.state(frame(1.8), None) == LensState(3.0, 4.0) and source.state(frame(2.0), None) == LensState()
 
 
 def test_first_known_of_each_value() -> None:

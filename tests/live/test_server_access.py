@@ -78,8 +78,7 @@ async def test_a_token_is_exchanged_once_for_a_cookie_that_scripts_cannot_read()
         assert status == 403 and "used before" in body["error"]
         assert await status_of(second, "GET", made.url + "state") == 401
         # The next guest gets an invitation of his own, which the command line is told to print.
-        assert renewed == [Role.CONTROL]
-        assert sessions.invitation(Role.CONTROL) != token
+        assert renewed == [Role.CONTROL] and sessions.invitation(Role.CONTROL) != token
         assert (await entered(made, second, sessions.invitation(Role.CONTROL)))[0] == 200
 
 
@@ -162,8 +161,7 @@ async def test_too_many_requests_and_too_many_guesses_are_refused() -> None:
 def test_a_bucket_fills_with_time_and_each_address_has_its_own() -> None:
     now_s = [0.0]
     limit = RateLimit(per_s=2.0, burst=3.0, clock=lambda: now_s[0])
-    assert [limit.allows("a") for _ in range(4)] == [True, True, True, False]
-    assert limit.allows("b")
+    assert [limit.allows("a") for _ in range(4)] == [True, True, True, False] and limit.allows("b")
     now_s[0] = 0.5  # one event at two per second
     assert [limit.allows("a"), limit.allows("a")] == [True, False]
     now_s[0] = 100.0
@@ -209,8 +207,7 @@ def test_roles_of_paths() -> None:
 
 def test_hosts_and_origins() -> None:
     names = frozenset({"192.168.1.7", "box.local"})
-    assert host_name("BOX.local:8080") == "box.local"
-    assert host_name("[fe80::1]:80") == "fe80::1"
+    assert host_name("BOX.local:8080") == "box.local" and host_name("[fe80::1]:80") == "fe80::1"
     for malformed in (None, "", "[", "[::1", "x@box.local", "box.local;x", "box.local:x", "box.local:1:2", "[x]", "[::1::]"):
         assert host_name(malformed) is None, malformed
     assert objection({"Host": "box.local:1", "Origin": "https://box.local:1"}, names, opens_page=False) is None
@@ -222,8 +219,7 @@ def test_hosts_and_origins() -> None:
 def test_the_oldest_guest_leaves_when_too_many_came() -> None:
     sessions = Sessions()
     cookies = [sessions.enter(sessions.invitation(Role.VIEW))[0] for _ in range(65)]
-    assert sessions.role_of(cookies[0], None) is None
-    assert sessions.role_of(cookies[1], None) is Role.VIEW
+    assert sessions.role_of(cookies[0], None) is None and sessions.role_of(cookies[1], None) is Role.VIEW
 
 
 ROOT = Path(__file__).resolve().parents[2] / "viewfinder"

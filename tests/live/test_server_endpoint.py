@@ -163,8 +163,7 @@ def test_what_cannot_be_used_is_named(make_certificate: Make, tmp_path: Path) ->
 
 def test_what_is_printed_for_a_network(capsys: pytest.CaptureFixture[str]) -> None:
     """The QR code is drawn with half blocks, as long as nobody asks for none. A token that was used is followed by the next."""
-    sessions = Sessions()
-    url = "https://10.0.0.1:8080/"
+    sessions, url = Sessions(), "https://10.0.0.1:8080/"
     for qr in (True, False):
         endpoint = Endpoint(ListeningOptions(lan=True, qr=qr), "10.0.0.1", None, Access(sessions=sessions))
         endpoint.announce("viewfinder of x", url)

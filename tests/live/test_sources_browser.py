@@ -107,12 +107,11 @@ async def test_nobody_reads_and_nothing_piles_up() -> None:
         reader.stop()
         async with sending(url, Canvas(RED)):
             await comes_true(lambda: source._newest.waiting)
-            await asyncio.sleep(0.5)
+            await asyncio.sleep(0.3)
             receiver = receiver_of(source)
-            assert receiver.track._queue.qsize() <= 1
             # The buffer that releases on the marker is the one in use.
             assert type(receiver._RTCRtpReceiver__jitter_buffer).__name__ == "MarkerJitterBuffer"
-            assert source._newest.take(0.0)[0] > 3
+            assert receiver.track._queue.qsize() <= 1 and source._newest.take(0.0)[0] > 1
 
 
 def receiver_of(source: BrowserCameraSource) -> Any:
@@ -143,7 +142,7 @@ async def test_loss_and_reordering_on_the_way_cost_no_torn_picture(caplog: pytes
 
         receiver._handle_rtp_packet = lossy
         before = reader.sequences[-1]
-        await comes_true(lambda: len(lost) > 10 and reader.sequences[-1] > before + 30)
+        await comes_true(lambda: len(lost) > 10 and reader.sequences[-1] > before + 15)
         assert np.all(np.diff(reader.sequences) >= 1)
     assert not [each for each in caplog.records if "failed to decode" in each.getMessage()]
 
@@ -160,8 +159,7 @@ async def test_focus_and_pose_travel_with_the_frames() -> None:
         for bad in ("no json", "[]", '{"focusDistance": -1}', "x" * (LONGEST_MESSAGE + 1)):
             sender.channel.send(bad)
         await comes_true(lambda: len(sender.answers) == 4)
-        assert all(list(each) == ["error"] for each in sender.answers)
-        assert reader.newest.lens.focus_distance_m == 0.8
+        assert all(list(each) == ["error"] for each in sender.answers) and reader.newest.lens.focus_distance_m == 0.8
 
 
 async def test_a_camera_goes_is_replaced_and_comes_again() -> None:
@@ -184,27 +182,21 @@ async def test_a_camera_goes_is_replaced_and_comes_again() -> None:
 
 
 async def test_offers_that_make_no_sense_change_nothing() -> None:
-    source = BrowserCameraSource()
+    source, sdp = BrowserCameraSource(), {"Content-Type": "application/sdp"}
     async with serving(source) as (url, reader), sending(url, Canvas(RED)) as sender, aiohttp.ClientSession() as session:
         await comes_true(lambda: reader.shows(RED))
-        sdp = {"Content-Type": "application/sdp"}
         listener = aiortc.RTCPeerConnection(aiortc.RTCConfiguration(iceServers=[]))
         listener.addTransceiver("audio", direction="sendrecv")
         await listener.setLocalDescription(await listener.createOffer())
-        sound_only = listener.localDescription.sdp.encode()
-        cases = [
-            (b"v=0", sdp, 400),
-            (b"\xff\xfe not sdp", sdp, 400),
-            (b"", sdp, 400),
-            (b"v=0\r\nm=video x y\r\n", sdp, 400),
-            (sound_only, sdp, 400),
-            (b"x" * (LONGEST_OFFER_BYTES + 1), sdp, 413),
+        malformed = (b"v=0", b"\xff\xfe not sdp", b"", b"v=0\r\nm=video x y\r\n", listener.localDescription.sdp.encode())
+        too_large = (b"x" * (LONGEST_OFFER_BYTES + 1), sdp, 413)
+        for body, headers, status in (
+            *((each, sdp, 400) for each in malformed),
+            too_large,
             (b"{}", {"Content-Type": "application/json"}, 415),
-        ]
-        for body, headers, status in cases:
+        ):
             async with session.post(url + "/whip", data=body, headers=headers) as answer:
-                assert answer.status == status, body[:30]
-                assert "expected" in await answer.text()
+                assert answer.status == status and "expected" in await answer.text(), body[:30]
         async with session.patch(url + sender.location, data=b"") as answer:
             assert answer.status == 405
         before = reader.sequences[-1]
@@ -212,20 +204,15 @@ async def test_offers_that_make_no_sense_change_nothing() -> None:
         await listener.close()
 
 
-def test_orientations_point_where_the_camera_looks() -> None:
+def test_orientations_and_poses_become_ours() -> None:
     """A phone held upright towards the north has its screen's z to the south: turned about x by 90 degrees. Its camera looks north."""
     known = CameraKnowledge().told(json.dumps({"orientation": [math.sin(math.pi / 4), 0, 0, math.cos(math.pi / 4)]}))
     np.testing.assert_allclose(known.camera_from_world, np.eye(4), atol=1e-12)
     # Flat on a table, screen up, its top to the north, the camera looks down (+y of ours), the picture's top is north (+z).
     flat = CameraKnowledge().told('{"orientation": [0, 0, 0, 1]}').camera_from_world
-    np.testing.assert_allclose(flat[:3, :3] @ (0, 1, 0), (0, 0, 1), atol=1e-12)
-    np.testing.assert_allclose(flat[:3, :3] @ (0, 0, 1), (0, -1, 0), atol=1e-12)
-
-
-def test_webxr_poses_become_ours() -> None:
-    """A camera that WebXR turned 90 degrees to the left (about y up) looks along -x; what lies there is ahead of it."""
-    turned = [0, 0, -1, 0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 1]
-    pose = CameraKnowledge().told(json.dumps({"pose": turned})).camera_from_world
+    np.testing.assert_allclose(flat[:3, :3] @ np.array([(0, 1, 0), (0, 0, 1)]).T, np.array([(0, 0, 1), (0, -1, 0)]).T, atol=1e-12)
+    # A camera that WebXR turned 90 degrees to the left (about y up) looks along -x; what lies there is ahead of it.
+    pose = CameraKnowledge().told(json.dumps({"pose": [0, 0, -1, 0, 0, 1, 0, 0, 1, 0, 0, 0, 0, 0, 0, 1]})).camera_from_world
     np.testing.assert_allclose(pose @ (-2, 0, 0, 1), (0, 0, 2, 1), atol=1e-12)
 
 
@@ -236,23 +223,12 @@ def test_messages_keep_what_they_do_not_name() -> None:
     assert known.told('{"focusDistance": null, "orientation": null}') == CameraKnowledge()
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        '{"other": 1}',
-        '{"focusDistance": true}',
-        '{"focusDistance": NaN}',
-        '{"focusDistance": "near"}',
-        '{"pose": [1, 2]}',
-        '{"pose": [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}',
-        '{"pose": [-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}',
-        '{"pose": [1, 0, 0, 5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}',
-        '{"orientation": [0, 0, 0, 2]}',
-        '{"orientation": [0, 0, 0, Infinity]}',
-        '{"orientation": "north"}',
-        "[" * 4000,
-    ],
-)
-def test_messages_that_make_no_sense_are_refused(text: str) -> None:
-    with pytest.raises(InputError, match="expected"):
-        CameraKnowledge().told(text)
+def test_messages_that_make_no_sense_are_refused() -> None:
+    for text in (
+        '{"other": 1}', '{"focusDistance": true}', '{"focusDistance": NaN}', '{"focusDistance": "near"}', '{"pose": [1, 2]}',
+        '{"pose": [2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}', '{"pose": [-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}',
+        '{"pose": [1, 0, 0, 5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}', '{"orientation": [0, 0, 0, 2]}',
+        '{"orientation": [0, 0, 0, Infinity]}', '{"orientation": "north"}', "[" * 4000,
+    ):  # fmt: skip
+        with pytest.raises(InputError, match="expected"):
+            CameraKnowledge().told(text)

@@ -3,7 +3,8 @@ camera as far as it goes (it has no live view), a stand-in for its live view, an
 
 import json
 import time
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from threading import Event, Thread
@@ -43,11 +44,8 @@ def test_a_webcam_is_pulled_out_and_plugged_in_again(clip: Path) -> None:
     assert source.status is None
     frames = source.frames(stopping)
     before = [next(frames) for _ in range(3)]
-    sentences: list[str | None] = []
-    waiting = Thread(target=lambda: [sentences.append(source.status) or time.sleep(0.01) for _ in range(60)])
-    waiting.start()
-    after = next(frames)
-    waiting.join()
+    with noted(source) as sentences:
+        after = next(frames)
     assert [each.sequence for each in [*before, after]] == [0, 1, 2, 3]
     assert all(each.bgr.shape == (56, 80, 3) for each in [*before, after])
     assert {"camera 3 stopped giving pictures: plug it in again", "camera 3 is unplugged or in use: waiting for it"} <= set(sentences)
@@ -201,14 +199,24 @@ def test_a_tethered_camera_is_switched_off_and_on_again() -> None:
     source, stopping = Gphoto2PreviewSource(open_camera=open_next), Event()
     frames = source.frames(stopping)
     assert next(frames).lens == LensState(focus_distance_m=float("inf"))
-    seen: list[str | None] = []
-    watcher = Thread(target=lambda: [seen.append(source.status) or time.sleep(0.01) for _ in range(60)])
-    watcher.start()
-    after = next(frames)
-    watcher.join()
+    with noted(source) as seen:
+        after = next(frames)
     assert abs(int(after.bgr[5, 5, 0]) - 90) < 3 and after.sequence == 1 and source.status is None
     assert any("is away" in str(each) and "check the cable" in str(each) for each in seen) and "no camera is found" in seen
     frames.close()
+
+
+@contextmanager
+def noted(source: Any) -> Iterator[list[str | None]]:
+    """What its status says meanwhile."""
+    seen, ended = list[str | None](), Event()
+    thread = Thread(target=lambda: [seen.append(source.status) for _ in iter(lambda: ended.wait(0.005), True)])
+    thread.start()
+    try:
+        yield seen
+    finally:
+        ended.set()
+        thread.join()
 
 
 def test_no_camera_at_the_start_is_refused() -> None:

@@ -75,15 +75,13 @@ def test_a_half_written_photograph_is_not_shown(watched: tuple[Path, WatchedFold
                 assert shows(20)(next(frames))
         assert "waiting until it is whole" in str(source.status)
         file.write(data[-30:])
-    assert comes(frames, shows(120)).bgr.shape == (HEIGHT, WIDTH, 3)
-    assert source.status is None
+    assert comes(frames, shows(120)).bgr.shape == (HEIGHT, WIDTH, 3) and source.status is None
 
 
 def test_the_newest_counts_by_when_it_came(watched: tuple[Path, WatchedFolderSource, Iterator[CameraFrame]]) -> None:
     """Not by its date, which copying from a card keeps; a file that is written over counts as new; others do not."""
     folder, source, frames = watched
-    first = comes(frames, shows(20))
-    old = folder / "from_card.jpg"
+    first, old = comes(frames, shows(20)), folder / "from_card.jpg"
     old.write_bytes(encoded(".jpg", 70))
     os.utime(old, (1e9, 1e9))
     second = comes(frames, shows(70))
@@ -107,8 +105,7 @@ def test_an_empty_folder_and_one_that_goes_away_are_waited_for(tmp_path: Path) -
     (tmp_path / "away").rename(folder)
     assert source._newer() is None and "waiting for the first photograph" in str(source.status)
     (folder / "a.png").write_bytes(encoded(".png", 30))
-    assert source._newer() is None
-    assert source._newer() is not None and source.status is None
+    assert source._newer() is None and source._newer() is not None and source.status is None
     with pytest.raises(InputError, match="there is none at"):
         WatchedFolderSource(tmp_path / "absent")
 
@@ -116,8 +113,7 @@ def test_an_empty_folder_and_one_that_goes_away_are_waited_for(tmp_path: Path) -
 def test_exif_becomes_the_state_of_the_lens(tmp_path: Path) -> None:
     """50 mm at f/2.8, focused 1.05 m from the film plane: from the lens that is s with s + s f / (s - f) = 1.05 m, 0.9975 m less
     0.0026: (1.05 + sqrt(1.05^2 - 4 * 1.05 * 0.05)) / 2 = 0.9972 m."""
-    path = tmp_path / "shot.jpg"
-    exif = Image.Exif()
+    path, exif = tmp_path / "shot.jpg", Image.Exif()
     exif.get_ifd(0x8769).update({0x829D: 2.8, 0x920A: 50.0, 0x9206: 1.05})
     Image.fromarray(NOISE).save(path, exif=exif)
     lens = read_tethered(path, SizeLimit()).lens
@@ -142,8 +138,7 @@ def test_photographs_of_a_real_camera_say_how_they_were_focused(shared_data: Pat
 
 def test_photographs_stand_upright_in_8_bit(tmp_path: Path) -> None:
     """Orientation 6 of Exif: to be turned clockwise by a quarter. Grey TIFF of 16 bit keeps its upper 8."""
-    path = tmp_path / "turned.png"
-    exif = Image.Exif()
+    path, exif = tmp_path / "turned.png", Image.Exif()
     exif[0x0112] = 6
     Image.fromarray(NOISE).save(path, exif=exif)
     np.testing.assert_array_equal(read_tethered(path, SizeLimit()).bgr, np.rot90(NOISE, -1)[..., ::-1])
@@ -156,8 +151,7 @@ def test_photographs_stand_upright_in_8_bit(tmp_path: Path) -> None:
 
 def test_what_is_no_photograph_is_not_whole(tmp_path: Path) -> None:
     """Pillow puts the directory of an uncompressed TIFF first, so that only its pixels are missing while it is written."""
-    path = tmp_path / "x.jpg"
-    plain = BytesIO()
+    path, plain = tmp_path / "x.jpg", BytesIO()
     Image.fromarray(NOISE).save(plain, "tiff")
     for data in (b"", b"not a picture", encoded(".jpg", 9)[:-200], encoded(".jpg", 9)[:2], plain.getvalue()[:-200]):
         path.write_bytes(data)
@@ -196,18 +190,16 @@ def test_a_real_film_comes_upright_and_small(shared_data: Path) -> None:
 
 
 def test_sizes_keep_their_aspect_and_never_grow() -> None:
-    assert SizeLimit(640, 640).fit(1920, 1080) == (640, 360)
-    assert SizeLimit(height_px=360).fit(1080, 1920) == (202, 360)
-    assert SizeLimit(4000, 4000).fit(640, 480) == (640, 480)
-    assert SizeLimit().fit(3, 5) == (3, 5)
-    assert SizeLimit(1, 1).fit(4000, 3) == (1, 1)
+    for limit, size, fitted in (
+        (SizeLimit(640, 640), (1920, 1080), (640, 360)), (SizeLimit(height_px=360), (1080, 1920), (202, 360)),
+        (SizeLimit(), (3, 5), (3, 5)), (SizeLimit(4000, 4000), (640, 480), (640, 480)), (SizeLimit(1, 1), (4000, 3), (1, 1)),
+    ):  # fmt: skip
+        assert limit.fit(*size) == fitted
     small = np.full((4, 6, 3), 7, np.uint8)
     assert SizeLimit(100, 100).applied(small) is small
     # Areas: four pixels become their mean.
-    checks = np.indices((4, 6)).sum(axis=0) % 2
-    np.testing.assert_array_equal(
-        SizeLimit(3).applied(np.repeat((checks * 200).astype(np.uint8)[..., None], 3, axis=2)), np.full((2, 3, 3), 100)
-    )
+    checks = np.repeat((np.indices((4, 6)).sum(axis=0) % 2 * 200).astype(np.uint8)[..., None], 3, axis=2)
+    np.testing.assert_array_equal(SizeLimit(3).applied(checks), np.full((2, 3, 3), 100))
 
 
 def test_what_is_late_is_not_hurried_after() -> None:
@@ -230,47 +222,25 @@ def test_what_is_late_is_not_hurried_after() -> None:
 
 
 def test_words_and_addresses_open_what_they_name(tmp_path: Path, clip: Path) -> None:
-    cases = {
-        "test": "test pattern",
-        str(clip): "clip.mkv",
-        f"folder:{tmp_path}": f"folder {tmp_path.name}",
-        "rtsp://camera/stream": "rtsp://camera/stream",
-        "https://host/cam.m3u8": "https://host/cam.m3u8",
-        "udp://@:5000": "udp://:5000",
-        "whip": "browser camera",
-    }
-    for text, name in cases.items():
+    named = {"test": "test pattern", str(clip): "clip.mkv", f"folder:{tmp_path}": f"folder {tmp_path.name}", "whip": "browser camera"}
+    named |= {address: address for address in ("rtsp://camera/stream", "https://host/cam.m3u8")} | {"udp://@:5000": "udp://:5000"}
+    for text, name in named.items():
         source = open_source(text, SizeLimit(80, 60))
         assert isinstance(source, FrameSource) and source.name == name, text
-    assert open_source("test").frames(Event()).__next__().bgr.shape == (360, 640, 3)
+    assert next(open_source("test").frames(Event())).bgr.shape == (360, 640, 3)
 
 
-@pytest.mark.parametrize(
-    ("text", "sentence"),
-    [
-        ("absent.mp4", "none of them"),
-        ("", "none of them"),
-        ("srt://host:9000", "MediaMTX"),
-        ("rtmp://host/live", "MediaMTX"),
-        ("gopher://host", "expected a URL of rtsp"),
-        ("folder:", "expected the folder"),
-        ("folder:/absent/here", "there is none at"),
-        ("whip:8080", "whip alone"),
-        ("987", "cannot be opened"),
-    ],
-)
-def test_anything_else_is_refused_in_one_sentence(text: str, sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence) as caught:
-        open_source(text)
-    assert "\n" not in str(caught.value)
-
-
-def test_a_browser_camera_without_its_package_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_anything_else_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    for text, sentence in (
+        ("absent.mp4", "none of them"), ("", "none of them"), ("srt://host:9000", "MediaMTX"), ("rtmp://host/live", "MediaMTX"),
+        ("gopher://host", "expected a URL of rtsp"), ("folder:", "expected the folder"), ("folder:/absent/here", "there is none at"),
+        ("whip:8080", "whip alone"), ("987", "cannot be opened"),
+    ):  # fmt: skip
+        with pytest.raises(InputError, match=sentence) as caught:
+            open_source(text)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match="--fps"):
+        open_source("test", fps=0.0)
     monkeypatch.setattr("viewfinder.sources.choose.find_spec", lambda _name: None)
     with pytest.raises(MissingExtraError, match=r"mrbokeh\[viewfinder\]"):
         open_source("whip")
-
-
-def test_a_rate_must_be_above_zero() -> None:
-    with pytest.raises(InputError, match="--fps"):
-        open_source("test", fps=0.0)

@@ -58,31 +58,27 @@ def test_each_frame_comes_with_its_own_last_packet(per_frame: int) -> None:
     for index, each in enumerate(stream(20, per_frame)):
         frame, part = divmod(index, per_frame)
         mine, theirs = ours.add(each)[1], stock.add(each)[1]
-        assert (mine is not None) == (part == per_frame - 1)
-        assert (theirs is not None) == (part == 0 and frame > 0)
+        assert (mine is not None) == (part == per_frame - 1) and (theirs is not None) == (part == 0 and frame > 0)
         if mine is not None:
             assert (mine.timestamp // 3000, mine.data) == (frame, whole(frame, per_frame))
         if theirs is not None:
             assert theirs.timestamp // 3000 == frame - 1
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_reordered_packets_make_the_same_frames_in_order(seed: int) -> None:
     """Each packet arrives up to 6 places late; nothing is lost."""
-    draw = random.Random(seed)
-    packets = stream(60, 4)
+    draw, packets = random.Random(seed), stream(60, 4)
     order = sorted(range(1, len(packets)), key=lambda index: index + draw.uniform(0, 6))
     out, asked = given(buffer(), [packets[0], *(packets[index] for index in order)])
-    assert [frame for frame, _ in out] == list(range(60))
-    assert all(data == whole(frame, 4) for frame, data in out)
+    assert [frame for frame, _ in out] == list(range(60)) and all(data == whole(frame, 4) for frame, data in out)
     assert asked == 0
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", range(4))
 def test_lost_packets_cost_whole_frames_and_never_tear_one(seed: int) -> None:
     """5 % lost, duplicates and reordering besides: what comes out is complete, in order, and what was lost is asked for again."""
-    draw = random.Random(seed)
-    packets = stream(200, 5)
+    draw, packets = random.Random(seed), stream(200, 5)
     order = sorted(range(1, len(packets)), key=lambda index: index + draw.uniform(0, 4))
     arriving = [packets[0], *(packets[index] for index in order if draw.random() > 0.05)]
     arriving = [each for one in arriving for each in ([one, one] if draw.random() < 0.05 else [one])]
@@ -91,8 +87,7 @@ def test_lost_packets_cost_whole_frames_and_never_tear_one(seed: int) -> None:
     assert numbers == sorted(set(numbers)) and all(data == whole(frame, 5) for frame, data in out)
     arrived = {id(each) for each in arriving}
     intact = {frame for frame in range(200) if all(id(each) in arrived for each in packets[5 * frame : 5 * frame + 5])}
-    assert set(numbers) <= intact and len(numbers) > 20
-    assert asked > 0
+    assert set(numbers) <= intact and len(numbers) > 20 and asked > 0
 
 
 def test_stock_tears_frames_where_ours_does_not() -> None:
@@ -100,15 +95,13 @@ def test_stock_tears_frames_where_ours_does_not() -> None:
     packets = [each for index, each in enumerate(stream(60, 4)) if index not in (7, 8)]
     for make, torn in ((lambda: JitterBuffer(capacity=32, is_video=True), True), (lambda: buffer(32), False)):
         out, asked = given(make(), packets)
-        assert any(data != whole(frame, 4) for frame, data in out) == torn
-        assert asked > 0 and len(out) > 40
+        assert any(data != whole(frame, 4) for frame, data in out) == torn and asked > 0 and len(out) > 40
 
 
 def test_the_first_frame_counts_only_from_its_key_start() -> None:
     """Packets that were sent before the connection stood are lost: the rest of that frame is dropped, the next ones come."""
     out, asked = given(buffer(), stream(4, 3)[1:])
-    assert out == [(frame, whole(frame, 3)) for frame in (1, 2, 3)]
-    assert asked == 1
+    assert out == [(frame, whole(frame, 3)) for frame in (1, 2, 3)] and asked == 1
 
 
 def test_padding_between_frames_is_no_frame() -> None:
@@ -136,8 +129,7 @@ def test_heads_of_key_frames_are_known() -> None:
 
 def test_frames_that_were_held_up_come_together() -> None:
     """Frames of one packet each: stock gives one frame per packet, and would stay two frames late from here on."""
-    packets = stream(12, 1)
-    order = [0, 1, 3, 4, 2, *range(5, 12)]
+    packets, order = stream(12, 1), [0, 1, 3, 4, 2, *range(5, 12)]
     ours = buffer()
     sizes = [len(given(ours, [packets[index]])[0]) for index in order]
     assert sizes == [1, 1, 0, 0, 3, *[1] * 7]

@@ -68,21 +68,16 @@ def test_everything_that_a_file_may_say(tmp_path: Path) -> None:
     assert scene.files == tuple(tmp_path / name for name in names)
 
 
-@pytest.mark.parametrize(
-    ("text", "told"),
-    [
-        ("[[object]\n", "cannot be read as such"),
-        ("[object]\nname = 'a'", "written as [[object]]"),
-        ("colour = 3", "nothing knows the key 'colour'"),
-        ("[[object]]\nname = 'a'", "glb missing"),
+def test_a_mistake_is_one_sentence_that_names_it(tmp_path: Path) -> None:
+    for text, told in (
+        ("[[object]\n", "cannot be read as such"), ("[object]\nname = 'a'", "written as [[object]]"),
+        ("colour = 3", "nothing knows the key 'colour'"), ("[[object]]\nname = 'a'", "glb missing"),
         ("[[object]]\nname = 'a'\nglb = 'no.glb'", "expected glb to be a file"),
-        ("[[object]]\nname = ''\nglb = 'card.glb'", "expected name to be a text"),
-        (ONE_CARD + "scale = 2", "height_m or scale"),
+        ("[[object]]\nname = ''\nglb = 'card.glb'", "expected name to be a text"), (ONE_CARD + "scale = 2", "height_m or scale"),
         (ONE_CARD + ONE_CARD, "'card' comes twice"),
         (ONE_CARD + "position_m = [1, 2]", "[[object]] 'card': expected position_m to be a list of 3 numbers"),
         (ONE_CARD + "yaw_deg = 'left'", "expected yaw_deg to be a number, got 'left'"),
-        (ONE_CARD + "visible = 1", "expected visible to be true or false"),
-        (ONE_CARD + "size = 1", "nothing knows the key 'size'"),
+        (ONE_CARD + "visible = 1", "expected visible to be true or false"), (ONE_CARD + "size = 1", "nothing knows the key 'size'"),
         ("[[object]]\nname = 'a'\nglb = 'card.glb'\nheight_m = 0", "expected height_m to be a number above 0, got '0'"),
         ("up = 'z'", "expected up to be one of +y, +z, -y, -z"),
         ("[light]\nexposure = -1", "[light]: expected exposure to be a number above 0"),
@@ -90,14 +85,13 @@ def test_everything_that_a_file_may_say(tmp_path: Path) -> None:
         ("[[sun]]\ndirection = [0, 0, 1]\nirradiance = -1", "expected irradiance to be a number of 0 or more"),
         ("[shadow]\nstrength = 1.5", "expected strength to be a number from 0 to 1"),
         ("[occlusion]\ndepth = 'card.glb'", "expected depth and camera, or mask alone, got depth"),
-        ("[lens]\nfile = 'no.json'", "expected file to be a file"),
-        ("[renderer]\nname = 5", "expected name to be a text"),
-    ],
-)
-def test_a_mistake_is_one_sentence_that_names_it(tmp_path: Path, text: str, told: str) -> None:
-    with pytest.raises(InputError) as caught:
-        described(tmp_path, text)
-    assert told in str(caught.value) and "scene.toml" in str(caught.value)
+        ("[lens]\nfile = 'no.json'", "expected file to be a file"), ("[renderer]\nname = 5", "expected name to be a text"),
+    ):  # fmt: skip
+        with pytest.raises(InputError) as caught:
+            described(tmp_path, text)
+        assert told in str(caught.value) and "scene.toml" in str(caught.value)
+    with pytest.raises(InputError, match="expected animation to be one of"):
+        staged(tmp_path, ONE_CARD + "animation = 'Fly'\n")
 
 
 def test_the_example_in_the_documentation_reads_with_all_that_it_comments_out(tmp_path: Path) -> None:
@@ -120,11 +114,6 @@ def test_an_object_stands_on_the_board(tmp_path: Path) -> None:
     scene = staged(tmp_path, ONE_CARD + "position_m = [0.3, 0.5, -0.1]\n").scene_at(0.0)
     low, high = scene.bounds_m
     assert np.allclose(low, [0.2, -0.3, -0.5], atol=1e-6) and np.allclose(high, [0.4, -0.1, -0.5], atol=1e-6)
-
-
-def test_an_unknown_animation_is_told_with_those_that_there_are(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="expected animation to be one of"):
-        staged(tmp_path, ONE_CARD + "animation = 'Fly'\n")
 
 
 def test_light_comes_from_where_the_file_says(tmp_path: Path) -> None:
@@ -153,13 +142,9 @@ def test_moving_and_hiding_make_new_versions(tmp_path: Path) -> None:
     moved = before.with_object("card", position_m=(1.0, 0.0, 0.0))
     assert np.allclose(moved.scene_at(0.0).bounds_m[0] - before.scene_at(0.0).bounds_m[0], [1, 0, 0])
     assert before.with_object("card", visible=False).scene_at(0.0).meshes == ()
+    assert before.scene_at(0.0) is before.scene_at(3.0), "a scene that does not move is one object"
     with pytest.raises(InputError, match="card"):
         before.with_object("cart", visible=False)
-
-
-def test_a_scene_that_does_not_move_is_one_object(tmp_path: Path) -> None:
-    scene = staged(tmp_path)
-    assert scene.scene_at(0.0) is scene.scene_at(3.0)
 
 
 def test_assets_are_kept_until_their_file_changes(tmp_path: Path) -> None:

@@ -54,8 +54,7 @@ def test_halves_hold_premultiplied_codes_and_alpha(light: list[float], alpha: fl
 
 
 def test_over_a_camera_it_gives_what_our_own_composite_gives_where_alpha_is_whole() -> None:
-    plate = np.full((8, 10, 3), 90, np.uint8)
-    layer = overlay([0.5, 0.2, 0.1], 1.0)
+    plate, layer = np.full((8, 10, 3), 90, np.uint8), overlay([0.5, 0.2, 0.1], 1.0)
     picture = color_over_alpha(layer, 10, 8, "srgb").astype(int)
     composite = np.rint(picture[:8] + plate * (1 - picture[8:] / 255))
     np.testing.assert_allclose(composite, layer.over_codes(plate, code_tables("srgb")), atol=1)

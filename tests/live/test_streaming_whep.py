@@ -39,7 +39,7 @@ from viewfinder.streaming.session_description import with_address
 from viewfinder.streaming.whep import Whep
 
 
-@pytest.mark.parametrize(("offered", "codec"), [(("VP8", "H264"), "H264"), (("VP8",), "VP8"), (("H264",), "H264")])
+@pytest.mark.parametrize(("offered", "codec"), [(("VP8", "H264"), "H264"), (("VP8",), "VP8")])
 async def test_h264_is_sent_where_it_can_be_played_and_colours_arrive(offered: tuple[str, ...], codec: str) -> None:
     with streaming() as stream, Feed(stream):
         async with whep_of(stream) as (_whep, url), watching(url, offered) as viewer:
@@ -275,8 +275,7 @@ async def test_packets_that_overtake_one_another_are_put_in_order() -> None:
     with streaming(StreamQuality(bitrate_bps=3_000_000), capacity=PATIENT) as stream, Feed(stream, noise):
         async with whep_of(stream) as (_whep, url), watching(url, viewer=Line(Viewer(), pass_on).viewer) as viewer:
             shown = [await viewer.next() for _ in range(20)]
-        assert all(b.pts > a.pts for a, b in pairwise(shown))
-        assert stream.keyframes["H264"] == 1
+        assert all(b.pts > a.pts for a, b in pairwise(shown)) and stream.keyframes["H264"] == 1
 
 
 async def test_a_viewer_whose_connection_stands_still_does_not_stall_the_others() -> None:

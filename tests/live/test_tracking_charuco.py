@@ -72,8 +72,7 @@ def test_corners_are_found_without_an_offset() -> None:
     frame, true = small_clip()[0]
     found = CharucoDetector(BOARD).detect(grey_of(frame))
     off_px = found.xy_px - true.project(BOARD.corners_m[found.ids])[0]
-    assert len(found) >= 36 and len(set(found.ids)) == len(found)
-    assert np.abs(off_px.mean(axis=0)).max() < 0.06
+    assert len(found) >= 36 and len(set(found.ids)) == len(found) and np.abs(off_px.mean(axis=0)).max() < 0.06
     assert np.sqrt((off_px**2).sum(axis=1).mean()) < 0.25
 
 
@@ -105,8 +104,7 @@ def test_flow_gives_up_points_that_do_not_flow_back() -> None:
     hidden = now_px[:, 0] < middle - 12
     assert hidden.sum() > 10 and not good[hidden].any()
     open_ = now_px[:, 0] > middle + 12
-    assert good[open_].mean() > 0.9
-    assert np.linalg.norm(places - now_px, axis=1)[good & open_].max() < 0.8
+    assert good[open_].mean() > 0.9 and np.linalg.norm(places - now_px, axis=1)[good & open_].max() < 0.8
 
 
 def test_a_late_detection_is_carried_to_the_newest_frame() -> None:
@@ -114,18 +112,15 @@ def test_a_late_detection_is_carried_to_the_newest_frame() -> None:
     for frame, _ in small_clip()[:5]:
         history.add(frame.sequence, grey_of(frame))
     detected = CharucoDetector(BOARD).detect(grey_of(small_clip()[1][0]))
-    carried = history.carry(detected, 1)
-    true = small_clip()[4][1]
+    carried, true = history.carry(detected, 1), small_clip()[4][1]
     assert carried is not None and len(carried) >= 34
     moved_px = np.linalg.norm(detected.xy_px[0] - true.project(BOARD.corners_m[detected.ids[:1]])[0])
     off_px = np.linalg.norm(carried.xy_px - true.project(BOARD.corners_m[carried.ids])[0], axis=1)
-    assert moved_px > 3.0 and np.median(off_px) < 0.3
-    assert history.carry(detected, 99) is None
+    assert moved_px > 3.0 and np.median(off_px) < 0.3 and history.carry(detected, 99) is None
 
 
 def test_history_starts_anew_with_another_size_or_an_older_number() -> None:
-    history = FrameHistory(length=3)
-    grey = np.zeros((60, 80), np.uint8)
+    history, grey = FrameHistory(length=3), np.zeros((60, 80), np.uint8)
     assert [history.add(number, grey) for number in (0, 1, 2, 3)] == [False, True, True, True]
     assert history.carry(Corners(np.zeros(0, np.int64), np.zeros((0, 2))), 0) is None
     assert not history.add(4, np.zeros((30, 40), np.uint8)) and not history.add(2, np.zeros((30, 40), np.uint8))
@@ -153,8 +148,7 @@ def test_a_lost_board_is_held_then_gone_and_comes_back() -> None:
 
 def test_half_a_board_is_enough_and_its_quality_is_lower() -> None:
     frame, true = small_clip()[0]
-    whole = tracker_of_each_frame().track(frame, true)
-    covered = frame.bgr.copy()
+    whole, covered = tracker_of_each_frame().track(frame, true), frame.bgr.copy()
     covered[: int(true.project(np.array([0.1, 0.135, 0.0]))[0][1])] = (120, 130, 150)
     half = tracker_of_each_frame().track(replace(frame, bgr=covered), true)
     assert whole is not None and half is not None
@@ -249,8 +243,7 @@ def test_a_real_dark_clip_is_tracked_in_most_frames(shared_data: Path) -> None:
         for number, frame in enumerate(read_display_frames(path, 320, 180))
     ]
     fresh = [pose for number, pose in enumerate(poses) if pose is not None and pose.captured_s == number / 60.0]
-    assert len(poses) == 443 and len(fresh) > 0.82 * len(poses)
-    assert np.mean([pose.residual_px for pose in fresh]) < 0.4
+    assert len(poses) == 443 and len(fresh) > 0.82 * len(poses) and np.mean([pose.residual_px for pose in fresh]) < 0.4
     steps = [np.linalg.norm(one.camera_from_world[:3, 3] - other.camera_from_world[:3, 3]) for one, other in pairwise(fresh)]
     assert np.median(steps) < 0.01, "poses jump about"
 
@@ -435,8 +428,7 @@ def test_a_hand_over_the_board_does_not_pull_it() -> None:
     covered = grey_of(frame).copy()
     x, y = true.project(np.array([0.09, 0.06, 0.0]))[0].astype(int)
     covered[y - 60 : y + 40, x - 50 : x + 120] = 150
-    read = CharucoDetector(BOARD).detect(covered)
-    given = AlignedDetector(BOARD).detect(covered)
+    read, given = CharucoDetector(BOARD).detect(covered), AlignedDetector(BOARD).detect(covered)
     assert len(read) >= 20 and aligned_corners(BOARD, covered, read) is None
     np.testing.assert_array_equal(given.xy_px, read.xy_px)
 

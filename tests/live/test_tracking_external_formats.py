@@ -108,8 +108,7 @@ def test_angles_of_steep_cameras() -> None:
 
 def test_opentrackio_says_what_it_leaves_out() -> None:
     sample = decoded(document((0, 0, 0), distortion=[{"model": "Brown-Conrady D-U", "radial": [0.1]}], tStop=3.1, focusDistance=0))
-    assert sample.ignored == {"lens.distortion", "lens.tStop"}
-    assert sample.lens == LensState()
+    assert sample.ignored == {"lens.distortion", "lens.tStop"} and sample.lens == LensState()
 
 
 def test_malformed_samples() -> None:
@@ -327,8 +326,7 @@ def test_poses_between_two_samples(encoding: int) -> None:
 
 def test_silence_is_a_lost_track() -> None:
     with listening(opentrackio_decoder(), hold_s=0.05) as (tracker, send):
-        assert tracker.track(frame_at(time.monotonic()), CAMERA) is None
-        assert "have come" in str(tracker.remark)
+        assert tracker.track(frame_at(time.monotonic()), CAMERA) is None and "have come" in str(tracker.remark)
         send(*datagrams(TrackingSample(pose_at(1.0), LensState(2.0))))
         wait_until(lambda: tracker._history.newest_s)
         newest_s = tracker._history.newest_s
@@ -372,8 +370,7 @@ def test_history_is_bounded() -> None:
     history = PoseHistory(longest=10)
     for time_s in range(1000):
         history.add(float(time_s), TrackingSample(pose_at(time_s)))
-    assert len(history._times) == len(history._samples) == 10
-    assert history.at(989.0) is None
+    assert len(history._times) == len(history._samples) == 10 and history.at(989.0) is None
     history.add(998.5, TrackingSample(pose_at(0.0)))  # late
     late = history.at(998.5)
     assert late is not None and late.camera_from_world == pytest.approx(pose_at(0.0))
@@ -381,8 +378,7 @@ def test_history_is_bounded() -> None:
 
 def test_sender_clock_takes_the_least_delayed() -> None:
     """Packets every 20 ms that are 0 to 15 ms late: the times become even, and right to the least delay there was."""
-    rng = np.random.default_rng(5)
-    clock = SenderClock()
+    rng, clock = np.random.default_rng(5), SenderClock()
     late_s = rng.uniform(0.0, 0.015, 100)
     ours_s = np.array([clock.ours_s(1000.0 + 0.02 * i, 50.0 + 0.02 * i + late) for i, late in enumerate(late_s)])
     true_s = 50.0 + 0.02 * np.arange(100)
