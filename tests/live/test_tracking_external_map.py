@@ -106,13 +106,11 @@ def test_no_place_without_the_room(room_map: SparseMap) -> None:
     grey = np.full((HEIGHT_PX, WIDTH_PX), 90, np.uint8)
     assert localiser.localise(grey) is None
     noise = np.random.default_rng(0).integers(0, 255, grey.shape).astype(np.uint8)
-    assert localiser.localise(cv2.GaussianBlur(noise, (0, 0), 2.0)) is None
-    assert len(localiser.detect(grey)) == 0
+    assert localiser.localise(cv2.GaussianBlur(noise, (0, 0), 2.0)) is None and len(localiser.detect(grey)) == 0
 
 
 def test_matches_agree_with_their_plain_twin(room_map: SparseMap) -> None:
-    rng = np.random.default_rng(4)
-    few = room_map.point_of < 60
+    rng, few = np.random.default_rng(4), room_map.point_of < 60
     small = SparseMap(room_map.points_m[:60], room_map.descriptors[few], room_map.point_of[few])
     seen = small.descriptors[rng.choice(few.sum(), 40)] + rng.normal(0, 0.03, (40, 128)).astype(np.float32)
     seen = np.maximum(seen, 0) / np.linalg.norm(np.maximum(seen, 0), axis=1, keepdims=True)
@@ -258,8 +256,7 @@ def test_held_out_pictures_of_the_fox(shared_data: Path) -> None:
         degrees, units = off(found.camera_from_map @ map_from_truth, expected)
         points = localiser.map.points_m @ found.camera_from_map[2, :3] + found.camera_from_map[2, 3]
         errors.append((name, degrees, units / float(np.median(points)), len(found.points)))
-    assert max(degrees for _, degrees, _, _ in errors) < 0.3
-    assert max(share for _, _, share, _ in errors) < 0.005
+    assert max(degrees for _, degrees, _, _ in errors) < 0.3 and max(share for _, _, share, _ in errors) < 0.005
 
 
 def alignment(of_map: dict[str, Pose], truth: dict[str, Pose]) -> tuple[float, Pose]:

@@ -82,8 +82,7 @@ def test_what_it_gives_is_a_rigid_pose_and_a_resting_one_stays_as_it_is() -> Non
 
 def test_turning_about_the_board_keeps_the_pivot_still() -> None:
     """Poses that differ by a turn about the pivot: whatever the filter does to the turn, the pivot stays at its pixel."""
-    pivot = np.array([0.1, 0.12, 0.0])
-    smooth = OneEuroPose(pivot_m=(0.1, 0.12, 0.0))
+    pivot, smooth = np.array([0.1, 0.12, 0.0]), OneEuroPose(pivot_m=(0.1, 0.12, 0.0))
     for number, angle in enumerate(np.linspace(0.0, 15.0, 10)):
         pose = pose_of(np.array([angle, 0.0, 0.0]), np.zeros(3))
         pose[:3, 3] = np.array([0.0, 0.0, 0.8]) - pose[:3, :3] @ pivot

@@ -100,8 +100,7 @@ def errors(track: Tracking, seeds: tuple[int, ...], of_views: range = range(len(
 
 def assert_no_flip_is_called_certain(track: Tracking, seeds: tuple[int, ...]) -> None:
     off_deg, certain, _ = errors(track, seeds).T
-    assert len(off_deg) == len(VIEWS) * len(seeds) * FRAMES
-    assert off_deg[certain > 0].max() < WORST_DEG
+    assert len(off_deg) == len(VIEWS) * len(seeds) * FRAMES and off_deg[certain > 0].max() < WORST_DEG
 
 
 @pytest.mark.parametrize("track", [live, of_clip])
@@ -175,10 +174,8 @@ def test_what_was_seen_clearly_before_tells_the_poses_apart_until_they_meet() ->
     fits = [branches.take(poses_of_frame(tilted(*at), seed=number), number / 30.0) for number, at in enumerate(path)]
     off_deg = [np.rad2deg(turn_between_rad(fit.camera_from_world, tilted(*at))) for fit, at in zip(fits, path, strict=True)]
     certain = np.array([fit.is_certain for fit in fits])
-    assert certain[:40].all() and max(off_deg[:40]) < 5.0
-    assert not certain[62:80].any()
-    assert certain[-3:].all() and max(off_deg[-3:]) < 5.0
-    assert max(np.array(off_deg)[certain]) < WORST_DEG
+    assert certain[:40].all() and max(off_deg[:40]) < 5.0 and not certain[62:80].any()
+    assert certain[-3:].all() and max(off_deg[-3:]) < 5.0 and max(np.array(off_deg)[certain]) < WORST_DEG
 
 
 def test_while_nobody_knows_the_object_does_not_jump() -> None:
@@ -209,6 +206,5 @@ def test_a_traced_board_that_is_small_in_the_picture_is_not_shown_flipped(elevat
     followed = [(tracker.track(frame, true), true) for frame, true in traced(1.8, elevation_deg, 12)]
     poses = [(pose, true) for pose, true in followed if pose is not None]
     off_deg = [np.rad2deg(turn_between_rad(pose.camera_from_world, true.camera_from_world)) for pose, true in poses if pose.is_certain]
-    assert len(poses) >= 11 and len(off_deg) >= least_certain
-    assert max(off_deg, default=0.0) < WORST_DEG
+    assert len(poses) >= 11 and len(off_deg) >= least_certain and max(off_deg, default=0.0) < WORST_DEG
     assert all(pose.is_certain or pose.quality < 0.3 for pose, _ in poses)
