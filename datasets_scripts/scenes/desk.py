@@ -10,7 +10,7 @@ from scipy import ndimage
 from datasets_scripts.scenes.textures import bricks, checks, mottled, page_of_text, spots, wood
 from datasets_scripts.tracers.baked_lighting import bake_lighting
 from datasets_scripts.tracers.thin_lens import trace_pinhole
-from datasets_scripts.tracers.traced_scene import DiscLight, Quad, Scene, Sphere, Texture, Vector, vector
+from datasets_scripts.tracers.traced_scene import DiscLight, Quad, Scene, Sphere, Texture, Vector, box_faces, vector
 from mrbokeh.optics.camera import Camera, camera_of_lens
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
@@ -117,22 +117,11 @@ class _Box:
     base_y_m: float = TABLE_Y_M
 
     def quads(self) -> tuple[Quad, ...]:
-        width, height, depth = self.size_m
-        right = width * np.array([np.cos(self.yaw_rad), 0.0, np.sin(self.yaw_rad)])
-        away = depth * np.array([-np.sin(self.yaw_rad), 0.0, np.cos(self.yaw_rad)])
-        down = np.array([0.0, height, 0.0])
-        front_left = np.array([self.x_m, self.base_y_m - height, self.z_m]) - 0.5 * right - 0.5 * away
         front, side, top = self.skin
-        faces = (
-            (front_left, right, down, front),
-            (front_left + right + away, -right, down, front),
-            (front_left + right, away, down, side),
-            (front_left + away, -away, down, side),
-            (front_left + away, right, -away, top),
-        )
+        faces = zip(box_faces((self.x_m, self.base_y_m, self.z_m), self.size_m, self.yaw_rad), (front, front, side, side, top), strict=True)
         return tuple(
             Quad(corner_m=vector(start), edge_u_m=vector(u), edge_v_m=vector(v), texture=texture, repeats=self.repeats)
-            for start, u, v, texture in faces
+            for (start, u, v), texture in faces
         )
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.optics.aperture_shapes import joined, net_area, outlines_of, unit_disc
+from mrbokeh.optics.aperture_shapes import joined, outlines_of, unit_disc
 from mrbokeh.system.errors import InputError
 
 _SCANLINES = 1 << 16
@@ -77,12 +77,6 @@ def _crossings(aperture: Aperture, y: Float[np.ndarray, " rows"]) -> Float[np.nd
     crossings, finite = crossings[:, : finite.sum(axis=1).max()], finite[:, : finite.sum(axis=1).max()]
     last = np.max(np.where(finite, crossings, -np.inf), axis=1, keepdims=True)
     return np.where(finite, crossings, np.where(np.isfinite(last), last, 0.0))
-
-
-def two_disc_overlap(distance: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
-    """Return the share of a unit disc that a second unit disc covers, their centres `distance` apart."""
-    half = np.clip(np.abs(distance) / 2.0, 0.0, 1.0)
-    return (np.arccos(half) - half * np.sqrt(1.0 - half**2)) * 2.0 / np.pi
 
 
 @dataclass(frozen=True)
@@ -161,8 +155,3 @@ def _span(y: Float[np.ndarray, " lines"], centre_x: float, centre_y: float, radi
     half = np.sqrt(np.maximum(radius**2 - (y - centre_y) ** 2, 0.0))
     misses = np.abs(y - centre_y) >= radius
     return np.where(misses, np.inf, centre_x - half), np.where(misses, -np.inf, centre_x + half)
-
-
-def polygon_share(aperture: Aperture) -> float:
-    """Return the area of a plain aperture over that of the unit disc."""
-    return net_area((aperture.outlines, aperture.weights)) / np.pi

@@ -42,10 +42,3 @@ def _mixed(x: Any) -> Any:
     x = (x ^ (x >> 16)) * 0x85EBCA6B
     x = (x ^ (x >> 13)) * 0xC2B2AE35
     return x ^ (x >> 16)
-
-
-def reversed_bits(x: UInt32[np.ndarray, "*batch"]) -> UInt32[np.ndarray, "*batch"]:
-    """Return the 32 bits of each number in reverse order."""
-    for shift, mask in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF)):
-        x = ((x >> shift) & mask) | ((x & mask) << shift)
-    return (x >> 16) | (x << 16)

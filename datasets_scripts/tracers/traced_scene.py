@@ -88,6 +88,27 @@ def emissive_quad(
     )
 
 
+def box_faces(
+    base_m: Sequence[float] | Float[np.ndarray, "3"], size_m: Vector, yaw_rad: float
+) -> list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"], Float[np.ndarray, "3"]]]:
+    """Return (corner, edge u, edge v) of the front, back, sides and top of a box (width, height, depth) that stands with the middle of its
+    base on base_m, turned about the vertical axis; it has no bottom.
+    """
+    width, height, depth = size_m
+    right = width * np.array([np.cos(yaw_rad), 0.0, np.sin(yaw_rad)])
+    away = depth * np.array([-np.sin(yaw_rad), 0.0, np.cos(yaw_rad)])
+    down = np.array([0.0, height, 0.0])
+    front_left = np.asarray(base_m) - down - 0.5 * right - 0.5 * away
+    back_right = front_left + right + away
+    return [
+        (front_left, right, down),
+        (back_right, -right, down),
+        (front_left + right, away, down),
+        (front_left + away, -away, down),
+        (front_left + away, right, -away),
+    ]
+
+
 def plain_texture(rgb: Vector) -> Texture:
     return np.full((1, 1, 3), rgb, np.float32)
 

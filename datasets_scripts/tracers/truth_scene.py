@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32, Int
 
-from datasets_scripts.tracers.traced_scene import Texture, Vector
+from datasets_scripts.tracers.traced_scene import Texture, Vector, box_faces
 from mrbokeh.optics.camera import Camera
 
 Place = Vector | Float[np.ndarray, "3"]
@@ -53,20 +53,8 @@ def quad(corner_m: Place, edge_u_m: Place, edge_v_m: Place, texture: Texture, re
 
 
 def box(base_m: Place, size_m: Vector, yaw_rad: float, texture: Texture, repeats: tuple[float, float] = (1.0, 1.0)) -> list[Body]:
-    """Return a box (width, height, depth) that stands with the middle of its base on base_m, turned about the vertical axis; no bottom."""
-    width, height, depth = size_m
-    right = width * np.array([np.cos(yaw_rad), 0.0, np.sin(yaw_rad)])
-    away = depth * np.array([-np.sin(yaw_rad), 0.0, np.cos(yaw_rad)])
-    down = np.array([0.0, height, 0.0])
-    front_left = np.asarray(base_m) - down - 0.5 * right - 0.5 * away
-    faces = (
-        (front_left, right, down),
-        (front_left + right + away, -right, down),
-        (front_left + right, away, down),
-        (front_left + away, -away, down),
-        (front_left + away, right, -away),
-    )
-    return [quad(corner, u, v, texture, repeats) for corner, u, v in faces]
+    """Return the five faces of a box, see `box_faces`."""
+    return [quad(corner, u, v, texture, repeats) for corner, u, v in box_faces(base_m, size_m, yaw_rad)]
 
 
 def ball(centre_m: Place, radius_m: float, texture: Texture, repeats: tuple[float, float] = (2.0, 1.0)) -> Body:

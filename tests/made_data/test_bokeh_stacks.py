@@ -10,13 +10,14 @@ import pytest
 from datasets_scripts.bokeh_stacks import StackView, main, make_bokeh_stacks, make_pull
 from datasets_scripts.made_sets.bokeh_plan import SHAPES, SIZES, StackSize, StacksPlan, bokeh_shape
 from datasets_scripts.scenes.bokeh_scenes import KINDS, bokeh_scene
-from datasets_scripts.tracers.pupil import FieldStop, OpenShares, polygon_share
+from datasets_scripts.tracers.pupil import FieldStop, OpenShares
 from datasets_scripts.tracers.traced_scene import plain_texture
 from datasets_scripts.tracers.truth import Opening
 from datasets_scripts.tracers.truth_layer import make_tracer
 from datasets_scripts.tracers.truth_scene import Lamp, PackedScene, TruthScene, pack, quad
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.aperture_shapes import net_area
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.stacks.focal_stack import read_focal_stack
@@ -31,6 +32,11 @@ NEAR_FOCUS_M, FAR_FOCUS_M = 0.9, 6.5
 # Left, middle, right and a corner of the frame, as places of pixels.
 PLACES = {"left": (24, 56), "middle": (96, 56), "right": (168, 60), "corner": (160, 20)}
 TINY = StackSize(scenes=("garlands_1", "checkers_1"), views=2, focuses=2, width_px=32, height_px=20, f_number=1.1, samples=4, lamp_rays=512)
+
+
+def polygon_share(aperture: Aperture) -> float:
+    """Area of a plain aperture over that of the unit disc."""
+    return net_area((aperture.outlines, aperture.weights)) / np.pi
 
 
 @pytest.fixture(autouse=True)

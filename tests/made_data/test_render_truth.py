@@ -9,8 +9,8 @@ import pytest
 from datasets_scripts.made_sets.truth_set import SHAPE_NAMES, TruthPlan, lens_shape
 from datasets_scripts.render_truth import main, render_truth
 from datasets_scripts.scenes.truth_scenes import SCENES, make_scene
-from datasets_scripts.tracers.pupil import pupil_table, two_disc_overlap
-from datasets_scripts.tracers.sobol import owen_scrambled, reversed_bits, scramble_seed, sobol_table
+from datasets_scripts.tracers.pupil import pupil_table
+from datasets_scripts.tracers.sobol import owen_scrambled, scramble_seed, sobol_table
 from datasets_scripts.tracers.traced_scene import Vector, plain_texture
 from datasets_scripts.tracers.truth import Opening, Part, TruthTracer, lamp_flux
 from datasets_scripts.tracers.truth_layer import make_tracer, sharp_layer
@@ -25,7 +25,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import scatter
 from mrbokeh.system.errors import InputError
 from tests.scenes.command_line import printed_by
-from tests.scenes.scalar_truth_tracer import ScalarTracer, require_mitsuba
+from tests.scenes.scalar_truth_tracer import ScalarTracer, require_mitsuba, reversed_bits, two_disc_overlap
 
 SIZE_PX = 96
 FOCAL_PX = 900.0

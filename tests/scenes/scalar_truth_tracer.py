@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from jaxtyping import Bool, Float, Float32, Int
+from jaxtyping import Bool, Float, Float32, Int, UInt32
 
-from datasets_scripts.tracers.pupil import PupilTable, pupil_table, two_disc_overlap
-from datasets_scripts.tracers.sobol import owen_scrambled, reversed_bits, scramble_seed, sobol_table
+from datasets_scripts.tracers.pupil import PupilTable, pupil_table
+from datasets_scripts.tracers.sobol import owen_scrambled, scramble_seed, sobol_table
 from datasets_scripts.tracers.truth import (
     LAMP_STREAM,
     OWN_LAMP,
@@ -29,6 +29,19 @@ Points = Float[np.ndarray, "n 3"]
 Pairs = Float[np.ndarray, "n 2"]
 Numbers = Float[np.ndarray, " n"]
 Flags = Bool[np.ndarray, " n"]
+
+
+def two_disc_overlap(distance: Float[np.ndarray, "*batch"]) -> Float[np.ndarray, "*batch"]:
+    """Return the share of a unit disc that a second unit disc covers, their centres `distance` apart."""
+    half = np.clip(np.abs(distance) / 2.0, 0.0, 1.0)
+    return (np.arccos(half) - half * np.sqrt(1.0 - half**2)) * 2.0 / np.pi
+
+
+def reversed_bits(x: UInt32[np.ndarray, "*batch"]) -> UInt32[np.ndarray, "*batch"]:
+    """Return the 32 bits of each number in reverse order."""
+    for shift, mask in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF)):
+        x = ((x >> shift) & mask) | ((x & mask) << shift)
+    return (x >> 16) | (x << 16)
 
 
 def require_mitsuba() -> None:
