@@ -25,6 +25,7 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import probe, read_frames
 from mrbokeh.video.picture_source import open_source
 from mrbokeh.video.writer import VideoWriter
+from tests.scenes.refusals import refused
 from tests.scenes.shot_makers import Brighter, wait_for
 
 INTRA = [("prores4444", ".mov"), ("prores4444-alpha", ".mov"), ("dnxhr-hqx", ".mov"), ("dnxhr-hqx", ".mxf")]
@@ -159,8 +160,7 @@ def test_numbered_pictures_in_and_out(tmp_path: Path, suffix: str) -> None:
     for index, frame in enumerate(shot.source.frames(2, 7), 2):
         expected = 0.5 * frame.rgb + 0.1 * (index % 5 + 1) / 5
         np.testing.assert_allclose(read_image(tmp_path / f"out.{1001 + index}{suffix}"), expected, atol=2**-11)
-    with pytest.raises(InputError, match=r"out\.1003\S+ exists already"):
-        render_shot(shot, SerialExecutor())
+    refused(r"out\.1003\S+ exists already", render_shot, shot, SerialExecutor())
     render_shot(shot, SerialExecutor(), overwrite=True)
 
 
@@ -183,13 +183,10 @@ def test_a_virtual_layer_alone_keeps_its_alpha(tmp_path: Path) -> None:
 
 def test_what_a_container_cannot_hold_is_told_before_the_work(tmp_path: Path) -> None:
     clip = clip_of_blobs(tmp_path, size=(272, 136))
-    with pytest.raises(InputError, match="even rates only"):
-        render_shot(shot_of(clip, VideoTarget(tmp_path / "out.mxf")), SerialExecutor())
-    with pytest.raises(InputError, match="too small for dnxhd"):
-        render_shot(shot_of(clip_of_blobs(tmp_path), VideoTarget(tmp_path / "out.mxf")), SerialExecutor())
+    refused("even rates only", render_shot, shot_of(clip, VideoTarget(tmp_path / "out.mxf")), SerialExecutor())
+    refused("too small for dnxhd", render_shot, shot_of(clip_of_blobs(tmp_path), VideoTarget(tmp_path / "out.mxf")), SerialExecutor())
     for name in ("out.%04d.gif", "out.%04d"):
-        with pytest.raises(InputError, match="expected numbered"):
-            render_shot(shot_of(clip, SequenceTarget(tmp_path / name)), SerialExecutor())
+        refused("expected numbered", render_shot, shot_of(clip, SequenceTarget(tmp_path / name)), SerialExecutor())
     with pytest.raises(InputError, match=r"expected numbered \.exr, not \.png"):
         render_shot(shot_of(clip, SequenceTarget(tmp_path / "out.%04d.png", layers=True)), SerialExecutor())
     assert [file.name for file in tmp_path.iterdir()] == ["clip.mkv"]
@@ -229,15 +226,13 @@ def test_parts_of_other_settings_are_refused_but_not_a_folder_without_parts(tmp_
         "frames": shot_of(clip, VideoTarget(tmp_path / "out.mkv"), Brighter(0.1, reads=(other,)), (0, 9)),
     }
     for name, shot in changes.items():
-        with pytest.raises(InputError, match=rf"other settings \({name}\): run with the same to go on, or --overwrite"):
-            render_shot(shot, SerialExecutor())
+        refused(rf"other settings \({name}\): run with the same to go on, or --overwrite", render_shot, shot, SerialExecutor())
     other.write_text("another")
     with pytest.raises(InputError, match=r"other settings \(files\)"):
         render_shot(shot_of(clip, VideoTarget(tmp_path / "out.mkv"), Brighter(0.1, reads=(other,))), SerialExecutor())
     render_shot(changes["amount"], SerialExecutor(), overwrite=True)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["clip.mkv", "lens.json", "out.mkv"]
-    with pytest.raises(InputError, match="exists already"):
-        render_shot(changes["amount"], SerialExecutor())
+    refused("exists already", render_shot, changes["amount"], SerialExecutor())
     # A run that was stopped before its first segment leaves its manifest alone: nothing of it can be mixed with other settings.
     target = VideoTarget(tmp_path / "again.mkv")
     before = PartsFolder.opened(shot_of(clip, target, Brighter(0.1)))
@@ -245,8 +240,7 @@ def test_parts_of_other_settings_are_refused_but_not_a_folder_without_parts(tmp_
     begun = PartsFolder.opened(shot_of(clip, target, Brighter(0.2)))
     render_segment(SegmentTask(begun.shot, begun.shot.segments[0], begun.path))
     assert begun.holds_parts and len(begun.missing) == 4
-    with pytest.raises(InputError, match=r"other settings \(amount\)"):
-        render_shot(before.shot, SerialExecutor())
+    refused(r"other settings \(amount\)", render_shot, before.shot, SerialExecutor())
     render_shot(begun.shot, SerialExecutor())
     render_shot(shot_of(clip, VideoTarget(tmp_path / "whole.mkv"), Brighter(0.2)), SerialExecutor())
     assert target.path.read_bytes() == (tmp_path / "whole.mkv").read_bytes()

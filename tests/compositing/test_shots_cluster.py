@@ -17,6 +17,7 @@ from mrbokeh.shots.executors import DaskExecutor, Executor, SerialExecutor, requ
 from mrbokeh.shots.render_shot import VideoTarget, render_shot
 from mrbokeh.system.errors import InputError
 from tests.compositing.test_shots import COUNT, clip_of_blobs, opened_once_two_work, shot_of
+from tests.scenes.refusals import refused
 from tests.scenes.shot_makers import Brighter, wait_for
 
 distributed = pytest.importorskip("distributed", reason="the extra 'cluster' is not installed")
@@ -98,8 +99,7 @@ def test_a_worker_killed_while_it_works_loses_nothing(tmp_path: Path, address: s
 
 def test_a_mistake_on_a_worker_is_the_users_sentence(tmp_path: Path, address: str) -> None:
     shot = shot_of(clip_of_blobs(tmp_path), VideoTarget(tmp_path / "out.mkv"), Brighter(as_layer=True))
-    with pytest.raises(InputError, match="pictures with alpha need"):
-        render_shot(shot, DaskExecutor(address))
+    refused("pictures with alpha need", render_shot, shot, DaskExecutor(address))
 
 
 def test_nobody_answers() -> None:
@@ -131,6 +131,5 @@ def test_workers_must_see_the_same_files(tmp_path: Path) -> None:
         ([(True, True, "0.0.1")], rf"runs mrbokeh 0\.0\.1, but this is {__version__}"),
         ([], "has no workers"),
     ):
-        with pytest.raises(InputError, match=words):
-            require_same_files(Elsewhere(*reports), tmp_path, clip)
+        refused(words, require_same_files, Elsewhere(*reports), tmp_path, clip)
     assert [file.name for file in tmp_path.iterdir()] == ["clip.mkv"]

@@ -16,6 +16,7 @@ from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.formats import write_track
 from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame, TrackOptions
+from tests.scenes.refusals import refused
 from tests.scenes.stage_scenes import HEIGHT, ONE_CARD, WIDTH, camera, scene_file
 
 SIZE = (WIDTH, HEIGHT)
@@ -32,8 +33,7 @@ def test_a_track_that_agrees_is_taken_and_other_options_stay(tmp_path: Path) -> 
     # A .chan does not tell the size of its pictures: it is the plate's.
     write_track(tmp_path / "track.chan", board_track(), TrackOptions())
     assert scene_track(tmp_path / "track.chan", SIZE, "+y").size_px == SIZE
-    with pytest.raises(InputError, match="there is none"):
-        scene_track(tmp_path / "none.json", SIZE, "-z")
+    refused("there is none", scene_track, tmp_path / "none.json", SIZE, "-z")
 
 
 def test_a_camera_follows_the_scene_in_pictures_of_its_shape(tmp_path: Path) -> None:
@@ -74,8 +74,7 @@ def test_both_commands_refuse_and_what_the_sentence_says_helps(tmp_path: Path) -
     photo = [tmp_path / "plate.0.exr", "--save-layer", tmp_path / "one.exr", "--out", tmp_path / "one.png"]
     filmed = ["--scene", scene, "--scene-renderer", "embree", "--lens", tmp_path / "pinhole.json", "--camera"]
     for app, words in ((video.app, clip), (composite.app, photo)):
-        with pytest.raises(InputError, match="points up in this track"):
-            run(app, *words, *filmed, tmp_path / "colmap")
+        refused("points up in this track", run, app, *words, *filmed, tmp_path / "colmap")
     run(track.app, "convert", tmp_path / "colmap", tmp_path / "turned.json", "--out-up=-z")
     for app, words, out in ((video.app, clip, "out.0.exr"), (composite.app, photo, "one.exr")):
         run(app, *words, *filmed, tmp_path / "turned.json")

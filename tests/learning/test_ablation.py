@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from mrbokeh.images.image_metrics import psnr
-from mrbokeh.system.errors import InputError
 from tests.scenes.card_stack import SIZE, make_card_scene
 from tests.scenes.command_line import printed_by
+from tests.scenes.refusals import refused
 from training.ablation.plan import (
     PAPER_TABLE_3,
     PUBLISHED,
@@ -106,10 +106,8 @@ def test_tiles_and_splits_are_one_for_all_rows(scene: Path, tmp_path: Path) -> N
     planned = planned_runs(list(TABLES["1"][:2]), sets, tmp_path, replace(BUDGET, seeds=2))
     assert [(each.row.name, each.seed, each.settings.seed) for each in planned] == [(n, s, s) for s in (0, 1) for n in ("published", "3x3")]
     assert {each.data_set.held_out for each in planned} == {sets[0].held_out}
-    with pytest.raises(InputError, match="at least two viewpoints"):
-        read_data_sets([scene / "view_0"])
-    with pytest.raises(InputError, match="rename one"):
-        read_data_sets([scene, scene])
+    refused("at least two viewpoints", read_data_sets, [scene / "view_0"])
+    refused("rename one", read_data_sets, [scene, scene])
 
 
 @pytest.mark.slow
@@ -151,8 +149,7 @@ def test_pages_hold_tables_and_finished_runs_are_not_trained_again(
     common = ("--out", done, "--table", "1", "--rows", "no_tiling,published", "--settings", small_base, *TILES)
     ablate(scene, *common, "--epochs", 1)
     assert (done / "table_1.csv").read_bytes() == before
-    with pytest.raises(InputError, match="other settings \\(epochs\\)"):
-        ablate(scene, *common, "--epochs", 2)
+    refused("other settings \\(epochs\\)", ablate, scene, *common, "--epochs", 2)
 
 
 def test_a_stopped_table_goes_on(scene: Path, small_base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -187,10 +184,8 @@ def test_a_dry_run_trains_nothing(scene: Path, done: Path, small_base: Path, tmp
     settings = ("--table", "1", "--epochs", 1, "--settings", small_base, *TILES)
     again = ablate(scene, "--out", done, "--rows", "published,3x3", *settings, "--dry-run")
     assert "2 runs, about" in again and again.count("finished") == 1
-    with pytest.raises(InputError, match="rows among published"):
-        ablate(scene, "--out", tmp_path / "out", "--rows", "4x4")
-    with pytest.raises(InputError, match="minutes or in epochs"):
-        ablate(scene, "--out", tmp_path / "out", "--minutes", 1, "--epochs", 1)
+    refused("rows among published", ablate, scene, "--out", tmp_path / "out", "--rows", "4x4")
+    refused("minutes or in epochs", ablate, scene, "--out", tmp_path / "out", "--minutes", 1, "--epochs", 1)
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ import torch
 from scipy.ndimage import gaussian_filter
 from torch import Tensor, nn
 
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 from training.export.onnx_export import OPSET
 from training.networks.baseline_networks import DeepFocusTiles, GaussianBank, NeuralCameraTiles, bank_sigmas_px, interleave
 from training.networks.network_settings import NetworkSettings
@@ -137,8 +137,7 @@ def test_every_parameter_learns_and_place_and_lens_are_inputs(form: str) -> None
     y = _network(form, settings)(x)
     x[:, 4:] -= 1.0
     assert y.shape == (1, 3, 24, 32) and not torch.equal(y, _network(form, settings)(x))
-    with pytest.raises(InputError, match="expected one tile"):
-        FORMS[form](SETTINGS, largest_coc_px=LARGEST_COC_PX, tiles=2)
+    refused("expected one tile", FORMS[form], SETTINGS, largest_coc_px=LARGEST_COC_PX, tiles=2)
 
 
 @both_forms

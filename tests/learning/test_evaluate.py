@@ -17,11 +17,11 @@ from mrbokeh.optics.psf_bank import Axis, PsfBank, physical_boxes
 from mrbokeh.optics.psf_bank_file import write_bank
 from mrbokeh.optics.psf_grid import NestedGrid
 from mrbokeh.stacks.focal_stack import write_focal_stack
-from mrbokeh.system.errors import InputError
 from tests.learning.test_train import DEMO_LIKE
 from tests.scenes.card_stack import CARD_M, CARD_PX, LENS, SIZE, WALL_M, make_card_scene, make_card_stack
 from tests.scenes.command_line import printed_by
 from tests.scenes.made_networks import jittered
+from tests.scenes.refusals import refused
 from training.cli import app
 from training.data.dataset import PairSet
 from training.data.pairs import WHERE_TRUTH_IS_KNOWN
@@ -182,10 +182,8 @@ def test_perceptual_distance_sees_what_a_display_shows(tmp_path: Path) -> None:
     grey, white = np.full((8, 9, 3), 0.5, np.float32), np.full((8, 9, 3), 7.0, np.float32)
     assert distance(white, grey) == pytest.approx(2.0 * (1.0 - float(linear_to_srgb(np.array([0.5]))[0])), rel=1e-5)
     assert distance(grey, grey) == 0.0
-    with pytest.raises(InputError, match="take two pictures"):
-        OnnxPerceptualDistance(write_distance(tmp_path / "one.onnx", inputs=1))
-    with pytest.raises(InputError, match="LPIPS as an"):
-        OnnxPerceptualDistance(tmp_path / "absent.onnx")
+    refused("take two pictures", OnnxPerceptualDistance, write_distance(tmp_path / "one.onnx", inputs=1))
+    refused("LPIPS as an", OnnxPerceptualDistance, tmp_path / "absent.onnx")
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux tells how much memory was in use")
@@ -245,17 +243,13 @@ def test_one_network_with_its_data_behind_it(scene: Path, runs: list[Path]) -> N
 
 
 def test_what_evaluate_wants_and_names_of_networks(scene: Path, runs: list[Path]) -> None:
-    with pytest.raises(InputError, match="give --data"):
-        printed_by(app, "evaluate", runs[0])
-    with pytest.raises(InputError, match="give --out"):
-        printed_by(app, "evaluate", *runs, "--data", scene)
-    with pytest.raises(InputError, match="trained on every slice of these"):
-        unseen_of(training_data([scene]).stacks, [Seen(("card/view_0", "card/view_1"))])
+    refused("give --data", printed_by, app, "evaluate", runs[0])
+    refused("give --out", printed_by, app, "evaluate", *runs, "--data", scene)
+    refused("trained on every slice of these", unseen_of, training_data([scene]).stacks, [Seen(("card/view_0", "card/view_1"))])
     assert network_names([Path("runs/a")]) == [NETWORK]
     assert network_names([Path("runs/a"), Path("b.onnx")]) == ["a", "b"]
     assert network_names([Path("x/lens.onnx"), Path("y/lens.onnx")]) == ["x/lens.onnx", "y/lens.onnx"]
-    with pytest.raises(InputError, match="expected renderers among"):
-        renderer_methods(["gauss"])
+    refused("expected renderers among", renderer_methods, ["gauss"])
     assert mean_known([1.0, float("nan"), 3.0]) == 2.0
     assert np.isnan(mean_known([float("nan")]))
 

@@ -17,6 +17,7 @@ from mrbokeh.renderers.onnx_network import METADATA_KEY, OnnxNetwork
 from mrbokeh.system.errors import InputError
 from tests.scenes.command_line import printed_by
 from tests.scenes.made_networks import jittered
+from tests.scenes.refusals import refused
 from training.cli import app
 from training.export import onnx_export
 from training.export.onnx_export import LARGEST_DIFFERENCE, export_network, largest_difference, picture_for_parity
@@ -113,31 +114,24 @@ def test_a_command_writes_what_computes_the_same_and_nothing_else(tmp_path: Path
     settings = TrainSettings(network=NetworkSettings(tile_px=0, overlap_px=0, blocks=1))
     write_settings(run, settings)
     write_facts(run, FACTS)
-    with pytest.raises(InputError, match="no finished network"):
-        printed_by(app, "export", run, "--out", out)
+    refused("no finished network", printed_by, app, "export", run, "--out", out)
     save_network(run, build_network(settings, FACTS))
     assert "any size" in printed_by(app, "export", run, "--out", out)
-    with pytest.raises(InputError, match="--overwrite"):
-        printed_by(app, "export", run, "--out", out)
+    refused("--overwrite", printed_by, app, "export", run, "--out", out)
     monkeypatch.setattr(onnx_export, "largest_difference", lambda *_: 2 * LARGEST_DIFFERENCE)
-    with pytest.raises(InputError, match="nothing was written"):
-        printed_by(app, "export", run, "--out", tmp_path / "other.onnx")
+    refused("nothing was written", printed_by, app, "export", run, "--out", tmp_path / "other.onnx")
     assert not list(tmp_path.glob("*other*"))
 
 
 def test_foreign_and_damaged_files_are_refused(tmp_path: Path, exported: tuple[BlurNetwork, NetworkSettings, Path]) -> None:
     damaged = tmp_path / "damaged.onnx"
     damaged.write_bytes(exported[2].read_bytes()[:100])
-    with pytest.raises(InputError, match="cannot be opened as an ONNX network"):
-        OnnxNetwork(damaged)
-    with pytest.raises(InputError, match="there is no such file"):
-        OnnxNetwork(tmp_path / "absent.onnx")
+    refused("cannot be opened as an ONNX network", OnnxNetwork, damaged)
+    refused("there is no such file", OnnxNetwork, tmp_path / "absent.onnx")
     foreign = onnx.load(exported[2])
     del foreign.metadata_props[:]
     onnx.save(foreign, tmp_path / "foreign.onnx")
-    with pytest.raises(InputError, match="does not say which lens"):
-        OnnxNetwork(tmp_path / "foreign.onnx")
+    refused("does not say which lens", OnnxNetwork, tmp_path / "foreign.onnx")
     foreign.metadata_props.add(key=METADATA_KEY, value=json.dumps({"format": onnx_network.FORMAT, "version": 99}))
     onnx.save(foreign, tmp_path / "newer.onnx")
-    with pytest.raises(InputError, match="export it again"):
-        OnnxNetwork(tmp_path / "newer.onnx")
+    refused("export it again", OnnxNetwork, tmp_path / "newer.onnx")

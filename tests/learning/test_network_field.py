@@ -15,6 +15,7 @@ from mrbokeh.system.errors import InputError
 from tests.renderers.test_onnx_network import LARGEST_COC_PX, LENS, card
 from tests.renderers.test_onnx_network import SIZE as ITS_SIZE
 from tests.scenes.made_networks import jittered
+from tests.scenes.refusals import refused
 from training.export.onnx_export import export_network, network_facts_of
 from training.fitting.run_folder import RunFacts, build_network, facts_from_json
 from training.fitting.settings import TrainSettings, demo_settings
@@ -94,8 +95,7 @@ def test_the_place_reaches_the_published_form_through_c1() -> None:
     assert network.tiles.c1.weight.shape == (3, 6, 1, 1)
     rgb, coc_px = torch.rand(1, 3, *SIZE), torch.zeros(1, 1, *SIZE)
     assert not torch.allclose(network(rgb, coc_px, _place()), network(rgb, coc_px, _place() * 0.0))
-    with pytest.raises(InputError, match="made with field_position, so it needs place"):
-        network(rgb, coc_px)
+    refused("made with field_position, so it needs place", network, rgb, coc_px)
 
 
 def _lights(seed: int) -> tuple[Tensor, Tensor]:
@@ -176,8 +176,7 @@ def test_ranges_are_the_runs_not_the_weights_and_one_lens_is_one(exported: OnnxN
     assert facts_from_json(FACTS.to_json(), "here").f_numbers == (1.4, 5.6)
     old = {name: value for name, value in FACTS.to_json().items() if name not in ("f_numbers", "focal_lengths_mm")}
     assert facts_from_json(old, "here").f_numbers is None
-    with pytest.raises(InputError, match="needs the ranges of f-number"):
-        BlurNetwork(SETTINGS, 7.0, 4.0)
+    refused("needs the ranges of f-number", BlurNetwork, SETTINGS, 7.0, 4.0)
     # Trained on one lens alone, with lens_inputs it takes that lens and no other; without them no range is written.
     facts = replace(FACTS, f_numbers=None, focal_lengths_mm=None)
     of_one = network_facts_of(_network(facts=facts), SETTINGS, facts)
@@ -196,8 +195,7 @@ def test_the_lens_changes_the_result_and_must_be_given(settings: NetworkSettings
     place = torch.zeros(2, 2, 20, 30)
     open_and_closed = network(rgb, coc_px, place, torch.tensor([[1.4, 35.0], [5.6, 35.0]]))
     assert not torch.allclose(open_and_closed[0], open_and_closed[1], atol=1e-3)
-    with pytest.raises(InputError, match="made with lens_inputs, so it needs lens"):
-        network(rgb, coc_px, place)
+    refused("made with lens_inputs, so it needs lens", network, rgb, coc_px, place)
 
 
 @pytest.mark.slow
@@ -219,8 +217,7 @@ def test_lenses_outside_the_trained_range_are_refused(exported: OnnxNetwork) -> 
         (replace(LENS, focal_length_mm=50.0), "trained for a lens with focal_length_mm 35, but came with 50"),
         (replace(LENS, sensor_width_mm=36.0), "trained for a lens with sensor_width_mm 5, but came with 36"),
     ):
-        with pytest.raises(InputError, match=message):
-            exported.render([card(1.0)], lens)
+        refused(message, exported.render, [card(1.0)], lens)
     with pytest.raises(InputError, match=r"f_number from 1\.4 to 5\.6, but came with 1"):
         exported.blur(np.zeros((8, 8, 3), np.float32), np.zeros((8, 8), np.float32), lens=(1.0, 35.0))
 

@@ -15,9 +15,9 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.renderers.onnx_network import facts_from_json
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
 from mrbokeh.stacks.focal_stack_dataset import slices_to_hold_out
-from mrbokeh.system.errors import InputError
 from tests.learning.test_train import DEMO_LIKE, LENS
 from tests.scenes.command_line import printed_by
+from tests.scenes.refusals import refused
 from training.cli import app
 from training.data.dataset import PairSet
 from training.data.stacks import Seen, stack_name
@@ -124,8 +124,7 @@ def test_what_was_held_out_is_recorded_and_what_any_network_saw_is_not_unseen(sc
     unseen = unseen_of(stacks, [Seen((name,), (1, 3)), Seen((name,), (3, 4)), Seen(("elsewhere/view",))])
     assert unseen.slices == {name: [3]}
     assert not unseen_of(stacks, [Seen(("elsewhere/view",))]).slices
-    with pytest.raises(InputError, match="every slice of these stacks"):
-        unseen_of(stacks, [Seen((name,))])
+    refused("every slice of these stacks", unseen_of, stacks, [Seen((name,))])
 
 
 def test_evaluate_judges_a_network_of_one_stack_on_the_slices_held_out(scene: Path, run: Path, tmp_path: Path) -> None:
@@ -172,8 +171,7 @@ def test_a_budget_without_time_for_200_steps_is_refused_and_nothing_changes(
     for name in ("old", "new"):
         clock = itertools.count()
         monkeypatch.setattr(Run, "_now_s", lambda _, clock=clock: 60.0 * next(clock))
-        with pytest.raises(InputError, match=r"10 minutes make about 11 steps of 60 s.*give --minutes \d+"):
-            printed_by(app, *arguments, tmp_path / name)
+        refused(r"10 minutes make about 11 steps of 60 s.*give --minutes \d+", printed_by, app, *arguments, tmp_path / name)
     assert (tmp_path / "old" / "network.pt").read_bytes() == b"kept" and not (tmp_path / "new").exists()
 
 

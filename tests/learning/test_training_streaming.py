@@ -16,6 +16,7 @@ from mrbokeh.optics.camera import field_positions
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 from training.data.batches import Batch, Drawing, draw_batch, draw_share, network_inputs, stack_pairs
 from training.data.dataset import PairSet, ReadAhead, Window, read_pair
 from training.data.exr_rows import exr_size_px, read_rows
@@ -100,17 +101,13 @@ def test_files_of_any_compression(tmp_path: Path, compression: str) -> None:
 
 def test_damaged_and_missing_files_say_so(tmp_path: Path) -> None:
     write_exr(tmp_path / "a.exr", ExrPart({"R": np.random.default_rng(0).random((64, 64)).astype(np.float32)}))
-    with pytest.raises(InputError, match=r"a.exr: expected the EXR channels \['Z'\]"):
-        read_rows(tmp_path / "a.exr", slice(0, 64), ["Z"])
+    refused(r"a.exr: expected the EXR channels \['Z'\]", read_rows, tmp_path / "a.exr", slice(0, 64), ["Z"])
     content = (tmp_path / "a.exr").read_bytes()
     (tmp_path / "a.exr").write_bytes(content[: len(content) // 2])
-    with pytest.raises(InputError, match=r"a.exr cannot be read as EXR"):
-        read_rows(tmp_path / "a.exr", slice(0, 64), ["R"])
+    refused(r"a.exr cannot be read as EXR", read_rows, tmp_path / "a.exr", slice(0, 64), ["R"])
     (tmp_path / "b.exr").write_bytes(b"no picture")
-    with pytest.raises(InputError, match=r"b.exr cannot be read as EXR"):
-        exr_size_px(tmp_path / "b.exr")
-    with pytest.raises(InputError, match=r"expected an EXR file at .*c.exr"):
-        exr_size_px(tmp_path / "c.exr")
+    refused(r"b.exr cannot be read as EXR", exr_size_px, tmp_path / "b.exr")
+    refused(r"expected an EXR file at .*c.exr", exr_size_px, tmp_path / "c.exr")
 
 
 @pytest.mark.parametrize("whole", [True, False], ids=["whole pictures", "crops"])
@@ -217,8 +214,7 @@ def test_a_mistake_in_the_reading_thread_is_told(tmp_path: Path) -> None:
     draw_batch(pairs, 1, 40, 3, rng)
     stack.depth_path.unlink()
     for _ in range(2):
-        with pytest.raises(InputError, match=r"expected an EXR file at .*depth.exr, but there is none"):
-            draw_many()
+        refused(r"expected an EXR file at .*depth.exr, but there is none", draw_many)
     pairs.close()
 
 
@@ -269,8 +265,7 @@ def test_several_lenses_where_the_network_is_told(stacks: list[FocalStack]) -> N
     """1.4 and 2.8 at 50 mm, 4 at 85 mm: the ranges are those, the lens is the one in the middle; another sensor is refused."""
     lenses = (LENS, replace(LENS, f_number=2.8), replace(LENS, focal_length_mm=85.0, f_number=4.0))
     mixed = [replace(stack, lens=lens) for stack, lens in zip(stacks, lenses, strict=True)]
-    with pytest.raises(InputError, match="one network learns one lens"):
-        gather_facts(PairSet(mixed))
+    refused("one network learns one lens", gather_facts, PairSet(mixed))
     facts = gather_facts(PairSet(mixed), several_lenses=True)
     assert (facts.f_numbers, facts.focal_lengths_mm) == ((1.4, 4.0), (50.0, 85.0))
     assert (facts.lens.f_number, facts.lens.focal_length_mm) == (2.8, 50.0)

@@ -16,7 +16,7 @@ from mrbokeh.scene.environment_filter import LightingMaps, _moments, filtered, l
 from mrbokeh.scene.light import directions, solid_angles_sr
 from mrbokeh.scene.mesh import rigid_motion
 from mrbokeh.scene.packed_scene import packed
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 LOOKING_DOWN = np.array([[1, 0, 0, 0], [0, 0.8, -0.6, 0], [0, 0.6, 0.8, 3.0], [0, 0, 0, 1.0]])
 CAMERA = Camera(201, 115, (160.0, 158.0), (99.3, 60.7), LOOKING_DOWN)
@@ -106,8 +106,7 @@ class TestEdges:
             ((3, 1), "expected 4 or 16 as edge_samples, got 3: take one"),
             ((4, 0), "from 1 on as shadow_step_px, got 0"),
         ):
-            with pytest.raises(InputError, match=told):
-                EmbreeRaycaster(edge_samples=quality[0], shadow_step_px=quality[1])
+            refused(told, EmbreeRaycaster, edge_samples=quality[0], shadow_step_px=quality[1])
 
 
 def plain_edge_pixels(

@@ -17,7 +17,7 @@ from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.gltf.gltf_loader import GltfAsset, load_glb
 from mrbokeh.scene.moving_layers import FilmedScene, ShutterTiming, accumulated, moving_layer, moving_shadow_layer
 from mrbokeh.scene.moving_layers.moving_layer import MotionQuality, ShadowCatcher, SurfacePoints, paths_of
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 OBJECTS = Path(__file__).resolve().parents[2] / "mrbokeh" / "demo_data" / "objects"
 CAMERA = Camera(160, 107, (173.0, 170.0), (79.0, 55.0))
@@ -296,12 +296,9 @@ def test_the_average_of_moments_is_their_mean_and_shutters_that_cannot_be() -> N
     np.testing.assert_allclose(mean.alpha, np.mean([each.alpha for each in by_hand], axis=0), atol=1e-6)
     np.testing.assert_allclose(mean.depth_m[mean.alpha > 0], 2.0, rtol=1e-6)
     assert np.isinf(mean.depth_m[mean.alpha == 0]).all()
-    with pytest.raises(InputError, match="frame rate above 0"):
-        ShutterTiming(0.0)
-    with pytest.raises(InputError, match="0 to 360"):
-        ShutterTiming(24.0, 400.0)
-    with pytest.raises(InputError, match="at least one picture"):
-        accumulated(RENDERER.render, FilmedScene(moving(board()), panning(), SHUTTER), 0.0, 0)
+    refused("frame rate above 0", ShutterTiming, 0.0)
+    refused("0 to 360", ShutterTiming, 24.0, 400.0)
+    refused("at least one picture", accumulated, RENDERER.render, FilmedScene(moving(board()), panning(), SHUTTER), 0.0, 0)
 
 
 LOOKING_DOWN = np.array([[1.0, 0, 0, 0], [0, 0.8, -0.6, 0.9], [0, 0.6, 0.8, 0.8], [0, 0, 0, 1.0]])

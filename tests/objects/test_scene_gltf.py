@@ -15,7 +15,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Scene, world_from_scene_placing
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.gltf.gltf_loader import GltfAsset, load_glb
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 OBJECTS = ("DepthOfFieldExample", "FlightHelmet", "Fox", "GolfBall", "alien", "cakeBirthday")
 CORNERS = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]], np.float32)
@@ -217,21 +217,17 @@ def test_skin_moves_vertices_with_their_joints(tmp_path: Path) -> None:
 
 
 def test_broken_and_unsupported_files_say_what_to_do(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="check the path"):
-        load_glb(tmp_path / "missing.glb")
+    refused("check the path", load_glb, tmp_path / "missing.glb")
     (tmp_path / "noise.glb").write_bytes(b"not a model at all, but long enough")
-    with pytest.raises(InputError, match="export it again"):
-        load_glb(tmp_path / "noise.glb")
+    refused("export it again", load_glb, tmp_path / "noise.glb")
     writer = GlbWriter()
     writer.square()
     writer.json["extensionsRequired"] = ["KHR_draco_mesh_compression"]
-    with pytest.raises(InputError, match="KHR_draco_mesh_compression"):
-        load_glb(writer.write(tmp_path / "draco.glb"))
+    refused("KHR_draco_mesh_compression", load_glb, writer.write(tmp_path / "draco.glb"))
     writer = GlbWriter()
     writer.square()
     writer.json["accessors"][0]["count"] = 4000
-    with pytest.raises(InputError, match="cut short"):
-        load_glb(writer.write(tmp_path / "short.glb"))
+    refused("cut short", load_glb, writer.write(tmp_path / "short.glb"))
 
 
 @pytest.fixture(scope="module")
@@ -274,5 +270,4 @@ def test_fox_runs(shared_data: Path) -> None:
     for corners in points:
         triangles = corners.reshape(-1, 3, 3)
         assert np.linalg.norm(triangles - np.roll(triangles, 1, axis=1), axis=-1).max() < 55.0
-    with pytest.raises(InputError, match="Survey"):
-        asset.scene_at(0.0, "Jump")
+    refused("Survey", asset.scene_at, 0.0, "Jump")

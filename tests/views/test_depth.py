@@ -22,9 +22,9 @@ from mrbokeh.images.image_io import read_image
 from mrbokeh.optics.camera import Camera
 from mrbokeh.stacks.focal_stack import find_focal_stacks, read_focal_stack
 from mrbokeh.system.atomic_files import write_json
-from mrbokeh.system.errors import InputError
 from tests.scenes.capture_truth import ViewTruth, picture_db, view_truth
 from tests.scenes.command_line import printed_by
+from tests.scenes.refusals import refused
 
 RAW = DATA / "raw_stack"
 POINTS_A_VIEW = 400
@@ -141,8 +141,7 @@ def test_depth_of_another_focus_does_not_go_into_a_data_set(deepened: Path) -> N
     stack = read_focal_stack(deepened / VIEWS[0])
     require_usable(stack)
     moved = tuple(replace(each, focus_distance_m=1.1 * (each.focus_distance_m or 0.0)) for each in stack.slices)
-    with pytest.raises(InputError, match="run `mrbokeh capture depth`"):
-        require_usable(replace(stack, slices=moved))
+    refused("run `mrbokeh capture depth`", require_usable, replace(stack, slices=moved))
 
 
 @pytest.mark.slow
@@ -163,16 +162,13 @@ def test_a_stack_without_a_pose_keeps_its_depth_from_focus(merged: Path, truths:
 def test_what_is_missing_is_said_before_anything_changes(merged: Path, tmp_path: Path) -> None:
     scene = tmp_path / "desk"
     shutil.copytree(merged, scene, ignore=shutil.ignore_patterns("reconstruction"))
-    with pytest.raises(InputError, match="capture poses"):
-        printed_by(app, "depth", scene)
+    refused("capture poses", printed_by, app, "depth", scene)
     write_sparse_model(scene / "reconstruction", read_sparse_model(merged / "reconstruction"))
-    with pytest.raises(InputError, match="capture scale"):
-        deepen_scene(scene)
+    refused("capture scale", deepen_scene, scene)
     assert len(find_focal_stacks(scene)) == 3
     # The package pycolmap of the extra is built without CUDA.
     write_json(scene / "reconstruction" / "scale.json", {"metres_per_unit": 1.0})
-    with pytest.raises(InputError, match="pycolmap-cuda12"):
-        deepen_scene(scene, SceneDepthSettings(patch_match=True))
+    refused("pycolmap-cuda12", deepen_scene, scene, SceneDepthSettings(patch_match=True))
     assert not list(scene.rglob("first_pass"))
 
 

@@ -26,8 +26,8 @@ from capture.scale.board import (
 from capture.scale.focus import FocusSample, focus_scale, sharpness_curves, sharpness_peaks, stated_sigma_dioptre
 from mrbokeh.optics.camera import Camera
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
-from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, read_board
+from tests.scenes.refusals import refused
 
 METRES_PER_UNIT = 0.2
 BOARD = CharucoBoard((CharucoGrid((8, 6), 30.0, 22.0),))
@@ -160,8 +160,7 @@ def test_boards_come_from_options_and_files_and_intervals_from_slices(tmp_path: 
     ],
 )
 def test_mistakes_are_named(make: Callable[[], object], message: str) -> None:
-    with pytest.raises(InputError, match=message):
-        make()
+    refused(message, make)
 
 
 def test_a_distance_between_two_cameras() -> None:
@@ -239,5 +238,4 @@ def test_the_board_counts_most_and_the_others_are_told(tmp_path: Path) -> None:
     assert read.contradictions == ("focus",), "5 % are more than 2 % and ten deviations"
     unsure = ScaleResult.of([replace(answers[0], uncertainty=0.03), answers[1]], {})
     assert unsure.contradictions == (), "5 % are less than two deviations"
-    with pytest.raises(InputError, match="board: none was given; focus: unknown"):
-        ScaleResult.of([], {"focus": "unknown", "board": "none was given"})
+    refused("board: none was given; focus: unknown", ScaleResult.of, [], {"focus": "unknown", "board": "none was given"})
