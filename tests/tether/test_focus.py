@@ -192,8 +192,7 @@ def test_exposure_read_out() -> None:
     preview = np.full((40, 40, 3), 120, np.uint8)
     preview[:10], preview[20:] = 255, 0
     reading = read_live(preview)
-    assert (reading.clipped, reading.black) == (0.25, 0.5)
-    assert reading.histogram.sum() == pytest.approx(1.0)
+    assert (reading.clipped, reading.black) == (0.25, 0.5) and reading.histogram.sum() == pytest.approx(1.0)
     assert reading.histogram[[0, 15, 31]] == pytest.approx([0.5, 0.25, 0.25])
     assert reading.bars()[0] == "█" and len(reading.bars()) == 32
     one_channel = np.full((8, 8, 3), 100, np.uint8)
@@ -213,8 +212,7 @@ def test_sharpness_does_not_depend_on_exposure_but_on_blur() -> None:
 def test_a_spot_reads_its_own_part() -> None:
     preview = np.concatenate([checkerboard(0, 200), np.full((64, 96, 3), 100, np.uint8)], axis=1)
     left, right = (read_live(preview, Spot(x, 0.5, 0.1)) for x in (0.25, 0.75))
-    assert right.sharpness < 1e-6 < left.sharpness
-    assert Spot(0.0, 1.0, 0.1).cut(preview).shape == (20, 20, 3)
+    assert right.sharpness < 1e-6 < left.sharpness and Spot(0.0, 1.0, 0.1).cut(preview).shape == (20, 20, 3)
     with pytest.raises(InputError, match="a spot needs"):
         Spot(1.2, 0.5)
 

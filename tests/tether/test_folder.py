@@ -43,8 +43,7 @@ def jpeg(seed: int = 0) -> bytes:
 
 def dng(folder: Path) -> bytes:
     """Made outside of the watched folder."""
-    sensor = SensorModel()
-    path = folder.parent / "made.dng"
+    sensor, path = SensorModel(), folder.parent / "made.dng"
     write_dng(path, np.full((32, 48), 3000, np.uint16), sensor, ShotMetadata(LENS))
     return path.read_bytes()
 
@@ -72,8 +71,7 @@ def test_a_slow_writer(folder: Path, kind: str) -> None:
     parts = [data[start : start + quarter] for start in range(0, len(data), quarter)]
     time = SimulatedTime(events=[(10.0 + 8.0 * index, lambda part=part: append(path, part)) for index, part in enumerate(parts)])
     shot = watched(folder, time).capture()
-    assert shot.data == data and shot.name == path.name and shot.steps is None
-    assert time.now_s > 10.0 + 8.0 * 3
+    assert shot.data == data and shot.name == path.name and shot.steps is None and time.now_s > 10.0 + 8.0 * 3
     assert path.read_bytes() == data, "the photographer's file stays"
 
 
@@ -86,8 +84,7 @@ def test_a_file_that_grows_after_its_end_mark_is_not_taken_yet(folder: Path) -> 
 
 def test_raw_goes_before_its_jpeg_and_both_are_one_shot(folder: Path) -> None:
     """The JPEG comes first, as cards send it; the RAW two seconds later. The next shot is another name."""
-    raw = dng(folder)
-    time = SimulatedTime()
+    raw, time = dng(folder), SimulatedTime()
     time.events = [
         (1.0, lambda: append(folder / "IMG_1.JPG", jpeg(1))), (3.0, lambda: append(folder / "IMG_1.DNG", raw)),
         (20.0, lambda: append(folder / "IMG_2.JPG", jpeg(2))), (21.0, lambda: append(folder / "notes.txt", b"no photograph")),

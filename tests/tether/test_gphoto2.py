@@ -92,8 +92,7 @@ def test_the_virtual_camera_is_listed_with_what_it_can(answers: dict[str, Any]) 
 def test_the_virtual_camera_is_configured(answers: dict[str, Any]) -> None:
     """Of what it has: 1/50 s is its "0.0200s"; f/4 is the nearest to 4.1; what was set stays."""
     expected = {"autofocus": "Off", "capture target": "Internal RAM", "exposure time": "0.0200s", "f-number": "f/4"}
-    assert answers["settings"] == answers["again"] == expected
-    assert "cannot be set over the cable" in answers["iso"]
+    assert answers["settings"] == answers["again"] == expected and "cannot be set over the cable" in answers["iso"]
     assert answers["wide"].startswith("InputError: the camera has no f-number of 1.4: it offers f/2.8,")
 
 
@@ -106,8 +105,7 @@ def test_the_virtual_camera_captures_and_hands_over(answers: dict[str, Any], car
 
 
 def test_what_the_virtual_camera_has_not_is_said(answers: dict[str, Any]) -> None:
-    assert answers["preview"].startswith("CameraError: the live view failed")
-    assert "--by-hand" in answers["focus"]
+    assert answers["preview"].startswith("CameraError: the live view failed") and "--by-hand" in answers["focus"]
     assert answers["missing"].startswith("CameraError: copying no.jpg failed")
     assert answers["port"] == "CameraError: no camera at usb:009,009, only at Nikon DSC D750 at usb:001,001"
 
@@ -244,8 +242,7 @@ def test_a_nikon_homes_at_the_end_error_and_counts_from_there(stop: Stop) -> Non
     axis.move_to(35040)
     assert stand_in.motor.lens == (35000 if stop is Stop.near else 5000)
     axis.move_to(1040)
-    assert stand_in.motor.lens == (1000 if stop is Stop.near else 39000)
-    assert camera.capture().steps == 1040 * stop.away
+    assert stand_in.motor.lens == (1000 if stop is Stop.near else 39000) and camera.capture().steps == 1040 * stop.away
     with pytest.raises(EndStop):
         camera.focus_step(stop.away * 50000)
     # One that runs the other way.
@@ -258,8 +255,7 @@ def test_a_canon_needs_none_between_steps() -> None:
     stand_in = canon()
     camera = driver_of(stand_in)
     camera.home(Stop.near)
-    assert stand_in.motor.lens == 0
-    assert stand_in.set_log.count(("manualfocusdrive", "Near 3")) == CANON_STEPS_HOME
+    assert stand_in.motor.lens == 0 and stand_in.set_log.count(("manualfocusdrive", "Near 3")) == CANON_STEPS_HOME
     camera.focus_step(40)
     assert stand_in.motor.lens == 200
     camera.focus_step(-10)
@@ -297,8 +293,7 @@ def test_live_view_its_end_and_the_raw_of_two_files() -> None:
 def test_what_a_stand_in_can() -> None:
     words = ("JPEG Fine", "NEF (Raw)", "NEF+Fine")
     abilities = driver_of(nikon(imagequality=Widget("JPEG Fine", words))).describe().abilities
-    assert abilities == set(Ability)
-    assert driver_of(StandIn({})).describe().abilities == {Ability.shutter}
+    assert abilities == set(Ability) and driver_of(StandIn({})).describe().abilities == {Ability.shutter}
 
 
 def test_a_full_configuration() -> None:

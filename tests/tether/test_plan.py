@@ -82,8 +82,7 @@ def test_motor_steps() -> None:
     free, plan = plan_focus(LENS, focus_range, 960), plan_for_motor(LENS, focus_range, 960, 1.0, motor_step_dioptres=0.03)
     steps = -np.diff(plan.dioptres) / 0.03
     assert steps == pytest.approx(np.round(steps)) and np.ptp(steps) < 1e-9
-    assert plan.residual_px <= 1.0 and len(plan) >= len(free)
-    assert plan.dioptres[-1] <= 0.4 < plan.dioptres[-2]
+    assert plan.residual_px <= 1.0 and len(plan) >= len(free) and plan.dioptres[-1] <= 0.4 < plan.dioptres[-2]
     coarse = plan_for_motor(LENS, focus_range, 960, 1.0, motor_step_dioptres=0.4)
     assert -np.diff(coarse.dioptres) == pytest.approx([0.4] * 4) and coarse.residual_px > 1.0
     assert plan_for_motor(LENS, FocusRange(0.5, math.inf), 960, 1.0, motor_step_dioptres=0.07).dioptres[-1] == 0.0

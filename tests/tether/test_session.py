@@ -54,8 +54,7 @@ def test_all_stacks_of_a_scene_share_one_exposure_scale(tmp_path: Path) -> None:
     shoot = make_views(tmp_path / "shoot", view_0=(sixtieth, sixtieth), view_1=(sixtieth / 4, sixtieth / 8))
     stacks = stacks_by_name(ingest([shoot], tmp_path / "scene"))
     gains = {name: [each.metadata["exposure_gain"] for each in stack.slices] for name, stack in stacks.items()}
-    assert gains["view_0"] == [1.0, 1.0]
-    assert gains["view_1"] == pytest.approx([4.0, 8.0])
+    assert gains["view_0"] == [1.0, 1.0] and gains["view_1"] == pytest.approx([4.0, 8.0])
     assert stacks["view_1"].slices[1].metadata["exposure_gain_session"] == pytest.approx(4.0)
     assert stacks["view_1"].slices[1].metadata["saturation_level"] == pytest.approx(8.0)
     means = [stack.slice_rgb(index).mean(axis=(0, 1)) for stack in stacks.values() for index in range(2)]
@@ -111,8 +110,7 @@ def test_developed_pictures_join_a_raw_stack_in_its_primaries(tmp_path: Path) ->
         make_raw_photo(tmp_path / "shoot" / f"{index}.dng", rgb, 0.6)
     write_image(tmp_path / "shoot" / "2.png", rgb)
     stack = only_stack(ingest([tmp_path / "shoot"], tmp_path / "scene", IngestSettings(grouping=Grouping.none)))
-    assert np.abs(stack.slice_rgb(2) - rgb).max() < 2e-5
-    assert np.abs(stack.slice_camera_rgb(2) - rgb).max() > 0.01
+    assert np.abs(stack.slice_rgb(2) - rgb).max() < 2e-5 and np.abs(stack.slice_camera_rgb(2) - rgb).max() > 0.01
 
 
 def test_overlap_tells_what_metadata_do_not(tmp_path: Path) -> None:
@@ -124,8 +122,7 @@ def test_overlap_tells_what_metadata_do_not(tmp_path: Path) -> None:
     reports = {each.name: each for each in ingest([tmp_path / "shoot"], tmp_path / "scene").stacks}
     stacks = {name: report.stack for name, report in reports.items() if report.stack is not None}
     gains = {name: [each.metadata["exposure_gain"] for each in stack.slices] for name, stack in stacks.items()}
-    assert gains["a"] == gains["c"] == [1.0, 1.0]
-    assert gains["b"] == pytest.approx([1 / 0.7] * 2, rel=0.005)
+    assert gains["a"] == gains["c"] == [1.0, 1.0] and gains["b"] == pytest.approx([1 / 0.7] * 2, rel=0.005)
     assert not any("does not state its exposure" in remark for remark in reports["a"].remarks)
     assert any("compared with a the gain is 1.43" in remark for remark in reports["b"].remarks)
     assert any("may be on another scale than that of a" in remark for remark in reports["c"].remarks)
