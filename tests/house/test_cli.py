@@ -62,8 +62,7 @@ def test_help_of_every_command(command: list[str], monkeypatch: pytest.MonkeyPat
 
 def test_a_mistake_is_one_sentence_and_a_code(tmp_path: Path) -> None:
     done = started("lens", "show", tmp_path / "none.json", "--out", tmp_path / "a.png")
-    assert done.returncode == 2
-    assert done.stderr.startswith("error: expected a lens file")
+    assert done.returncode == 2 and done.stderr.startswith("error: expected a lens file")
     assert "Traceback" not in done.stderr and not (tmp_path / "a.png").exists()
 
 
@@ -89,8 +88,7 @@ def test_a_missing_extra_names_the_pip_command(tmp_path: Path) -> None:
     )
     (tmp_path / "run").mkdir()
     done = started("train", "export", tmp_path / "run", "--out", tmp_path / "a.onnx", PYTHONPATH=f"{tmp_path}:{Path.cwd()}")
-    assert done.returncode == 2
-    assert "pip install 'mrbokeh[train]'" in done.stderr
+    assert done.returncode == 2 and "pip install 'mrbokeh[train]'" in done.stderr
 
 
 def test_extras_are_those_of_the_package() -> None:

@@ -123,8 +123,7 @@ def test_a_kernel_runs_where_nothing_can_be_written(
         assert told.count("\n") == 1 and "compiled anew each time" in told
         monkeypatch.setattr(kernels.tempfile, "gettempdir", lambda: str(tmp_path))
         kernels._writable_base.cache_clear()
-        kept = kernels._writable_base()
-        told = capsys.readouterr().err
+        kept, told = kernels._writable_base(), capsys.readouterr().err
         assert kept is not None and kept.parent == tmp_path and kept.stat().st_mode & 0o077 == 0
         assert told.count("\n") == 1 and f"kept in {kept}" in told
     finally:
@@ -151,8 +150,7 @@ def next_of_fibonacci(n: int) -> int:
 
 
 def test_what_kernels_call_becomes_machine_code_only_where_python_calls_it() -> None:
-    assert next_of_fibonacci(10) == 56
-    assert not fibonacci.signatures
+    assert next_of_fibonacci(10) == 56 and not fibonacci.signatures
     assert fibonacci(10) == 55 and len(fibonacci.signatures) == 1
     with pytest.raises(ValueError, match="a negative place"):
         next_of_fibonacci(-1)

@@ -63,8 +63,7 @@ def test_long_work_is_told_less_and_less_often(clock: Clock, said: io.StringIO) 
     """An hour in seconds: ten lines in the first 100 s, and one for each twentieth of the time from 200 s on, 1.05^n."""
     list(track(slow(clock, 3600, 1.0), "train", 3600))
     lines = said.getvalue().splitlines()
-    assert sum(int(line.split()[1]) <= 100 for line in lines) == 10
-    assert 60 < len(lines) < 85
+    assert sum(int(line.split()[1]) <= 100 for line in lines) == 10 and 60 < len(lines) < 85
 
 
 @pytest.mark.parametrize(("total", "lines"), [(0, ["frames: 4, 0:00:08"]), (2, ["frames: 2 of 2, 0:00:04", "frames: 4 of 2, 0:00:08"])])
@@ -109,8 +108,7 @@ def test_memory_that_is_given_back_as_zeros_is_handed_out_again_if_it_is_large_e
     assert memory.take(80, np.float32) is first
     assert memory.take(80, np.float32) is not first, "one array to one taker"
     memory.give_back(first)
-    assert memory.take(101, np.float32).size == 101
-    assert memory.take(80, np.float64).dtype == np.float64
+    assert memory.take(101, np.float32).size == 101 and memory.take(80, np.float64).dtype == np.float64
 
 
 def test_what_is_too_large_is_not_kept() -> None:
@@ -118,8 +116,7 @@ def test_what_is_too_large_is_not_kept() -> None:
     small, large = memory.take(100, np.float32), memory.take(101, np.float32)
     memory.give_back(large)
     memory.give_back(small)
-    assert memory.take(1, np.float32) is small
-    assert memory.take(1, np.float32) is not large
+    assert memory.take(1, np.float32) is small and memory.take(1, np.float32) is not large
 
 
 TWO = [("A", "usb:001,001"), ("B", "usb:001,002")]
@@ -134,8 +131,7 @@ class GPhoto2Error(Exception):
 
 
 def test_the_only_camera_or_the_one_that_is_named() -> None:
-    assert chosen_of(TWO[:1], None, "--camera") == TWO[0]
-    assert chosen_of(TWO, "usb:001,002", "--camera") == TWO[1]
+    assert chosen_of(TWO[:1], None, "--camera") == TWO[0] and chosen_of(TWO, "usb:001,002", "--camera") == TWO[1]
 
 
 def test_a_camera_that_is_not_there() -> None:

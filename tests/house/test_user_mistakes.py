@@ -1,5 +1,5 @@
-"""What users get wrong on any day, damaged and too new files: one sentence says what was expected, with the whole path and without the words
-of libraries, the code is 2, and nothing that they have is lost."""
+"""What users get wrong on any day, damaged and too new files: one sentence says what was expected, with the whole path and without the
+words of libraries, the code is 2, and nothing that they have is lost."""
 
 import os
 import re
