@@ -104,14 +104,11 @@ def test_alpha_is_stored_beside_straight_colour(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("size", "tag", "range_tag", "matrix", "full"),
     [
-        ((1280, 720), "untagged", 0, "709", False),
-        ((720, 576), "untagged", 0, "601", False),
-        ((1280, 720), "601", 1, "601", False),
-        ((720, 576), "709", 1, "709", False),
-        ((1280, 720), "709", 2, "709", True),
+        ((1280, 720), "untagged", 0, "709", False), ((720, 576), "untagged", 0, "601", False),
+        ((1280, 720), "601", 1, "601", False), ((720, 576), "709", 1, "709", False), ((1280, 720), "709", 2, "709", True),
         ((720, 576), "601", 2, "601", True),
     ],
-)
+)  # fmt: skip
 def test_tags_decide_and_missing_tags_follow_the_size(
     tmp_path: Path, size: tuple[int, int], tag: str, range_tag: int, matrix: str, full: bool
 ) -> None:
@@ -166,8 +163,7 @@ def test_transfer_curves() -> None:
 @pytest.mark.parametrize("vertical", [False, True])
 def test_chroma_does_not_wander(tmp_path: Path, encoding: str, suffix: str, largest_px: float, vertical: bool) -> None:
     """Chroma read half a pixel beside where it was written shows as half a pixel of a slope, with the slope's sign (rounding has none)."""
-    ramp = (np.arange(64) + 0.5) / 64
-    shifts_px = []
+    ramp, shifts_px = (np.arange(64) + 0.5) / 64, []
     for sign in (1, -1):
         codes = np.stack([0.5 + 0.2 * sign * (2 * ramp - 1), np.full_like(ramp, 0.4), 0.5 - 0.2 * sign * (2 * ramp - 1)], -1)
         codes = codes[None].repeat(64, axis=0).astype(np.float32)
@@ -198,8 +194,7 @@ def test_real_clips_keep_their_frames_and_times(tmp_path: Path, shared_data: Pat
 
 def test_a_real_clip_survives(tmp_path: Path, shared_data: Path) -> None:
     source = shared_data / "video" / "ducks_720p.mp4"
-    info = probe(source)
-    path = tmp_path / "ducks.mov"
+    info, path = probe(source), tmp_path / "ducks.mov"
     with VideoWriter(path, info.width_px, info.height_px, info.frame_rate, info.time_base, audio_from=source) as writer:
         for frame in read_frames(source, 30, 32):
             writer.write(frame.rgb, frame.time_s)
