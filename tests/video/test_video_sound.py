@@ -60,13 +60,10 @@ def black(out: Path, source: Path, start_s: float) -> str:
 @pytest.mark.parametrize(
     ("source", "rate", "suffix", "codec"),
     [
-        ("aac.mp4", 44100, ".mxf", "pcm_s24le"),
-        ("flac.mkv", 48000, ".mxf", "pcm_s16le"),
-        ("flac.mkv", 44100, ".mov", "pcm_s16le"),
-        ("libopus.mkv", 48000, ".mov", "pcm_s24le"),
-        ("flac.mkv", 44100, ".mp4", "aac"),
+        ("aac.mp4", 44100, ".mxf", "pcm_s24le"), ("flac.mkv", 48000, ".mxf", "pcm_s16le"), ("flac.mkv", 44100, ".mov", "pcm_s16le"),
+        ("libopus.mkv", 48000, ".mov", "pcm_s24le"), ("flac.mkv", 44100, ".mp4", "aac"),
     ],
-)
+)  # fmt: skip
 def test_sound_arrives_when_and_as_loud_as_it_was(tmp_path: Path, source: str, rate: int, suffix: str, codec: str, start_s: float) -> None:
     """The tone begins at 0.5 s less the start, and is cut where the last of 30 pictures ends, at 1.2 s: 57600 samples.
 
@@ -87,22 +84,18 @@ def test_sound_arrives_when_and_as_loud_as_it_was(tmp_path: Path, source: str, r
     assert np.abs(samples).max() < 0.525
 
 
-def test_sixteen_bits_at_48_khz_come_through_bit_for_bit(tmp_path: Path) -> None:
+def test_sixteen_bits_at_48_khz_come_through_bit_for_bit_and_what_is_missing_is_silence(tmp_path: Path) -> None:
+    """Sound that begins late, at 0.3 s, or ends early: taken from 1.5 s on it lasts for 0.5 s of the 1.2."""
     black(tmp_path / "out.mxf", sounding(tmp_path / "pcm_s16le.mov", "pcm_s16le", 48000), 0.0)
     before, after = heard(tmp_path / "pcm_s16le.mov")[1], heard(tmp_path / "out.mxf")[1]
     np.testing.assert_array_equal(after, before[:, :57600])
     assert np.abs(after).max() > 0.49
-
-
-def test_sound_that_begins_late_or_ends_early_is_filled_with_silence(tmp_path: Path) -> None:
-    """Sound from 0.3 s on; taken from 1.5 s on it lasts for 0.5 s of the 1.2."""
-    source = sounding(tmp_path / "late.mov", "pcm_s16le", 48000, delay_s=0.3)
-    black(tmp_path / "begin.mxf", source, 0.0)
-    samples = heard(tmp_path / "begin.mxf")[1]
-    assert np.flatnonzero(samples[0])[0] / 48000 == pytest.approx(BEGINS_S, abs=1e-3)
-    black(tmp_path / "end.mxf", source, 1.5)
-    samples = heard(tmp_path / "end.mxf")[1]
-    assert samples.shape[1] == 57600 and np.flatnonzero(samples[0])[-1] / 48000 == pytest.approx(0.5, abs=2e-3)
+    late = sounding(tmp_path / "late.mov", "pcm_s16le", 48000, delay_s=0.3)
+    black(tmp_path / "begin.mxf", late, 0.0)
+    black(tmp_path / "end.mxf", late, 1.5)
+    begin, end = (heard(tmp_path / name)[1] for name in ("begin.mxf", "end.mxf"))
+    assert np.flatnonzero(begin[0])[0] / 48000 == pytest.approx(BEGINS_S, abs=1e-3)
+    assert end.shape[1] == 57600 and np.flatnonzero(end[0])[-1] / 48000 == pytest.approx(0.5, abs=2e-3)
 
 
 @pytest.mark.slow
@@ -112,8 +105,7 @@ def test_a_real_clip_of_uneven_times_goes_into_mxf_with_its_sound(tmp_path: Path
     shot = Shot(open_source(clip), Brighter(0.0), VideoTarget(tmp_path / "out.mxf", None, clip, even_rate=Fraction(30)), 3, 9, 3)
     note = render_shot(shot, SerialExecutor())
     assert "(pcm_s16le, 48 kHz)" in note
-    frames = list(read_frames(tmp_path / "out.mxf"))
-    times_s = np.array(shot.all_times_s)
+    frames, times_s = list(read_frames(tmp_path / "out.mxf")), np.array(shot.all_times_s)
     assert [frame.time_s for frame in frames] == pytest.approx([i / 30 for i in range(len(frames))], abs=1e-6)
     assert len(frames) == round(times_s[-1] * 30) + 1
     sources = [frame.rgb for frame in shot.source.frames(3, 9)]
@@ -125,16 +117,10 @@ def test_a_real_clip_of_uneven_times_goes_into_mxf_with_its_sound(tmp_path: Path
     assert heard(tmp_path / "out.mxf")[1].shape[1] == 48000 * len(frames) // 30
 
 
-@pytest.mark.parametrize(
-    ("times_s", "rate", "expected"),
-    [
-        ([0.0, 0.04, 0.08], 25, [0, 1, 2]),
-        ([0.0, 0.04, 0.16, 0.2], 25, [0, 1, 1, 2, 2, 3]),
-        ([0.0, 0.02, 0.04, 0.06, 0.08], 25, [0, 2, 4]),
-        ([0.0], 30, [0]),
-        ([0.0, 0.04], 50, [0, 1, 1]),
-    ],
-)
-def test_the_nearest_picture_is_held(times_s: list[float], rate: int, expected: list[int]) -> None:
+def test_the_nearest_picture_is_held() -> None:
     """Halfway (0.02 s of 0 and 0.04; 0.1 would be of 0.04 and 0.16) the later one is shown."""
-    assert held_pictures(times_s, Fraction(rate)) == expected
+    for times_s, rate, expected in (
+        ([0.0, 0.04, 0.08], 25, [0, 1, 2]), ([0.0, 0.04, 0.16, 0.2], 25, [0, 1, 1, 2, 2, 3]), ([0.0], 30, [0]),
+        ([0.0, 0.02, 0.04, 0.06, 0.08], 25, [0, 2, 4]), ([0.0, 0.04], 50, [0, 1, 1]),
+    ):  # fmt: skip
+        assert held_pictures(times_s, Fraction(rate)) == expected
