@@ -25,5 +25,5 @@ def test_the_library_that_can_be_used(there: tuple[str, ...], found: str | None,
     library = mitsuba_tracer.find_llvm()
     assert (library and library.name) == found
     if there and found is None:
-        with pytest.raises(InputError, match="abort.*apt install libllvm19"):
+        with pytest.raises(InputError, match=r"abort.*apt install libllvm19"):
             mitsuba_tracer.load()
