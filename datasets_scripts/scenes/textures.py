@@ -105,8 +105,8 @@ def spots(
         y, x = rows[:, None] + 0.5, columns + 0.5
         away = np.hypot((y - cy + size / 2) % size - size / 2, (x - cx + size / 2) % size - size / 2)
         cover = np.clip((r - away) / 4.0 + 0.5, 0.0, 1.0)[..., None]
-        ground = picture[np.ix_(rows, columns)]
-        picture[np.ix_(rows, columns)] = ground * (1 - cover) + cover * np.asarray(colours[index % len(colours)]) * rng.uniform(0.8, 1.15)
+        under = picture[np.ix_(rows, columns)]
+        picture[np.ix_(rows, columns)] = under * (1 - cover) + cover * np.asarray(colours[index % len(colours)]) * rng.uniform(0.8, 1.15)
     rough = 1.0 + 0.12 * fractal_noise(size, size, rng, 4.0, size / 4.0, 0.3)
     return np.clip(picture * rough[..., None], 0.01, 0.95).astype(np.float32)
 
