@@ -20,7 +20,7 @@ from capture.merging.registration.alignment import register_stack
 from capture.merging.registration.registered_slices import IngestedSlices, RegisteredSlices, newer, source_path
 from capture.merging.registration.registration_file import FILE_NAME as REGISTRATION_NAME
 from capture.merging.registration.registration_file import Registration, read_registration, write_registration
-from capture.merging.restored_lights import RestoredLight, restored_lights, with_restored_lights
+from capture.merging.restored_lights import RestoredLight, known_opening, restored_lights, with_restored_lights
 from capture.merging.retouch import RETOUCHES
 from capture.merging.second_pass import DEPTH_SOURCE, FIRST_PASS_FOLDER, FROM_FOCUS, SliceOptics
 from capture.stacks.slice_files import reporting_full_disk, stated_by_sentinel
@@ -73,7 +73,7 @@ def _merged(stack: FocalStack, overwrite: bool, registration: Path | None, prefe
     volume = focus_volume(made, slices.valid, len(stack))
     merged, focus = _with_registration(stack, slices), focus_map(volume, no_lights(volume.shape), slices.saturated)
     sharp = sharp_all_in_focus(slices.stored, focus.focus_index, volume, _crossover(merged, volume.shape[1]))
-    lights, restored = restored_lights(slices.stored, sharp, extremes)
+    lights, restored = restored_lights(slices.stored, sharp, extremes, opening=known_opening(stack.lens))
     if restored:
         sharp, focus = with_restored_lights(sharp, restored), focus_map(volume, lights, slices.saturated)
     merged = _with_highlights(merged, restored)

@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from capture.merging.lights import OVER_RANGE, UNSATURATED_SHARE, Extremes, Lights, find_lights
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -52,6 +54,7 @@ RADII_PX = np.arange(0.0, 2.51, 0.125)
 USUAL_RADIUS_PX = 1.0
 USUAL_WEIGHT = 10.0
 SUBPIXELS = 8
+OPENING_SUBPIXELS = 16
 MARGIN_PX = 3
 # A light or the disc of a lens (a cat-eye) is an ellipse where its axes differ at least by this factor. Discs of a lens are measured within
 # a circle, which cuts longer ones off (5 % of the flux at 1.8, 15 % at 3).
@@ -73,12 +76,18 @@ class RestoredLight:
 
 
 def restored_lights(
-    slices: Callable[[], Iterable[Rgb]], merged: Rgb, extremes: Extremes | None = None, *, guided: bool = False
+    slices: Callable[[], Iterable[Rgb]],
+    merged: Rgb,
+    extremes: Extremes | None = None,
+    *,
+    guided: bool = False,
+    opening: Aperture | None = None,
 ) -> tuple[Lights, list[RestoredLight]]:
     """Return the lights of registered slices that the evidence supports, and what is drawn for them in place of the merged picture.
 
     slices: gives a fresh pass over them, one held at a time. extremes: what an earlier pass has gathered. guided: the picture was merged
-    by a depth that lights cannot mislead, so that what surrounds them stays.
+    by a depth that lights cannot mislead, so that what surrounds them stays. opening: of the lens; None for a disc, or the ellipse that the
+    lights show. (Compared as discs, no light behind a mirror lens was drawn: rings are far from them.)
     """
     candidates = find_lights(slices, extremes)
     if len(candidates) == 0:
@@ -89,7 +98,7 @@ def restored_lights(
     found = {
         place.light: drawn
         for place, patches in zip(alone, zip(*cut, strict=True), strict=True)
-        if (drawn := _restored(np.stack(patches), merged[place.box], place, candidates.areas_px[:, place.light], guided))
+        if (drawn := _restored(np.stack(patches), merged[place.box], place, candidates.areas_px[:, place.light], guided, opening))
     }
     kept = np.isin(np.arange(len(candidates)), list(found))
     return candidates.only(kept), [found[light] for light in sorted(found)]
@@ -116,6 +125,11 @@ class _Place:
         centre_px = np.array([columns.mean() + 0.5, rows.mean() + 0.5])
         sharpest = int(lights.sharpest[light])
         return cls(light, box, zone, core, centre_px, sharpest, float(lights.areas_px[sharpest, light]))
+
+
+def known_opening(lens: Lens | None) -> Aperture | None:
+    """Return the opening of a known lens where it is no disc."""
+    return None if lens is None or len(lens.aperture.outlines) == 1 else lens.aperture
 
 
 def with_restored_lights(merged: Rgb, restored: Sequence[RestoredLight]) -> Rgb:
@@ -217,7 +231,9 @@ def _radius_px(area_px: float) -> float:
     return 1.15 * float(np.sqrt(area_px / np.pi)) + 2.0
 
 
-def _restored(patches: Patches, ordinary: Rgb, place: _Place, areas_px: Float[np.ndarray, " slices"], guided: bool) -> RestoredLight | None:
+def _restored(
+    patches: Patches, ordinary: Rgb, place: _Place, areas_px: Float[np.ndarray, " slices"], guided: bool, opening: Aperture | None
+) -> RestoredLight | None:
     """Return what explains the slices around a light clearly better than the ordinary merge, None where nothing does."""
     zone, core, sharpest = place.zone, place.core, place.sharpest
     discs = measured_discs(patches, zone, place.centre_px, areas_px)
@@ -226,7 +242,7 @@ def _restored(patches: Patches, ordinary: Rgb, place: _Place, areas_px: Float[np
     spread = _without_rings(ordinary, patches[sharpest], zone, discs, areas_px)
     # In the light's own slice nothing of it lies on its surroundings. Another base has to be clearly better.
     bases, lost = ((spread, CLEARLY if guided else 1.0), (ordinary, 1.0 if guided else CLEARLY)), _mostly_lost(discs, areas_px, sharpest)
-    compare, ways = _Comparison.of(patches, zone, discs, areas_px, sharpest), []
+    compare, ways = _Comparison.of(patches, zone, discs, areas_px, sharpest, opening), []
     for base, handicap in bases:
         drawn = _drawn(base, discs, areas_px[sharpest])
         for picture in (drawn, _raised(base, core, discs, sharpest), base):
@@ -273,13 +289,20 @@ class _Comparison:
     light: float
 
     @classmethod
-    def of(cls, patches: Patches, zone: Mask, discs: Discs, areas_px: Float[np.ndarray, " slices"], sharpest: int) -> "_Comparison":
+    def of(
+        cls, patches: Patches, zone: Mask, discs: Discs, areas_px: Float[np.ndarray, " slices"], sharpest: int, opening: Aperture | None
+    ) -> "_Comparison":
         """Choose slices in which the disc is whole, evenly from the sharpest to the widest."""
         whole = np.flatnonzero(discs.whole)
         by_area = whole[np.argsort(areas_px[whole])]
         chosen = by_area[np.unique(np.linspace(0, len(by_area) - 1, COMPARED_SLICES).round().astype(int))]
         radii_px, shape = np.sqrt(np.maximum(areas_px - areas_px[sharpest], 0.0) / np.pi), discs.blur_shape(sharpest)
-        blurs = [(_grey(patches[i]), _disc_kernel(float(radii_px[i]), shape)) for i in chosen]
+        if opening is None:
+            kernels = [_disc_kernel(float(radii_px[i]), shape) for i in chosen]
+        else:
+            radii_px /= np.sqrt(_open_share(opening))
+            kernels = [opening_kernel(opening, float(radii_px[i])) for i in chosen]
+        blurs = [(_grey(patches[i]), kernel) for i, kernel in zip(chosen, kernels, strict=True)]
         light = sum(float(((grey - np.median(grey[~zone] if (~zone).any() else grey)) ** 2)[zone].sum()) for grey, _ in blurs)
         return cls(zone, float(discs.peak.max()), tuple(blurs), light)
 
@@ -302,6 +325,26 @@ def _disc_kernel(radius_px: float, shape: Matrix) -> Kernel:
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
     kernel = np.clip(radius_px + 0.5 - _distance(x, y, shape), 0.0, 1.0).astype(np.float32)
     return kernel / kernel.sum()
+
+
+def opening_kernel(opening: Aperture, radius_px: float) -> Kernel:
+    """Return what an opening makes of a point, of sum 1, at that radius of the pupil; drawn by OpenCV, so that nothing compiles."""
+    if radius_px < 1.0:
+        return _disc_kernel(radius_px, np.eye(2))
+    reach = int(np.ceil(radius_px * opening.unit_radius + 0.5))
+    side = 2 * reach + 1
+    fine = np.zeros((side * OPENING_SUBPIXELS,) * 2, np.float32)
+    for outline, weight in zip(opening.outlines, opening.weights, strict=True):
+        corners = np.round((np.asarray(outline) * radius_px + reach + 0.5) * OPENING_SUBPIXELS - 0.5).astype(np.int32)
+        fine += np.float32(weight) * cv2.fillPoly(np.zeros(fine.shape, np.uint8), [corners], 1)
+    kernel = np.maximum(cv2.resize(fine, (side, side), interpolation=cv2.INTER_AREA), 0.0)
+    return kernel / kernel.sum()
+
+
+def _open_share(opening: Aperture) -> float:
+    """Return the area of what an opening shows as even light, over that of the pupil."""
+    kernel = opening_kernel(opening, 32.0)
+    return float(1.0 / (kernel**2).sum()) / (np.pi * 32.0**2)
 
 
 def _distance(x: np.ndarray, y: np.ndarray, shape: Matrix) -> Float[np.ndarray, "..."]:

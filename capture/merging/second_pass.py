@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from capture.merging.restored_lights import restored_lights, with_restored_lights
+from capture.merging.restored_lights import known_opening, restored_lights, with_restored_lights
 from mrbokeh.images.camera_rgb import read_camera_rgb
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.stacks.focal_stack import FocalStack
@@ -114,7 +114,7 @@ def second_pass(stack: FocalStack, depth_m: Float[np.ndarray, "height width"]) -
         return stack.slice_masks(index).valid
 
     guided = all_in_focus_from_depth(stack.iter_camera_rgb, depth_m, optics, first, valid)
-    return with_restored_lights(guided, restored_lights(stack.iter_camera_rgb, guided, guided=True)[1])
+    return with_restored_lights(guided, restored_lights(stack.iter_camera_rgb, guided, guided=True, opening=known_opening(stack.lens))[1])
 
 
 def keep_first_pass(stack: FocalStack) -> None:

@@ -11,11 +11,12 @@ from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import Extremes, Lights, find_lights, no_lights
 from capture.merging.registration.alignment import register_stack
 from capture.merging.registration.plane_transforms import warp
-from capture.merging.restored_lights import Discs, measured_discs, restored_lights, with_restored_lights
+from capture.merging.restored_lights import Discs, measured_discs, opening_kernel, restored_lights, with_restored_lights
 from capture.merging.second_pass import SliceOptics, all_in_focus_from_depth
 from datasets_scripts.tracers.thin_lens import camera_for_lens, trace, trace_pinhole
 from datasets_scripts.tracers.traced_scene import DiscLight, Quad, Scene, emissive_quad
 from mrbokeh.images.image_metrics import psnr
+from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from tests.scenes.blended_slices import all_in_focus
@@ -90,6 +91,33 @@ def test_a_light_that_lost_its_flux_is_drawn_anew(photographs: list[np.ndarray])
     assert restored.max() < found[0].supported
     far = np.hypot(*(np.mgrid[: SIZE[0], : SIZE[1]] + 0.5 - AT_PX[::-1, None, None])) > 8
     np.testing.assert_array_equal(restored[far], merged[far])
+
+
+def test_a_light_behind_a_mirror_lens_is_drawn_anew_once_its_opening_is_known() -> None:
+    """Half of the diameter is stopped: points blur to rings, and no disc explains them. In focus the light lacks a sixth of its flux."""
+    opening, light = Aperture.disc().obstructed(0.5), drawn_disc(2.2)[..., None] * (1.3 * np.pi * 2.2**2)
+    slices = []
+    for index in range(9):
+        kernel = opening.rasterize(1.6 * abs(index - SHARP_SLICE)).kernel
+        slices.append(np.minimum(0.05 + cv2.filter2D(light, -1, kernel)[..., None] * np.ones(3, np.float32), FULL).astype(np.float32))
+    whole = 3 * light.sum()
+    merged = slices[SHARP_SLICE]
+    assert (merged - 0.05).sum() < 0.9 * whole
+    as_discs, as_rings = (
+        with_restored_lights(merged, restored_lights(lambda: slices, merged, opening=each)[1]) for each in (None, opening)
+    )
+    np.testing.assert_array_equal(as_discs, merged)
+    assert (as_rings - 0.05).sum() == pytest.approx(whole, rel=0.03)
+
+
+@pytest.mark.parametrize("radius_px", [4.3, 17.0])
+@pytest.mark.parametrize("opening", [Aperture.disc().obstructed(0.5), Aperture.blades(6)], ids=["ring", "hexagon"])
+def test_an_opening_drawn_by_opencv_is_the_exact_one(opening: Aperture, radius_px: float) -> None:
+    drawn, exact = opening_kernel(opening, radius_px), opening.rasterize(2.0 * radius_px).kernel
+    reach = max(len(drawn), len(exact)) // 2
+    drawn, exact = (np.pad(each, reach - len(each) // 2) for each in (drawn, exact))
+    # Corners lie on a grid of a sixteenth of a pixel, and OpenCV fills the line of the outline too.
+    assert np.abs(drawn - exact).max() < exact.max() / 8 and np.abs(drawn - exact).sum() < 0.03
 
 
 @pytest.mark.parametrize("cat_eye", [1.0, 0.6])
