@@ -57,7 +57,7 @@ def test_what_cannot_be_is_refused(samples: LightFieldSamples, name: str, value:
     with pytest.raises(InputError, match=says):
         replace(samples, **{name: wrong})
     with pytest.raises((InputError, TypeError)):  # jaxtyping's own check, where it runs, comes first
-        replace(samples, **{name: wrong[:-1]})
+        replace(samples, **{name: getattr(samples, name)[:-1]})
     none = [np.zeros((0, 2) if width == 2 else (0, 3) if width == 3 else 0, np.float32) for width in (2, 2, 1, 3, 1, 2)]
     with pytest.raises(InputError, match="at least one"):
         LightFieldSamples(4, 4, *none)

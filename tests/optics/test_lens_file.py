@@ -118,6 +118,8 @@ def test_an_image_is_found_beside_the_lens_file_and_may_have_grey_levels(tmp_pat
 
 @pytest.mark.parametrize(("changed", "message"), [
     ({"f_nummer": 2}, "'f_nummer'"), ({"f_number": -1.8}, "positive"), ({"f_number": "1.8"}, "f_number to be a number"),
+    ({"f_number": True}, "f_number to be a number"), ({"f_number": None}, "f_number to be a number"),
+    ({"focus_distance_m": float("nan")}, "focus_distance_m to be a number"),
     ({"f_number": float("nan")}, "f_number to be a number"), ({"focus_distance_m": 0.04}, "cannot focus"),
     ({"sensor_width_mm": float("inf")}, "sensor_width_mm to be a number"), ({"tilt_deg": 3}, "tilt_deg to be a list of 2 numbers"),
     ({"tilt_deg": [0, 60]}, "45 degrees"), ({"petzval_radius_mm": 0}, "petzval_radius_mm"),
@@ -134,6 +136,7 @@ def test_mistakes_in_a_lens_are_named(changed: dict[str, Any], message: str) -> 
     ({"shape": "polygon", "blades": 2}, "3 to 100 blades"), ({"shape": "polygon", "blades": 6, "curvature": 2}, "curvature"),
     ({"shape": "ring"}, "inner missing"), ({"shape": "ring", "inner": 1.5}, "below 1"), ({"shape": "outline"}, "either points"),
     ({"shape": "outline", "points": [[0, 0], [1, 1], [2, "x"]]}, "at least 3 points"),
+    ({"shape": ["disc"]}, "expected a shape out of"), ({"shape": "outline", "points": [[0, 0], [1, 1]]}, "at least 3 points"),
     ({"shape": "image", "image": ""}, "image to be a text"), ({"shape": "disc", "cat_eye": 1.5}, "cat_eye must lie between"),
     ({"shape": "disc", "squeeze": 0}, "squeeze"),
     ({"shape": "disc", "axial_chromatic": [0, 0]}, "axial_chromatic to be a list of 3 numbers"),

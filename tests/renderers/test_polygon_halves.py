@@ -97,6 +97,7 @@ def test_highlights_are_spread_whole_and_threads_do_not_change_a_bit() -> None:
     reach = kernel.shape[0] // 2
     seen = lamp[150 - reach : 151 + reach, 151 - reach : 152 + reach, 0]
     np.testing.assert_allclose(seen, kernel, atol=2e-3 * kernel.max())
-    values, coc_px = picture(400, 360), hills(400, 360, 10.0, 150.0)
+    # Above 1 << 18 pixels there are two bands, and threads for them.
+    values, coc_px = picture(640, 700), hills(640, 700, 10.0, 150.0)
     one, three = (PolygonDifferences(halve_from_px=64.0, threads=threads).sum_kernels(values, coc_px, OCTAGON) for threads in (1, 3))
     np.testing.assert_array_equal(one, three)
