@@ -128,7 +128,7 @@ class _Place:
 
 
 def known_opening(lens: Lens | None) -> Aperture | None:
-    """Return the opening of a known lens where it is no disc."""
+    """Return the opening of a known lens where it has several outlines, as with a stop in its middle; one is near enough to a disc."""
     return None if lens is None or len(lens.aperture.outlines) == 1 else lens.aperture
 
 
