@@ -79,8 +79,6 @@ def test_pixels_without_virtual_light_and_what_came_in_stay_bit_for_bit(name: st
     np.testing.assert_array_equal(found.photo_rgb, inserted.photo_rgb)
     np.testing.assert_array_equal(found.virtual.alpha, inserted.virtual.alpha)
     np.testing.assert_array_equal(found.virtual.extra["id"], inserted.virtual.extra["id"])
-    plate = scene_plate()
-    inserted = put_in(plate, soft_disc())
 
 
 def test_a_finishing_or_a_layer_that_is_nothing_gives_back_what_came() -> None:

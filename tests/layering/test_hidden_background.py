@@ -110,6 +110,15 @@ def test_parting_does_not_depend_on_threads(seed: int, monkeypatch: pytest.Monke
     assert len(behind.places) == (alone[1][0][..., 3] > 0).sum() > 200
 
 
+def test_an_even_surface_hides_nothing_and_stays_as_it_is() -> None:
+    """One depth all over has no edge, whatever is painted on it, lights too."""
+    values, coc_px = cluttered(1)[0], np.full(SIZE, 3.0, np.float32)
+    (front, front_coc_px), (behind, _) = parted(values, coc_px)
+    np.testing.assert_array_equal(front, values)
+    np.testing.assert_array_equal(front_coc_px, coc_px)
+    assert not behind.any()
+
+
 def test_antialiased_depth_leaves_nothing_in_the_air_and_parting_loses_no_light() -> None:
     """A disc at another depth, its depth map resized as pictures are, so that its rim lies at every depth between: the rim's
     pixels take one side or the other, and a steep but even slope stays as it is."""

@@ -40,13 +40,16 @@ def test_its_spread_along_the_path_is_that_of_even_motion() -> None:
     assert (drawn.sum(axis=0) * x**2).sum() == pytest.approx(24.0**2 / 12.0 + 1.0 / 6.0, abs=0.1)
 
 
-def test_what_does_not_move_stays_bit_for_bit_and_diameters_are_averaged_by_coverage() -> None:
+def test_what_does_not_move_stays_bit_for_bit_an_even_field_even_and_diameters_are_averaged_by_coverage() -> None:
     values = np.random.default_rng(0).uniform(-1.0, 1.0, (30, 40, 6)).astype(np.float32)
     values[..., 3] = 1.0
     coc_px = np.random.default_rng(1).uniform(-9.0, 9.0, (30, 40)).astype(np.float32)
     still, still_coc_px = drawn_out(values, coc_px, np.zeros((30, 40, 2), np.float32))
     np.testing.assert_array_equal(still, values)
     np.testing.assert_array_equal(still_coc_px, coc_px)
+    # As much light comes to a pixel as leaves it, where all move alike.
+    even, motion = np.full((40, 60, 4), 0.5, np.float32), np.full((40, 60, 2), (7.7, -3.1), np.float32)
+    np.testing.assert_allclose(drawn_out(even, even[..., 0], motion)[0][6:-6, 6:-6], 0.5, rtol=1e-6)
     values, coc_px, motion = np.zeros((9, 21, 4), np.float32), np.zeros((9, 21), np.float32), np.zeros((9, 21, 2), np.float32)
     values[4, 9], values[4, 11], coc_px[4, 9], coc_px[4, 11] = 0.25, 0.75, 4.0, 8.0
     motion[4, 9], motion[4, 11] = (4.0, 0.0), (4.0, 0.0)
