@@ -173,19 +173,21 @@ def opened(source: NetworkStreamSource) -> Iterator[tuple[Iterator[CameraFrame],
     assert not [each for each in threading.enumerate() if each.name.startswith("decode ")]
 
 
-def test_udp_comes_and_goes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_udp_comes_goes_and_comes_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tagged BT.709: its matrix is used although so small a picture would be BT.601 untagged (up to 12 codes apart)."""
     monkeypatch.setattr("viewfinder.sources.playback.READ_TIMEOUT_S", 1.0)
-    port = free_port(socket.SOCK_DGRAM)
+    port, tags = free_port(socket.SOCK_DGRAM), dict.fromkeys(("colorspace", "color_trc", "color_primaries", "color_range"), 1)
     source = NetworkStreamSource(f"udp://127.0.0.1:{port}")
     assert source.status is not None
-    with opened(source) as (frames, stopping):
-        with udp_sender(port, RED, colorspace=1, color_trc=1, color_primaries=1, color_range=1):
-            frame = first_like(frames, RED)
-            assert frame.bgr.shape == (HEIGHT, WIDTH, 3) and source.status is None and source.transfer == "bt709"
-            assert next(frames).sequence > frame.sequence
-        with at_work(lambda: list(frames), stopping.set):
-            wait_until(lambda: source.status is not None and "does not answer" in source.status)
+    with opened(source) as (frames, _):
+        with udp_sender(port, RED, **tags):
+            before = first_like(frames, RED)
+            assert before.bgr.shape == (HEIGHT, WIDTH, 3) and source.status is None and source.transfer == "bt709"
+            assert next(frames).sequence > before.sequence
+        wait_until(lambda: source.status is not None and "does not answer" in source.status)
+        with udp_sender(port, GREEN, **tags):
+            after = first_like(frames, GREEN)
+            assert after.sequence > before.sequence and after.captured_s > before.captured_s and source.status is None
 
 
 @pytest.mark.parametrize("kind", ["http", "rtsp"])

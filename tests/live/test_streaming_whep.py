@@ -292,24 +292,34 @@ async def test_a_viewer_whose_connection_stands_still_does_not_stall_the_others(
             assert stream.viewers[0].dropped > 10 and stream.viewers[1].dropped == 0 and sequences == sorted(sequences)
 
 
-async def test_the_page_learns_when_the_picture_on_its_screen_was_captured() -> None:
-    """By the RTP timestamp alone. (That the picture is of that very capture is seen in test_viewfinder_live.)"""
-    with streaming() as stream, Feed(stream, fps=30.0) as feed:
-        async with whep_of(stream) as (_whep, url), watching(url) as viewer:
-            # From the first status on; pictures before it came while the channel was not open yet.
-            await viewer.until(viewer.statuses)
-            arrived, from_ms = set[int](), 1000 * time.monotonic()
-            Line(viewer, lambda _number, packet: arrived.add(packet.timestamp) or [packet])
-            await viewer.until(lambda: len([each for each in viewer.statuses() if each["captured_ms"] > from_ms]) >= 10)
-            told = [each for each in viewer.statuses() if each["captured_ms"] > from_ms]
+def level(sequence: int) -> np.ndarray:
+    """A flat grey that names the picture, in steps of 4 that outlive the 219 steps of the codec."""
+    return np.full((HEIGHT, WIDTH, 3), 40 + 4 * (sequence % 48), np.uint8)
+
+
+async def test_a_status_names_the_very_picture_on_the_screen_and_tells_when_it_was_captured() -> None:
+    """A picture is known by its grey; it is joined to its status by the RTP timestamp alone, which aiortc counts from its first packet."""
+    arrived = list[int]()
+    with streaming() as stream, Feed(stream, level, fps=30.0) as feed:
+        line = Line(Viewer(), lambda _number, packet: arrived.append(packet.timestamp) or [packet])
+        async with whep_of(stream) as (_whep, url), watching(url, viewer=line.viewer) as viewer:
+            # Pictures before the first status came while the channel was not open yet.
+            await viewer.until(lambda: len(viewer.statuses()) >= 3)
+            shown = [await viewer.next() for _ in range(12)]
+            status_of = {each["rtp_timestamp"]: each for each in viewer.statuses()}
             # The very timestamps that are in the packets, which is what a browser compares.
-            await viewer.until(lambda: {each["rtp_timestamp"] for each in told} <= arrived)
-    for status in told:
+            await viewer.until(lambda: status_of.keys() <= set(arrived))
+    pairs = [(each, status_of.get((arrived[0] + each.pts) & 0xFFFFFFFF)) for each in shown]
+    told = [(each, status) for each, status in pairs if status is not None]
+    assert len(told) >= 8
+    for picture, status in told:
+        bgr = display_bgr(picture, color_of(picture, "stream"), (WIDTH, HEIGHT))
+        assert round((float(bgr[40:-40, 40:-40].mean()) - 40) / 4) == status["sequence"] % 48
         assert status["captured_ms"] == 1000 * feed.captured_s[status["sequence"]]
         assert status["focus_distance_m"] == 2.0 and status["stages_ms"]["h264"] > 0
     # The clock of RTP is that of capture: 90 ticks for a millisecond, each rounded.
-    ticks, ms = (told[-1][key] - told[0][key] for key in ("rtp_timestamp", "captured_ms"))
-    assert ticks & 0xFFFFFFFF == pytest.approx(90 * ms, abs=1.01)
+    (first, of_first), (last, of_last) = told[0], told[-1]
+    assert last.pts - first.pts == pytest.approx(90 * (of_last["captured_ms"] - of_first["captured_ms"]), abs=1.01)
 
 
 async def test_the_channel_answers_the_clock_and_refuses_the_rest() -> None:
