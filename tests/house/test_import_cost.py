@@ -33,7 +33,7 @@ print(json.dumps({{"seconds": seconds, "heavy": [name for name in {HEAVY} if nam
     raise AssertionError(result)
 
 
-def test_the_help_of_the_command_line_loads_no_sub_command_and_no_camera_library() -> None:
+def test_the_help_of_the_command_line_loads_no_sub_command_and_no_camera_library_and_spreadlets_no_torch() -> None:
     code = f"""
 import json, sys
 from contextlib import suppress
@@ -43,9 +43,11 @@ from mrbokeh.cli import app
 with suppress(SystemExit):
     app()
 ours = [name for name in ("capture", "training", "viewfinder", "mrbokeh.commands.demo", "gphoto2") if name in sys.modules]
-print(json.dumps({{"loaded": ours + [name for name in {HEAVY} if name in sys.modules]}}))
+loaded = ours + [name for name in {HEAVY} if name in sys.modules]
+import mrbokeh.renderers.spreadlets.laplacian_spreadlets
+print(json.dumps({{"loaded": loaded, "torch": "torch" in sys.modules}}))
 """
-    assert run_python(code)["loaded"] == []
+    assert run_python(code) == {"loaded": [], "torch": False}
 
 
 def test_every_public_name_can_be_had() -> None:
