@@ -71,3 +71,18 @@ def test_every_command_runs_from_the_installed_wheel(wheel: Path, tmp_path: Path
     assert done.returncode == 0, done.stderr
     assert done.stdout.split("\n")[-2] == "0 " * len(COMMANDS), done.stderr
     assert all(f"Usage: mrbokeh {name} " in done.stdout for name in COMMANDS)
+
+
+@pytest.mark.slow
+def test_pip_builds_and_installs_it_with_its_data_and_its_command(wheel: Path, tmp_path: Path) -> None:
+    """What pip lays down is what setuptools packed, and `mrbokeh` starts from there."""
+    pip, site = [sys.executable, "-m", "pip", "--quiet"], tmp_path / "site"
+    built = [*pip, "wheel", "--no-deps", "--no-build-isolation", "--wheel-dir", str(tmp_path), str(wheel.parent / "source")]
+    subprocess.run(built, check=True, capture_output=True)
+    [by_pip] = tmp_path.glob("mrbokeh-*.whl")
+    subprocess.run([*pip, "install", "--no-deps", "--target", str(site), str(by_pip)], check=True, capture_output=True)
+    packed = {name for name in zipfile.ZipFile(wheel).namelist() if ".dist-info/" not in name}
+    assert packed <= {path.relative_to(site).as_posix() for path in site.rglob("*")}
+    command = [str(site / "bin" / "mrbokeh"), "--help"]
+    done = subprocess.run(command, cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(site)}, capture_output=True, text=True)
+    assert done.returncode == 0 and "Usage: mrbokeh" in done.stdout, done.stderr
