@@ -104,6 +104,7 @@ class TestEdges:
     def test_other_qualities_are_refused(self) -> None:
         for quality, told in (
             ((3, 1), "expected 4 or 16 as edge_samples, got 3: take one"),
+            ((64, 1), "4 or 16 as edge_samples, got 64"),
             ((4, 0), "from 1 on as shadow_step_px, got 0"),
         ):
             refused(told, EmbreeRaycaster, edge_samples=quality[0], shadow_step_px=quality[1])

@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from capture.report.examination import STEP_PX
+from capture.report.slice_fit import Prediction, SliceFit, fit_slice
 from capture.report.stack_view import Reblur
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.optics.aperture import Aperture
@@ -78,6 +80,26 @@ def fine_and_coarse(aperture: Aperture) -> tuple[np.ndarray, np.ndarray]:
     coc_px = np.broadcast_to(-np.linspace(0.3, 9.0, WIDTH_PX, dtype=np.float32), (HEIGHT_PX, WIDTH_PX)).copy()
     fine_px = FINER * np.repeat(np.repeat(coc_px, FINER, axis=0), FINER, axis=1)
     return coc_px, reduced(Reblur(EXACT)(picture(FINER), fine_px, aperture), FINER)
+
+
+def fitted(aperture: Aperture) -> SliceFit:
+    """Fit a slice that is focused behind everything."""
+    coc_px, photographed = fine_and_coarse(aperture)
+    predicted = (Reblur(EXACT)(picture(1), coc_px + np.float32(step), aperture) for step in (0.0, -STEP_PX, STEP_PX))
+    counted = np.zeros(coc_px.shape, bool)
+    counted[INNER] = True
+    return fit_slice(photographed, Prediction(*predicted, coc_px, STEP_PX), counted)[0]
+
+
+@pytest.mark.parametrize("aperture", APERTURES[:3])
+@pytest.mark.slow
+def test_a_slice_at_its_focus_is_found_there(aperture: Aperture, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drawn without regard to the pixels, the very same slice seems to be focused elsewhere, and blurred by another lens."""
+    right = fitted(aperture)
+    monkeypatch.setattr("mrbokeh.layering.psf_over_field.drawn_diameters_px", lambda coc_px, _: coc_px)
+    wrong = fitted(aperture)
+    assert abs(right.focus_px.value) < 0.1 and abs(right.blur_gain.value) < 0.015
+    assert abs(wrong.focus_px.value) > 0.2 and abs(wrong.blur_gain.value) > 0.03
 
 
 @cache

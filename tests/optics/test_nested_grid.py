@@ -25,6 +25,10 @@ def test_the_example_of_the_paper() -> None:
     edges = np.round(9 * grid.boxes).astype(int)
     diagonal = [edge for edge in edges if edge[0, 0] == edge[1, 0]]
     assert [tuple(edge[0]) for edge in diagonal] == [(0, 1), (1, 3), (3, 6), (6, 9)], "the last is cut off: an edge of 4 would end at 10"
+    # Table 1: 400 samples for two coordinates. Storage grows as n^1.5 instead of n^2: four times the steps, eight times the cells.
+    # Levels end at about sqrt(2 n); level l has about 2 (n - l^2 / 2) / l cells, which sums to n log n: well below n^1.5.
+    assert 380 <= len(NestedGrid((75, 75))) <= 420
+    assert len(NestedGrid((600, 600))) < 8 * len(NestedGrid((150, 150)))
 
 
 @pytest.mark.parametrize("counts", SHAPES)

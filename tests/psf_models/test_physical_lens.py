@@ -12,8 +12,10 @@ from mrbokeh.optics.psf_grid import NestedGrid
 from mrbokeh.psf_models import _physical_lens_numba as compiled
 from mrbokeh.psf_models._lens_beam import BANDS_UM, GREEN_UM
 from mrbokeh.psf_models._physical_lens_numba import trace_ray
+from mrbokeh.psf_models.base import centred, sobol_blocks
 from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface, index_at
 from mrbokeh.psf_models.physical_lens import PhysicalLens, biconvex_lens
+from mrbokeh.psf_models.simple_lens import SimpleLens
 from mrbokeh.system.errors import InputError
 
 RAYS = 1 << 15
@@ -133,6 +135,25 @@ def test_far_from_focus_on_the_axis_the_blur_is_the_thin_lens_circle_of_confusio
     error = relative_error_of_coc(depth_m, 32.0)
     assert abs(error) < 0.01
     assert relative_error_of_coc(depth_m, 11.0) == pytest.approx(error * (32.0 / 11.0) ** 2, rel=0.25)
+
+
+@pytest.mark.parametrize("depth_m", [0.8, 1.2, 6.0, 50.0])
+def test_on_the_axis_at_a_small_aperture_the_kernel_is_the_disc_of_the_thin_lens(depth_m: float) -> None:
+    """Compare the bi-convex lens at f/64, of glass without dispersion, with the kernel of the thin lens's circle of confusion.
+
+    Spherical aberration, which at f/32 changes the diameter by 2 %, here changes it by half a per cent, and of a disc's light twice
+    that comes to lie elsewhere; the pupil lies 0.4 mm before the principal plane.
+    """
+    width_px, f_number = 30_000, 64.0
+    small = biconvex_lens(50.0, 8.0, abbe_number=inf).stopped_down(f_number)
+    kernel = PhysicalLens(small, focus_distance_m=2.0, image_width_px=width_px).kernel(at(depth_m), 1 << 18, 0)
+    coc_px = abs(float(Lens(50.0, f_number, 2.0, 36.0).coc_px(depth_m, width_px)))
+    disc = SimpleLens().exact(np.array([coc_px]))
+    assert coc_px > 8.0
+    assert_allclose(kernel[..., 0], kernel[..., 2], atol=1e-6)
+    size = max(len(kernel), len(disc))
+    elsewhere = centred(kernel.astype(np.float64).mean(axis=2), size) - centred(disc[..., 0].astype(np.float64), size)
+    assert 0.5 * np.abs(elsewhere).sum() < 2.0 * 0.005
 
 
 @pytest.mark.parametrize("eccentricity", [0.0, 0.6, 0.9])
@@ -304,6 +325,21 @@ def test_prefiltering_is_the_mean_over_the_box() -> None:
             total[margin : len(whole) - margin, margin : len(whole) - margin] += part / 32.0
     assert np.abs(whole - total).sum() / 3.0 < 0.06 * whole.sum() / 3.0
     assert whole.sum() == pytest.approx(total.sum(), rel=0.01)
+
+
+@pytest.mark.slow
+def test_rays_are_spread_more_evenly_than_chance_would() -> None:
+    """Compare with four times as many rays of another seed: half a million rays miss a third of what as many pseudo-random ones do.
+
+    Measured: 0.0025 of the light against 0.018. An additive recurrence over the five dimensions (square roots of primes) leaves
+    streaks and 0.0083, and hardly less with more rays.
+    """
+    model, rays, box = PhysicalLens(pair(), image_width_px=1000), 1 << 19, np.array([[0.65, 0.66], [0.0, 0.01]])
+    truth = model.landed(box, 4 * rays, sobol_blocks(5, 4 * rays, 1))
+    random = model.landed(box, rays, np.random.default_rng(0).random((8, rays // 8, 5)))
+    even = model.landed(box, rays, sobol_blocks(5, rays, 0))
+    missed, by_chance = (np.abs(each - truth).sum() / truth.sum() for each in (even, random))
+    assert missed < by_chance / 3.0
 
 
 def test_chunks_leave_no_seam_and_off_the_axis_the_simple_lens_smears() -> None:

@@ -11,7 +11,7 @@ from mrbokeh.psf_models.build import PAPER_COUNTS, Combined
 from mrbokeh.psf_models.simple_lens import SimpleLens, Stylized, banded_edges
 from mrbokeh.system.errors import InputError
 
-RAYS = 1 << 18
+RAYS = 1 << 20
 ODD_LENS = Aperture(Aperture.heart().outlines, (1.0,), spherical_aberration=0.6, axial_chromatic=(0.1, 0.0, -0.1))
 
 
@@ -55,7 +55,7 @@ def centroid(kernel: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("name", MODELS)
 def test_rays_agree_with_the_closed_form(name: str) -> None:
-    """Many rays over n pixels miss by the noise of chance or less: independent rays would leave sqrt(2 n / (pi N)) of the light.
+    """A million rays over n pixels miss by the noise of chance or less: independent rays would leave sqrt(2 n / (pi N)) of the light.
 
     (Mean absolute deviation of n counts of mean N / n, summed, over N.) Of a quarter of them, the rest is less by a factor
     between 2, that of chance, and 4. The closed form averages steps of up to a pixel over a box: 0.3 % more is allowed.
@@ -137,7 +137,7 @@ def test_limits_of_the_capsule_and_boxes_of_no_size() -> None:
 @pytest.mark.parametrize("name", ["disc", "ring", "capsule over a cell"])
 @pytest.mark.parametrize("rays", [0, RAYS])
 def test_the_centroid_stays_in_place(name: str, rays: int) -> None:
-    """Of many rays the centroid is off by less than chance would: 3 times the radius over the root of their number."""
+    """Of a million rays the centroid is off by less than chance would: 3 times the radius over the root of their number."""
     kernel, box = kernel_of(name, rays)
     assert np.abs(centroid(kernel)).max() < (1e-5 if rays == 0 else 3.0 * 0.5 * box.sum(axis=0).max() / np.sqrt(RAYS))
 

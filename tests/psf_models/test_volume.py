@@ -139,6 +139,14 @@ def test_energy_of_straight_walks_is_analytic(albedo: float) -> None:
     assert (albedo**collisions).mean() == pytest.approx(np.exp(-(1.0 - albedo) * tau), rel=0.01)
 
 
+def test_a_volume_that_does_not_turn_light_is_no_volume() -> None:
+    """Let g go towards 1: there are collisions, but light goes straight on: hardly any leaves the middle pixel."""
+    for anisotropy, least, most in ((0.5, 0.3, 1.0), (1.0 - 1e-9, 0.0, 1e-3)):
+        model = Volume(density_per_m=0.9, anisotropy=anisotropy, albedo=(1.0, 1.0, 1.0), size_px=513)
+        kernel = model.kernel(at(1.0), RAYS, 0)
+        assert least <= 1.0 - kernel[len(kernel) // 2, len(kernel) // 2, 1] < most
+
+
 def test_absorption_darkens_colours_where_they_absorb() -> None:
     model = Volume(size_px=129, focal_px=200.0)
     near, far = (model.kernel(at(distance_m), RAYS, 0) for distance_m in (0.5, 4.0))

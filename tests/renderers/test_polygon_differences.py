@@ -158,6 +158,28 @@ def test_what_is_in_focus_stays_bit_for_bit() -> None:
     np.testing.assert_allclose(DEFAULT.sum_kernels(values, coc_px, APERTURES["disc"])[:, :180], values[:, :180], atol=1e-7)
 
 
+@pytest.mark.parametrize("name", APERTURES)
+def test_an_even_field_stays_even(name: str) -> None:
+    """Look beyond half the largest kernel from the border: what a pixel loses to others it gets from others, to single precision."""
+    values = np.full((120, 110, 4), 0.7, np.float32)
+    for coc_px in (6.5, 23.4, -37.0):
+        inside = DEFAULT.sum_kernels(values, np.full((120, 110), coc_px, np.float32), APERTURES[name])[25:-25, 25:-25]
+        np.testing.assert_allclose(inside, 0.7, rtol=1e-5)
+
+
+@pytest.mark.parametrize("renderer", [SUMS_ONLY, DEFAULT], ids=["sums only", "default"])
+def test_a_moved_picture_gives_a_moved_result_and_brighter_light_changes_exponents_alone(renderer: PolygonDifferences) -> None:
+    """Move lamps too, by steps that are no multiples of any tile. Four times the light is a power of two: no rounding differs, and
+    highlights, told by ratios, stay the same pixels."""
+    values, coc_px, heart = np.zeros((120, 130, 4), np.float32), np.zeros((120, 130), np.float32), APERTURES["heart"]
+    values[30:70, 40:80], coc_px[30:70, 40:80] = picture(40, 40), waves(40, 40, 0.0, 22.0)
+    values[50, 60] = values[33, 43] = values[31, 66] = 1e3
+    result = renderer.sum_kernels(values, coc_px, heart)
+    moved = renderer.sum_kernels(np.roll(values, (5, 11), (0, 1)), np.roll(coc_px, (5, 11), (0, 1)), heart)
+    np.testing.assert_allclose(moved, np.roll(result, (5, 11), (0, 1)), rtol=2e-6, atol=2e-6)
+    np.testing.assert_array_equal(renderer.sum_kernels(4.0 * values, coc_px, heart), 4.0 * result)
+
+
 @pytest.mark.parametrize("name", ["octagon", "heart"])
 @pytest.mark.parametrize(("from_px", "to_px", "renderer"), [(0.95, 1.5, DEFAULT), (5.9, 7.1, SUMS_ONLY), (12.0, 13.0, SUMS_ONLY)])
 def test_a_focus_pull_does_not_pop(name: str, from_px: float, to_px: float, renderer: PolygonDifferences) -> None:

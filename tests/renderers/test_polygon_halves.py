@@ -71,6 +71,13 @@ def test_light_stays_in_place_on_odd_and_even_pixels(place: tuple[int, int], dia
     assert ((spread * y).sum(), (spread * x).sum()) == pytest.approx(place, abs=2e-3)
 
 
+@pytest.mark.parametrize("diameter_px", [65.0, 70.0, 90.0, -230.0])
+def test_an_even_field_stays_even(diameter_px: float) -> None:
+    """Look farther from the border than the largest kernel reaches."""
+    values, coc_px = np.full((301, 313, 4), 0.7, np.float32), np.full((301, 313), diameter_px, np.float32)
+    np.testing.assert_allclose(HALVED.sum_kernels(values, coc_px, OCTAGON)[130:-130, 130:-130], 0.7, rtol=1e-5)
+
+
 def test_edges_of_depth_are_not_halved_and_diameters_without_light_do_not_matter() -> None:
     """Beside a large step of diameters kernels stay as they are, bit for bit in what each pixel throws."""
     values, coc_px = picture(120, 300), np.full((120, 300), 4.0, np.float32)
