@@ -9,7 +9,7 @@ import pytest
 from mrbokeh.depth.depth_map import DepthSettings, KnownDistance
 from mrbokeh.depth.open_depth import IMAGENET_MEAN, IMAGENET_STD, NetworkInput, open_depth, predicted, read_network_input
 from mrbokeh.images.color import srgb_to_linear
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 onnx = pytest.importorskip("onnx", reason="the extra `train` brings onnx, which makes the test's networks")
 SIZE = (32, 48)
@@ -80,8 +80,7 @@ def test_a_sidecar_overrides_mean_std_and_order_and_a_wrong_one_is_refused(tmp_p
     model = channel_mean(tmp_path / "m.onnx", [1, 3, 32, 48])
     for values in ({"meen": 1}, {"fit": "crop"}, {"channels": "RGBA"}, {"std": [1, 1, 0]}):
         (tmp_path / "m.json").write_text(json.dumps(values))
-        with pytest.raises(InputError, match="expected"):
-            read_network_input(model)
+        refused("expected", read_network_input, model)
 
 
 def test_any_size_is_whole_multiples_and_padding_is_mirrored_and_cut_away(tmp_path: Path) -> None:
@@ -116,25 +115,20 @@ def test_two_known_distances_fix_scale_and_offset(tmp_path: Path) -> None:
     one_depth = DepthSettings(known=(KnownDistance(5.0, 3.5, 1.0), KnownDistance(30.0, 3.5, 4.0)))
     outside = DepthSettings(known=(KnownDistance(5.0, 300.0, 1.0), KnownDistance(30.0, 3.5, 4.0)))
     for wrong, words in ((swapped, "swapped"), (one_depth, "different depths"), (outside, "outside")):
-        with pytest.raises(InputError, match=words):
-            open_depth(model, photo(), wrong)
+        refused(words, open_depth, model, photo(), wrong)
 
 
 def test_what_is_no_depth_network_is_refused(tmp_path: Path) -> None:
     from onnx import helper
 
-    with pytest.raises(InputError, match="--disparity NEAR:FAR"):
-        open_depth(from_height(tmp_path / "a.onnx", [1, 3, 32, 48]), photo())
+    refused("--disparity NEAR:FAR", open_depth, from_height(tmp_path / "a.onnx", [1, 3, 32, 48]), photo())
     two_planes = write_model(tmp_path / "b.onnx", [helper.make_node("Identity", ["image"], ["depth"])], [1, 3, 32, 48])
-    with pytest.raises(InputError, match="one plane of depth"):
-        predicted(two_planes, photo(), NetworkInput())
+    refused("one plane of depth", predicted, two_planes, photo(), NetworkInput())
     four = channel_mean(tmp_path / "c.onnx", [1, 4, 32, 48])
-    with pytest.raises(InputError, match="one picture"):
-        predicted(four, photo(), NetworkInput())
+    refused("one picture", predicted, four, photo(), NetworkInput())
     broken = write_model(
         tmp_path / "d.onnx",
         [helper.make_node("Log", ["image"], ["logs"]), helper.make_node("ReduceMean", ["logs"], ["depth"], axes=[1], keepdims=0)],
         [1, 3, 32, 48],
     )
-    with pytest.raises(InputError, match="NaN"):
-        predicted(broken, photo(), NetworkInput())
+    refused("NaN", predicted, broken, photo(), NetworkInput())

@@ -11,7 +11,7 @@ from mrbokeh.depth.depth_filters import TemporalDepthFilter
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 SIZE = (80, 128)
 LENS = Lens(50.0, 2.0, 1.5, 10.0)
@@ -111,7 +111,5 @@ def test_infinity_stays_and_another_size_is_refused() -> None:
     steady = TemporalDepthFilter()
     for _ in range(3):
         np.testing.assert_array_equal(steady.filtered(depth_m), depth_m)
-    with pytest.raises(InputError, match="keep its size"):
-        steady.filtered(np.ones((6, 4), np.float32))
-    with pytest.raises(InputError, match="memory"):
-        TemporalDepthFilter(memory=0)
+    refused("keep its size", steady.filtered, np.ones((6, 4), np.float32))
+    refused("memory", TemporalDepthFilter, memory=0)

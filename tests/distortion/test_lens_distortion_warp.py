@@ -10,7 +10,7 @@ from mrbokeh.images.layer import Layer, clear
 from mrbokeh.layering.motion import MOTION, with_motion
 from mrbokeh.layering.pixel_box import Box, lit_box
 from mrbokeh.optics.camera import Camera
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 PLATE = Camera(320, 214, (270.0, 265.0), (158.3, 109.6))
 BARREL = LensDistortion.of("opencv", k1=-0.25, k2=0.08, p1=1e-3, p2=-8e-4)
@@ -225,5 +225,4 @@ def test_what_the_lens_cannot_see_is_clear_and_a_layer_of_another_camera_refused
     warped = distorted(Layer(np.repeat(full[..., None], 3, axis=2), full, full), wide, plate, folds)
     assert not warped.alpha[:, :10].any() and not warped.alpha[:, -10:].any()
     np.testing.assert_allclose(warped.alpha[:, 20:140], 1.0, rtol=1e-6)
-    with pytest.raises(InputError, match="rendered by the overscanned camera"):
-        distorted(clear(10, 10), PLATE, PLATE, BARREL)
+    refused("rendered by the overscanned camera", distorted, clear(10, 10), PLATE, PLATE, BARREL)

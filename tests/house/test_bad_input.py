@@ -11,9 +11,9 @@ from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.stacks.focus_places import FocusLookup, parse_focus
-from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import Frame, read_frames
 from tests.scenes.command_line import mrbokeh
+from tests.scenes.refusals import refused
 
 TRANSFER = ("transfer", "photo.png", "--lens", "lens.json", "--depth", "sharp.exr", "--out", "out.exr")
 NEW_LENS = ("lens", "new", "new.json", "--focal-length", "50", "--f-number", "2", "--focus", "1")
@@ -76,8 +76,7 @@ def test_it_is_refused_in_one_sentence(words: tuple[str, ...], told: str, there:
 def test_places_to_focus_on_have_a_largest_number() -> None:
     seen = FocusLookup(Lens(50.0, 2.0, 1.0, 36.0))
     assert len(parse_focus("1:2:1000", seen)) == 1000
-    with pytest.raises(InputError, match="at most 1000 places"):
-        parse_focus("1:2:100000000", seen)
+    refused("at most 1000 places", parse_focus, "1:2:100000000", seen)
 
 
 @pytest.mark.parametrize("suffix", ["mp4", "mkv"])
@@ -96,6 +95,5 @@ def test_a_clip_that_was_cut_off_is_told_once_its_pictures_were_given(suffix: st
     cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
     assert len(list(read_frames(whole))) == 40
     given: list[Frame] = []
-    with pytest.raises(InputError, match="the file is damaged or cut off"):
-        given.extend(read_frames(cut))
+    refused("the file is damaged or cut off", given.extend, read_frames(cut))
     assert 10 <= len(given) <= 25

@@ -30,8 +30,8 @@ from mrbokeh.images.image_io import write_image, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.camera import Camera
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from mrbokeh.system.errors import InputError
 from tests.scenes.command_line import mrbokeh
+from tests.scenes.refusals import refused
 
 
 @pytest.fixture(autouse=True)
@@ -68,8 +68,7 @@ def test_finished_stages_are_skipped_and_stale_ones_are_not(tmp_path: Path) -> N
 
 
 def test_a_failing_stage_names_its_command(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="mrbokeh lens show"):
-        run_stages([draw_stage(tmp_path / "none.json", tmp_path / "a.png")], tmp_path, Console(quiet=True))
+    refused("mrbokeh lens show", run_stages, [draw_stage(tmp_path / "none.json", tmp_path / "a.png")], tmp_path, Console(quiet=True))
 
 
 def test_what_was_interrupted_goes_on_and_what_replaced_something_starts_over(tmp_path: Path) -> None:

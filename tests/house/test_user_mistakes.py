@@ -29,6 +29,7 @@ from mrbokeh.scene.gltf.gltf_loader import load_glb
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.writer import VideoWriter
 from tests.scenes.command_line import mrbokeh
+from tests.scenes.refusals import refused
 
 RNG = np.random.default_rng(0)
 
@@ -63,13 +64,11 @@ def card(tmp_path: Path) -> Path:
 def test_an_empty_picture_is_said_to_be_empty_and_a_cut_off_exr_is_not_called_deep(tmp_path: Path) -> None:
     for name in ("empty.png", "empty.jpg", "empty.tif", "empty.hdr"):
         (tmp_path / name).touch()
-        with pytest.raises(InputError, match=f"{name} is empty"):
-            read_image(tmp_path / name)
+        refused(f"{name} is empty", read_image, tmp_path / name)
     write_exr(tmp_path / "whole.exr", ExrPart({name: RNG.random((64, 64)).astype(np.float32) for name in "RGB"}))
     stored = (tmp_path / "whole.exr").read_bytes()
     (tmp_path / "cut.exr").write_bytes(stored[: len(stored) // 2])
-    with pytest.raises(InputError, match="missing or damaged"):
-        read_layer(tmp_path / "cut.exr")
+    refused("missing or damaged", read_layer, tmp_path / "cut.exr")
 
 
 def test_what_is_read_is_never_written_over(card: Path) -> None:
@@ -203,8 +202,7 @@ def test_libpng_says_nothing_beside_us(stored: bytes, tmp_path: Path, capfd: pyt
     flipped = stored[:half] + bytes([stored[half] ^ 255]) + stored[half + 1 :]
     for damaged in (stored[:half], stored[:-12], flipped, stored[:20] + b"\xff" + stored[21:]):
         (tmp_path / "odd.png").write_bytes(damaged)
-        with pytest.raises(InputError, match=r"odd\.png cannot be read as a picture: it is damaged"):
-            read_image(tmp_path / "odd.png")
+        refused(r"odd\.png cannot be read as a picture: it is damaged", read_image, tmp_path / "odd.png")
         assert capfd.readouterr() == ("", "")
 
 
@@ -214,8 +212,7 @@ def test_neither_do_opencv_and_the_other_libraries(suffix: str, tmp_path: Path, 
     whole = cv2.imencode(suffix, codes.astype(np.float32) if suffix == ".hdr" else codes)[1].tobytes()
     (tmp_path / f"odd{suffix}").write_bytes(whole[: len(whole) // 2])
     before = cv2.utils.logging.getLogLevel()
-    with pytest.raises(InputError, match="it is damaged"):
-        read_image(tmp_path / f"odd{suffix}")
+    refused("it is damaged", read_image, tmp_path / f"odd{suffix}")
     assert capfd.readouterr() == ("", "") and cv2.utils.logging.getLogLevel() == before
 
 
@@ -270,8 +267,7 @@ def test_a_damaged_glb_is_named_by_its_whole_path(tmp_path: Path) -> None:
     path = tmp_path / "cake.glb"
     for damaged_glb in (b"not a model at all, but long enough", b"glTF\x02\0\0\0"):
         path.write_bytes(damaged_glb)
-        with pytest.raises(InputError, match=f"{re.escape(str(path))}.*not a readable glTF"):
-            load_glb(path)
+        refused(f"{re.escape(str(path))}.*not a readable glTF", load_glb, path)
 
 
 def test_nothing_is_said_by_a_command_but_our_line(stored: bytes, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

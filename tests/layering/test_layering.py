@@ -11,7 +11,7 @@ from mrbokeh.layering.psf_over_field import Frame, blur_colours
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 SIZE = (72, 96)
 LENS = Lens(focal_length_mm=50.0, f_number=0.7, focus_distance_m=0.5, sensor_width_mm=12.0)  # up to 64 px of blur at infinity
@@ -140,5 +140,4 @@ def test_field_cells_meet_their_limit_and_those_of_a_part_are_those_of_the_whole
     ],
 )
 def test_what_cannot_be_rendered_is_said(layers: list[Layer], said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        rendered(layers)
+    refused(said, rendered, layers)

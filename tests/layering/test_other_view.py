@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import opaque
@@ -12,7 +11,7 @@ from mrbokeh.layering.layering import Layering, render_layers
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 WIDTH, HEIGHT = 96, 64
 CAMERA = Camera(WIDTH, HEIGHT, (96.0, 96.0), (WIDTH / 2, HEIGHT / 2))
@@ -57,8 +56,7 @@ def test_points_land_where_their_parallax_puts_them() -> None:
     np.testing.assert_array_equal(layer.rgb[wall], expected[wall])
     assert (layer.depth_m[:, WIDTH // 2] == np.float32(POST_M)).all(), "the post is where it is"
     rgb, depth_m = seen_by(CAMERA)
-    with pytest.raises(InputError, match="resize"):
-        layer_from_view(rgb[:-2].copy(), depth_m[:-2].copy(), CAMERA, CAMERA)
+    refused("resize", layer_from_view, rgb[:-2].copy(), depth_m[:-2].copy(), CAMERA, CAMERA)
 
 
 def test_what_another_view_saw_is_nearer_to_the_truth_than_what_was_guessed() -> None:

@@ -6,8 +6,8 @@ import pytest
 from mrbokeh.images.layer import Layer, clear, opaque
 from mrbokeh.layering.padded_layers import PaddedLayer, Pixels, coc_px_of, pad_layer
 from mrbokeh.optics.lens import Lens
-from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import CallingThread
+from tests.scenes.refusals import refused
 
 LENS = Lens(focal_length_mm=50.0, f_number=2.0, focus_distance_m=2.0, sensor_width_mm=36.0)
 SIZE = (12, 17)
@@ -57,8 +57,7 @@ def test_pixels_that_cover_nothing_have_no_circle_of_confusion_and_sheets_know_t
     np.testing.assert_array_equal(coc_px[3, 4:7], LENS.coc_px(source.depth_m[3, 4:7], SIZE[1]))
     assert coc_px_of(clear(*SIZE), LENS).max() == 0.0
     source.depth_m[3, 5] = np.nan
-    with pytest.raises(InputError, match="finite circle of confusion"):
-        coc_px_of(source, LENS)
+    refused("finite circle of confusion", coc_px_of, source, LENS)
     values = np.zeros((3, 4, 5), np.float32)
     values[1, 2], values[2, 0] = 0.5, 0.25
     sheet = PaddedLayer(values, np.arange(12, dtype=np.float32).reshape(3, 4), False)

@@ -28,7 +28,7 @@ from mrbokeh.optics.psf_bank_file import read_bank
 from mrbokeh.renderers.scatter_reference import ScatterReference, scatter
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 SIZE = (132, 196)
 FOCI_M = (0.5, 0.68, 1.3)  # the wall lies from 0.6 m to 0.9 m
@@ -274,8 +274,7 @@ def test_refusals(tmp_path: Path) -> None:
         ([replace(stack, lens=replace(LENS, f_number=16.0))], "more focus distances"),
         ([], "nothing to fit"),
     ):
-        with pytest.raises(InputError, match=said):
-            fit_lens(stacks, [], ONE)
+        refused(said, fit_lens, stacks, [], ONE)
 
 
 def test_the_command_writes_a_bank_that_renders(tmp_path: Path) -> None:
@@ -300,8 +299,7 @@ def test_the_command_writes_a_bank_that_renders(tmp_path: Path) -> None:
     sharp, slice_rgb = stack.all_in_focus(), stack.slice_rgb(0)
     blurred = LaplacianSpreadlets(bank=bank).render([opaque(sharp, stack.depth_m())], stack.lens_of(0)).rgb
     assert ((blurred - slice_rgb) ** 2).mean() < 0.1 * ((sharp - slice_rgb) ** 2).mean()
-    with pytest.raises(InputError, match="--overwrite"):
-        run("fit", stack.folder, "--out", out)
+    refused("--overwrite", run, "fit", stack.folder, "--out", out)
 
 
 def test_a_bank_over_the_field_whose_axes_go_both_ways() -> None:
@@ -323,5 +321,4 @@ def test_a_bank_over_the_field_whose_axes_go_both_ways() -> None:
     one = np.ones((1, 1, 1), np.float32)
     bank = PsfBank("test", (axis, Axis("field_y", -0.6, 0.6)), (2, 1), (one, one), nested=False)
     assert [int(bank.nearest(np.array([x, 0.1]))) for x in (-0.2, 0.2)] == [0, 1]
-    with pytest.raises(InputError, match="field_x and field_y"):
-        Axis("eccentricity", -1.0, 1.0)
+    refused("field_x and field_y", Axis, "eccentricity", -1.0, 1.0)

@@ -27,6 +27,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 HEIGHT, WIDTH = 214, 320
 LENS = Lens(50.0, 1.8, 1.0, 14.0)
@@ -263,8 +264,7 @@ def test_exact_contours_give_the_opening_back_and_standard_errors_cover_the_spre
 
 
 def require_refused(rgb: np.ndarray, said: str) -> None:
-    with pytest.raises(InputError, match=said):
-        match_lens(rgb.astype(np.float32), FACTS, largest_value=1.0)
+    refused(said, match_lens, rgb.astype(np.float32), FACTS, largest_value=1.0)
 
 
 def test_texture_two_discs_and_impossible_sizes_are_refused() -> None:
@@ -274,10 +274,8 @@ def test_texture_two_discs_and_impossible_sizes_are_refused() -> None:
     require_refused(((smooth - smooth.min()) / np.ptp(smooth)) ** 4, "bright spots|expected at least 3")
     require_refused(np.full_like(noise, 0.3), "found 0")
     require_refused(linear(photograph(DISC, count=2)), "expected at least 3.*found 2.*night")
-    with pytest.raises(InputError, match="--side"):
-        effective_f_number(LENS, -10.0, 4.0, WIDTH)
-    with pytest.raises(InputError, match="--depth-m"):
-        focus_from_size(LENS, -2000.0, 4.0, WIDTH)
+    refused("--side", effective_f_number, LENS, -10.0, 4.0, WIDTH)
+    refused("--depth-m", focus_from_size, LENS, -2000.0, 4.0, WIDTH)
 
 
 @pytest.mark.parametrize("name", ["stacks/usb_two_layers/13.jpg", "rgbd/bokehme_3_image.jpg"])
@@ -311,8 +309,7 @@ def test_facts_of_exif_and_those_that_are_missing(tmp_path: Path) -> None:
     assert bare == PhotoFacts()
     with pytest.raises(InputError, match=r"give --focal-length, --sensor-width$"):
         bare.given(f_number=2.0).require("bare.jpg")
-    with pytest.raises(InputError, match="--f-number above 0"):
-        bare.given(f_number=-1.0)
+    refused("--f-number above 0", bare.given, f_number=-1.0)
     write_image(tmp_path / "a.exr", np.zeros((4, 6, 3), np.float32))
     assert read_facts(tmp_path / "a.exr", (6, 4)) == PhotoFacts()
 

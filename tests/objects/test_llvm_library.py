@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from mrbokeh.scene.mitsuba import mitsuba_tracer
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 
 @pytest.mark.parametrize(
@@ -25,5 +25,4 @@ def test_the_library_that_can_be_used(there: tuple[str, ...], found: str | None,
     library = mitsuba_tracer.find_llvm()
     assert (library and library.name) == found
     if there and found is None:
-        with pytest.raises(InputError, match=r"abort.*apt install libllvm19"):
-            mitsuba_tracer.load()
+        refused(r"abort.*apt install libllvm19", mitsuba_tracer.load)

@@ -16,6 +16,7 @@ from mrbokeh.scene.choose import described_device, has_graphics_card, scene_rend
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.light import directions
 from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 pytest.importorskip("wgpu", reason="wgpu is not installed: pip install 'mrbokeh[viewfinder]'")
 
@@ -195,10 +196,8 @@ class TestChoice:
         assert isinstance(scene_renderer("wgpu"), WgpuRasterizer)
         assert isinstance(scene_renderer(), WgpuRasterizer if has_graphics_card() else EmbreeRaycaster)
         assert gpu().name in described_device()
-        with pytest.raises(InputError, match="auto, wgpu or embree"):
-            scene_renderer("opengl")
+        refused("auto, wgpu or embree", scene_renderer, "opengl")
 
     @pytest.mark.usefixtures("rasterizer")
     def test_impossible_settings(self) -> None:
-        with pytest.raises(InputError, match="shadow maps"):
-            WgpuRasterizer(shadow_map_px=4)
+        refused("shadow maps", WgpuRasterizer, shadow_map_px=4)

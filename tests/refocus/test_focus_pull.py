@@ -7,6 +7,7 @@ import pytest
 
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.focus_pull import FocusPull, parse_focus_keys, quantisation_steps, read_focus_pull, smoothed_within_steps
+from tests.scenes.refusals import refused
 
 
 def venice(shared_data: Path) -> Path:
@@ -42,18 +43,15 @@ def test_keys_that_are_none_are_refused() -> None:
     for text in ("", "1.2", "0:1.2,", "0:-1", "0:0", "0:x", "0:1:2", "0:1,0:2", "5:1,0:2"):
         with pytest.raises(InputError):
             parse_focus_keys(text)
-    with pytest.raises(InputError, match="easing must be"):
-        parse_focus_keys("0:1", "bouncy")
-    with pytest.raises(InputError, match="must grow"):
-        FocusPull(np.array([1.0, 1.0]), np.array([1.0, 1.0]))
+    refused("easing must be", parse_focus_keys, "0:1", "bouncy")
+    refused("must grow", FocusPull, np.array([1.0, 1.0]), np.array([1.0, 1.0]))
 
 
 def test_venice_red_and_canon_write_feet_millimetres_and_bits(shared_data: Path) -> None:
     """The first row is 5.83 ft."""
     pull = read_focus_pull(venice(shared_data))
     assert len(pull.frames) == 588 and pull.at(0) == pytest.approx(5.83 * 0.3048)
-    with pytest.raises(InputError, match="from frame 0 to 587"):
-        pull.at(588)
+    refused("from frame 0 to 587", pull.at, 588)
     # REDline: 410 and 420 mm. Canon: 3F000000 is 0.5.
     folder = venice(shared_data).parent
     red, canon = read_focus_pull(folder / "red_frames.csv"), read_focus_pull(folder / "canon_frames.csv")
@@ -76,8 +74,7 @@ def test_plain_tables_name_their_unit(tmp_path: Path) -> None:
 ])  # fmt: skip
 def test_tables_without_focus_are_refused(tmp_path: Path, text: str, says: str) -> None:
     (tmp_path / "a.csv").write_text(text)
-    with pytest.raises(InputError, match=says):
-        read_focus_pull(tmp_path / "a.csv")
+    refused(says, read_focus_pull, tmp_path / "a.csv")
 
 
 @pytest.mark.parametrize(("amplitude", "period", "share"), [(0.25, 240, 0.5), (0.1, 240, 0.3), (0.4, 120, 0.4), (0.05, 480, 0.9)])

@@ -21,9 +21,9 @@ from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
 from mrbokeh.stacks.focus_places import FocusLookup, parse_focus
-from mrbokeh.system.errors import InputError
 from tests.scenes.card_stack import CARD_PX, LENS, SIZE, make_card_stack
 from tests.scenes.command_line import printed_by
+from tests.scenes.refusals import refused
 
 BETWEEN_M = 0.52
 
@@ -125,13 +125,11 @@ def test_the_command_writes_a_focal_stack(tmp_path: Path) -> None:
     # The card at 0.5 m lies before the first new slice, the wall at 0.7 m between those at 0.55 m and at infinity.
     np.testing.assert_allclose(made.focus_index()[24, [10, 60]], [0.0, 1.0 + (1 / 0.55 - 1 / 0.7) * 0.55], atol=1e-6)
     assert psnr(made.slice_rgb(0), stack.slice_rgb(0)) < 60 and (tmp_path / "sheet.png").stat().st_size > 500
-    with pytest.raises(InputError, match="--overwrite"):
-        run(stack.folder, "--focus", "0.52", "--out", tmp_path / "new")
+    refused("--overwrite", run, stack.folder, "--focus", "0.52", "--out", tmp_path / "new")
     run(stack.folder, "--focus", "0.6", "--out", tmp_path / "new", "--overwrite", "--renderer", "scatter")
     assert sorted(each.name for each in (tmp_path / "new").glob("slice*")) == ["slice_0.6000m.exr", "slice_0.6000m.png"]
     other = make_card_stack(tmp_path / "captured", 4)
-    with pytest.raises(InputError, match="not made by refocus"):
-        run(stack.folder, "--focus", "0.6", "--out", other.folder, "--overwrite")
+    refused("not made by refocus", run, stack.folder, "--focus", "0.6", "--out", other.folder, "--overwrite")
     assert len(read_focal_stack(other.folder)) == 3
 
 
@@ -172,8 +170,7 @@ def test_an_interrupted_run_goes_on_and_other_settings_start_anew(tmp_path: Path
 
 @pytest.mark.parametrize("text", ["", "0.8,0.8", "-1", "a", "1:2", "0:2:3"])
 def test_odd_distances_are_refused(text: str) -> None:
-    with pytest.raises(InputError, match="--focus"):
-        parse_focus(text, FocusLookup(LENS))
+    refused("--focus", parse_focus, text, FocusLookup(LENS))
 
 
 def test_distances_evenly_in_dioptres() -> None:
@@ -242,5 +239,4 @@ def test_layers_may_be_made_for_each_plate(tmp_path: Path) -> None:
 
     composite_stack(stack, staged, OverPhotograph(), ScatterReference(threads=1), tmp_path / "made")
     assert seen == [0.5, 0.55, 0.7, 0.5]
-    with pytest.raises(InputError, match="exists already"):
-        composite_stack(stack, staged, OverPhotograph(), ScatterReference(threads=1), tmp_path / "made")
+    refused("exists already", composite_stack, stack, staged, OverPhotograph(), ScatterReference(threads=1), tmp_path / "made")

@@ -20,8 +20,8 @@ from mrbokeh.refocus import seen_like, with_recovered_highlights
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.stacks.photograph import Photograph
-from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import read_frames
+from tests.scenes.refusals import refused
 
 LENS = Lens(50.0, 2.0, 1.0, 9.0)
 SIZE = (48, 72)
@@ -84,8 +84,7 @@ def test_several_distances_become_a_focal_stack_with_a_sheet(files: dict[str, Pa
     # 1 m is sharpest in slice 0, 2 m in slice 2.
     assert stack.focus_index()[5, 5] == 0 and stack.focus_index()[5, 60] == 2
     assert (files["folder"] / "sheet.png").stat().st_size > 500
-    with pytest.raises(InputError, match="exists already"):
-        run(files, "stack", "--focus", "1,2")
+    refused("exists already", run, files, "stack", "--focus", "1,2")
     assert len(read_focal_stack(run(files, "stack", "--focus", "1,2", "--overwrite"))) == 2
 
 
@@ -95,8 +94,7 @@ def test_a_focus_pull_is_a_film(files: dict[str, Path]) -> None:
     assert [each.time_s for each in frames] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4], abs=1e-3)
     for index, focus_m in ((0, 1.0), (4, 2.0)):
         assert psnr(frames[index].rgb, np.clip(expected(files, focus_m), 0, 1)) > 70
-    with pytest.raises(InputError, match="5 distances"):
-        run(files, "one.png", "--focus", "1:2:5")
+    refused("5 distances", run, files, "one.png", "--focus", "1:2:5")
 
 
 def test_clipped_light_is_boosted_only_when_asked_and_smoothly(files: dict[str, Path]) -> None:
@@ -118,10 +116,8 @@ def test_the_same_view_is_a_lens_of_another_length_and_asks_the_photograph(files
     phone = Photograph(np.zeros((4, 4, 3), np.float32), focal_length_mm=4.2, sensor_width_mm=5.6)
     found = seen_like(replace(LENS, sensor_width_mm=36.0), phone, Path("phone.jpg"))
     assert found.focal_length_mm == pytest.approx(27.0) and found.f_number == LENS.f_number
-    with pytest.raises(InputError, match="--same-view"):
-        seen_like(LENS, Photograph(np.zeros((4, 4, 3), np.float32)), Path("phone.jpg"))
-    with pytest.raises(InputError, match="does not tell its focal length"):
-        run(files, "a.exr", "--same-view")
+    refused("--same-view", seen_like, LENS, Photograph(np.zeros((4, 4, 3), np.float32)), Path("phone.jpg"))
+    refused("does not tell its focal length", run, files, "a.exr", "--same-view")
 
 
 def test_what_is_missing_or_odd_is_one_sentence(files: dict[str, Path]) -> None:
@@ -132,13 +128,10 @@ def test_what_is_missing_or_odd_is_one_sentence(files: dict[str, Path]) -> None:
         (["--disparity", "3"], "NEAR:FAR"),
         (["--depth-model-gives", "depth"], "'inverse' or 'metric'"),
     ):
-        with pytest.raises(InputError, match=words):
-            run(files, "a.exr", *more)
-    with pytest.raises(InputError, match="holds no depth of its own"):
-        run(files, "a.exr", depth=None)
+        refused(words, run, files, "a.exr", *more)
+    refused("holds no depth of its own", run, files, "a.exr", depth=None)
     (files["folder"] / "other").mkdir()
-    with pytest.raises(InputError, match="not made by transfer"):
-        run(files, "other", "--overwrite")
+    refused("not made by transfer", run, files, "other", "--overwrite")
 
 
 def test_a_phones_photograph_brings_its_depth_its_original_and_its_focus(files: dict[str, Path], shared_data: Path) -> None:
