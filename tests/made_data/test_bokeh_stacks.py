@@ -22,8 +22,8 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.stacks.focal_stack_dataset import file_troubles, read_focal_stack_dataset
-from mrbokeh.system.errors import InputError
 from tests.scenes.command_line import printed_by
+from tests.scenes.refusals import refused
 from tests.scenes.scalar_truth_tracer import ScalarTracer, require_mitsuba
 from training.data.dataset import PairSet, read_pair
 from training.data.training_data import training_data
@@ -115,10 +115,8 @@ def test_the_ring_is_thick_left_thin_in_the_middle_and_open_right() -> None:
     assert polygon_share(left) == pytest.approx(0.75, abs=1e-3)
     assert polygon_share(middle) == pytest.approx(0.36, abs=1e-3)
     assert [sum(weight < 0 for weight in each.weights) for each in (left, middle, right)] == [1, 1, 0]
-    with pytest.raises(InputError, match="radii between 0 and 1"):
-        FieldStop(radius=1.2)
-    with pytest.raises(InputError, match="round openings"):
-        Opening(Aperture.heart(), 0.05, 1.0, FieldStop())
+    refused("radii between 0 and 1", FieldStop, radius=1.2)
+    refused("round openings", Opening, Aperture.heart(), 0.05, 1.0, FieldStop())
 
 
 def test_open_shares_are_areas() -> None:
@@ -174,12 +172,9 @@ def test_scenes_have_lights_at_many_depths_are_always_the_same_and_differ_by_num
 
 def test_unknown_names_are_refused() -> None:
     for name in ("castle_1", "fence", "fence_x"):
-        with pytest.raises(InputError, match="scene such as"):
-            bokeh_scene(name)
-    with pytest.raises(InputError, match="shape out of"):
-        bokeh_shape("square")
-    with pytest.raises(InputError, match="a set needs"):
-        replace(TINY, views=0)
+        refused("scene such as", bokeh_scene, name)
+    refused("shape out of", bokeh_shape, "square")
+    refused("a set needs", replace, TINY, views=0)
 
 
 # --- The data set ---------------------------------------------------------------------------------------------------------------------
@@ -202,8 +197,7 @@ def test_a_set_is_written_resumed_and_trained_on(tmp_path: Path) -> None:
     assert len(read.metadata["noise_floor_db"]["by_stack"]["garlands_1/view_00"]) == 2
     assert "CC0" in read.licence and (out / "LICENCE.txt").is_file()
     assert read_lens(out / "lens.json").aperture.cat_eye == 0.35
-    with pytest.raises(InputError, match="other settings"):
-        make_bokeh_stacks(out, replace(plan, seed=2))
+    refused("other settings", make_bokeh_stacks, out, replace(plan, seed=2))
     require_trainable(out)
 
 
@@ -227,8 +221,7 @@ def test_a_pull_is_one_test_view_in_even_steps(tmp_path: Path) -> None:
     assert plan.parts()[f"{folder.parent.name}/{folder.name}"] == "test"
     assert np.ptp(np.diff(1.0 / np.array(stack.focus_distances_m))) < 1e-9
     assert [stack.focus_distances_m[0], stack.focus_distances_m[-1]] == pytest.approx(plan.focus_distances_m[1:3])
-    with pytest.raises(InputError, match="at least 2 frames"):
-        make_pull(tmp_path / "pull", plan, 1)
+    refused("at least 2 frames", make_pull, tmp_path / "pull", plan, 1)
 
 
 @pytest.mark.slow

@@ -11,7 +11,7 @@ from datasets_scripts.gallery.pictures import WIDEST_PX, result_jpeg
 from mrbokeh.cli import SUB_COMMANDS
 from mrbokeh.images.image_io import write_image, write_layer
 from mrbokeh.images.layer import Layer
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples.md"
 ENTRIES = read_entries(EXAMPLES.read_text(encoding="utf-8"))
@@ -46,8 +46,7 @@ def test_examples_are_read_from_headings_blocks_and_comments() -> None:
     assert entry.title == "mrbokeh refocus: new slices" and entry.caption == "Three slices"
     assert [line.split() for line in entry.commands] == [["mrbokeh", "refocus", "a", "--out", "b"], ["python", "-m", "x"]]
     assert (entry.picture, entry.shows, entry.page) == (Path("docs/pictures/refocus.jpg"), "b/sheet.png", "")
-    with pytest.raises(InputError, match="found none"):
-        read_entries("nothing")
+    refused("found none", read_entries, "nothing")
 
 
 def test_the_gallery_is_made_by_the_commands_and_what_a_check_finds_is_its_result(tmp_path: Path) -> None:
@@ -55,8 +54,7 @@ def test_the_gallery_is_made_by_the_commands_and_what_a_check_finds_is_its_resul
     demo, out, plate = tmp_path / "demo", tmp_path / "out", np.full((16, 24, 3), 0.2, np.float32)
     demo.mkdir()
     out.mkdir()
-    with pytest.raises(InputError, match="expected a finished demo"):
-        build(out, ENTRIES[:1], demo)
+    refused("expected a finished demo", build, out, ENTRIES[:1], demo)
     (demo / "report.html").write_text("done")
     write_image(out / "plate.png", plate)
     plate[4, 5] = 0.9
@@ -73,8 +71,7 @@ def test_the_gallery_is_made_by_the_commands_and_what_a_check_finds_is_its_resul
     assert (out / "a.jpg").is_file() and (out / "repository" / "README.md").is_file() and (out / "demo_out" / "report.html").is_file()
     assert [each.name for each in demo.iterdir()] == ["report.html"]
     broken = Entry(title="b", commands=("mrbokeh lens show none.json --out b.png",), caption="", picture=Path("b.jpg"), shows="b.png")
-    with pytest.raises(InputError, match=r"(?s)ended with 2.*none\.json"):
-        build(out, [broken], demo)
+    refused(r"(?s)ended with 2.*none\.json", build, out, [broken], demo)
 
 
 def test_pictures_stand_side_by_side_long_sheets_are_cut_and_linear_ones_shown_as_light(tmp_path: Path) -> None:

@@ -23,8 +23,8 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import scatter
-from mrbokeh.system.errors import InputError
 from tests.scenes.command_line import printed_by
+from tests.scenes.refusals import refused
 from tests.scenes.scalar_truth_tracer import ScalarTracer, require_mitsuba, reversed_bits, two_disc_overlap
 
 SIZE_PX = 96
@@ -218,12 +218,9 @@ def moments(aperture: Aperture) -> tuple[float, np.ndarray, np.ndarray]:
 def test_openings_are_shares_of_discs_and_those_that_rays_cannot_take_are_refused() -> None:
     """At a distance of one radius: (2 pi / 3 - sqrt(3) / 2) / pi."""
     assert two_disc_overlap(np.array([0.0, 2.0, 1.0])) == pytest.approx([1.0, 0.0, (2 * np.pi / 3 - np.sqrt(3) / 2) / np.pi])
-    with pytest.raises(InputError, match="weights"):
-        pupil_table(Aperture((Aperture.disc().outlines[0],), (0.5,)))
-    with pytest.raises(InputError, match="round"):
-        opening(1.0, Aperture(lens_shape("heart").outlines, (1.0,), cat_eye=0.5))
-    with pytest.raises(InputError, match="aberration"):
-        opening(1.0, Aperture(Aperture.disc().outlines, (1.0,), spherical_aberration=0.5))
+    refused("weights", pupil_table, Aperture((Aperture.disc().outlines[0],), (0.5,)))
+    refused("round", opening, 1.0, Aperture(lens_shape("heart").outlines, (1.0,), cat_eye=0.5))
+    refused("aberration", opening, 1.0, Aperture(Aperture.disc().outlines, (1.0,), spherical_aberration=0.5))
 
 
 # --- Scenes and plans ----------------------------------------------------------------------------------------------------------------
@@ -253,8 +250,7 @@ def test_the_opening_of_a_plan_blurs_as_its_lens_says() -> None:
     ("settings", "word"), [({"scenes": ("sea",)}, "fence"), ({"shapes": ("box",)}, "heart"), ({"samples": 0}, "sample")]
 )
 def test_plans_that_cannot_be_are_refused_with_what_can_be(settings: dict, word: str) -> None:
-    with pytest.raises(InputError, match=word):
-        TruthPlan(**settings)
+    refused(word, TruthPlan, **settings)
 
 
 # --- Both ways of tracing, and the script --------------------------------------------------------------------------------------------

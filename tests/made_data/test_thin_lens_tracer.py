@@ -10,7 +10,7 @@ from datasets_scripts.tracers.traced_scene import DiscLight, Scene, Sphere, emis
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 SIZE_PX = 64
 # A crop of 0.32 mm with 64 px: 90 px of blur per dioptre, so that a small picture shows large blur.
@@ -157,5 +157,4 @@ def test_the_seed_decides_every_pixel_and_a_camera_with_another_focal_length_is_
     first, again, other = (trace(scene, camera(LENS), LENS, 32, seed) for seed in (5, 5, 6))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - other).max() > 1e-4
-    with pytest.raises(InputError, match="camera_for_lens"):
-        trace(Scene(), camera(LENS), LENS.focused_at(0.5), 16)
+    refused("camera_for_lens", trace, Scene(), camera(LENS), LENS.focused_at(0.5), 16)

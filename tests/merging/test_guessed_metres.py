@@ -28,11 +28,11 @@ from mrbokeh.stacks.guessed_metres import (
     metres_note,
     metres_notes,
 )
-from mrbokeh.system.errors import InputError
 from tests.compositing.test_composite_command import CAKE
 from tests.house.test_user_mistakes import said
 from tests.scenes.card_stack import CARD_PX, LENS, SIZE, make_card_stack
 from tests.scenes.guessed_stack import guessed_twin
+from tests.scenes.refusals import refused
 from training.export.onnx_export import network_facts_of
 from training.fitting.run_folder import load_run
 
@@ -93,11 +93,9 @@ def test_places_between_slices_and_at_pixels(known: FocalStack) -> None:
     [("#3", "#0 to #2"), ("#-1", "#0 to #2"), ("@500,2", "72 x 48 pixels"), ("#a", "--focus"), ("@1", "--focus"), ("#0,#0", "different")],
 )
 def test_places_that_are_not_there_are_refused(known: FocalStack, text: str, match: str) -> None:
-    with pytest.raises(InputError, match=match):
-        parse_focus(text, FocusLookup.of(known))
+    refused(match, parse_focus, text, FocusLookup.of(known))
     for place, needed in (("#1", "a focal stack, for a picture has no slices"), ("@1,1", "needs the depth of the picture")):
-        with pytest.raises(InputError, match=needed):
-            parse_focus(place, FocusLookup(LENS))
+        refused(needed, parse_focus, place, FocusLookup(LENS))
 
 
 def test_names_of_slices_close_together_differ() -> None:

@@ -14,7 +14,7 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import blur_layer
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 SIZE = (96, 128)
 FOCUS = (2.0, 1.5, 1.0)
@@ -155,5 +155,4 @@ def test_optics_of_a_stack_are_its_circles_of_confusion() -> None:
 
 
 def test_optics_need_one_of_each_for_every_slice() -> None:
-    with pytest.raises(InputError, match="got 2 and 1 of them"):
-        SliceOptics.of_slices((1.0, 2.0), (12.0,))
+    refused("got 2 and 1 of them", SliceOptics.of_slices, (1.0, 2.0), (12.0,))

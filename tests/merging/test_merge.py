@@ -22,7 +22,7 @@ from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.images.image_metrics import depth_edge_mask, psnr
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 VIEW = "view_1"
 
@@ -126,22 +126,19 @@ def test_a_registration_of_pictures_of_another_size_is_refused(desk: FocalStack,
     scene = tmp_path / "other"
     shutil.copytree(desk.folder, scene)
     write_registration(tmp_path / "half.json", replace(read_registration(scene / "registration.json"), size_px=(272, 180)))
-    with pytest.raises(InputError, match=r"\(272, 180\).*\(544, 360\)"):
-        merge_scene(scene, overwrite=True, registration=tmp_path / "half.json")
+    refused(r"\(272, 180\).*\(544, 360\)", merge_scene, scene, overwrite=True, registration=tmp_path / "half.json")
 
 
 def test_slices_out_of_order_are_refused(tmp_path: Path) -> None:
     write_focal_stack(FocalStack(tmp_path, tuple(Slice(f"slices/{i}.exr", distance) for i, distance in enumerate((1.0, 3.0, 2.0)))))
-    with pytest.raises(InputError, match="not in the order of their focus"):
-        merge_scene(tmp_path)
+    refused("not in the order of their focus", merge_scene, tmp_path)
 
 
 def test_a_registration_of_another_stack_is_refused(desk: FocalStack, tmp_path: Path) -> None:
     found = read_registration(desk.folder / "registration.json")
     fewer = replace(found, reference_from_slice=found.reference_from_slice[:4], correlations=found.correlations[:3], residuals_px=())
     write_registration(tmp_path / "four.json", fewer)
-    with pytest.raises(InputError, match="4"):
-        merge_scene(desk.folder, overwrite=True, registration=tmp_path / "four.json")
+    refused("4", merge_scene, desk.folder, overwrite=True, registration=tmp_path / "four.json")
 
 
 def test_a_second_pass_with_true_depth_keeps_the_first(desk: FocalStack, tmp_path: Path) -> None:
@@ -171,8 +168,7 @@ def test_a_second_pass_with_true_depth_keeps_the_first(desk: FocalStack, tmp_pat
 
 def test_a_stack_without_a_merge_has_no_second_pass(tmp_path: Path) -> None:
     stack = FocalStack(tmp_path, tuple(Slice(f"{i}.exr", 1.0 + i) for i in range(3)))
-    with pytest.raises(InputError, match="capture merge"):
-        second_pass(stack, np.ones((4, 4), np.float32))
+    refused("capture merge", second_pass, stack, np.ones((4, 4), np.float32))
 
 
 def test_photographs_without_distances_give_an_index_and_guessed_metres(tmp_path: Path) -> None:
@@ -203,6 +199,5 @@ def test_a_sheet_shows_what_came_out(desk: FocalStack) -> None:
 def test_one_slice_is_no_stack(tmp_path: Path) -> None:
     write_image(tmp_path / "slices/0.exr", np.ones((64, 64, 3), np.float32))
     write_focal_stack(FocalStack(tmp_path, (Slice("slices/0.exr", 1.0),)))
-    with pytest.raises(InputError, match="at least 2"):
-        merge_scene(tmp_path)
+    refused("at least 2", merge_scene, tmp_path)
     assert not read_focal_stack(tmp_path).merged

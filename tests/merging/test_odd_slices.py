@@ -16,8 +16,8 @@ from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.odd_slices import Candidate, blown, duplicates, odd_sizes, other_scenes
 from capture.stacks.slice_looks import look_at, look_of, one_scene, same_photograph
 from mrbokeh.images.image_io import write_image
-from mrbokeh.system.errors import InputError
 from tests.scenes.made_photographs import Picture, defocused, make_shoot, only_stack, scene_rgb, sources
+from tests.scenes.refusals import refused
 
 CHECKS = (blown, duplicates, other_scenes)
 
@@ -136,8 +136,7 @@ def two_sizes(folder: Path) -> None:
 )
 def test_without_a_majority_one_sentence_and_nothing_half_written(make: Callable[[Path], None], told: str, tmp_path: Path) -> None:
     make(tmp_path / "shoot")
-    with pytest.raises(InputError, match=told):
-        ingest([tmp_path / "shoot"], tmp_path / "scene")
+    refused(told, ingest, [tmp_path / "shoot"], tmp_path / "scene")
     assert not list((tmp_path / "scene").rglob("*.exr"))
     assert not (tmp_path / "scene" / "shoot").exists()
     sweep(tmp_path / "more" / "good", 3)

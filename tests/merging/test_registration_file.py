@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from capture.merging.registration.registration_file import Breathing, Registration, read_registration, write_registration
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 
 REGISTRATION = Registration(
     reference=1,
@@ -48,8 +48,7 @@ def test_a_person_can_read_it(tmp_path: Path) -> None:
 def test_a_file_of_another_stack_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "registration.json"
     write_registration(path, REGISTRATION)
-    with pytest.raises(InputError, match="registers 3 slices, but the stack has 5"):
-        read_registration(path, slices=5)
+    refused("registers 3 slices, but the stack has 5", read_registration, path, slices=5)
 
 
 @pytest.mark.parametrize("change", [
@@ -64,5 +63,4 @@ def test_a_broken_file_gets_one_clear_line(tmp_path: Path, change: dict) -> None
     path = tmp_path / "registration.json"
     write_registration(path, REGISTRATION)
     path.write_text(json.dumps(json.loads(path.read_text()) | change))
-    with pytest.raises(InputError, match="delete"):
-        read_registration(path)
+    refused("delete", read_registration, path)

@@ -17,8 +17,8 @@ from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.slice_files import find_slices
 from capture.stacks.stack_ingest import Development
 from mrbokeh.images.image_io import write_image
-from mrbokeh.system.errors import InputError
 from tests.scenes.made_photographs import make_raw_photo, make_shoot, only_stack, scene_rgb, sources
+from tests.scenes.refusals import refused
 
 
 @pytest.fixture
@@ -143,8 +143,7 @@ def test_another_size_is_asked_for_by_overwrite_only(tmp_path: Path) -> None:
     path = make_raw_photo(tmp_path / "shoot" / "0.dng", scene_rgb(24, 32), 0.6)
     small = IngestSettings(development=Development(max_width=16))
     made = only_stack(ingest([path.parent], tmp_path / "scene", small))
-    with pytest.raises(InputError, match="was ingested with --max-width 16, now it is None"):
-        ingest([path.parent], tmp_path / "scene")
+    refused("was ingested with --max-width 16, now it is None", ingest, [path.parent], tmp_path / "scene")
     assert made.slice_rgb(0).shape[1] == 16
     again = only_stack(ingest([path.parent], tmp_path / "scene", IngestSettings(overwrite=True)))
     assert again.slice_rgb(0).shape[1] == 32

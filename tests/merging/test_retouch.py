@@ -17,6 +17,7 @@ from mrbokeh.images.picture_codec import stored_rgb, write_stored
 from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack
 from mrbokeh.system.errors import InputError
 from tests.scenes.crossing_stack import DISTANCES_M, FAR, NEAR, SIZE, crossing_stack, unmoved
+from tests.scenes.refusals import refused
 
 ON_ITS_SIDE = 6
 """EXIF: a quarter turn clockwise brings the picture upright."""
@@ -161,8 +162,7 @@ def test_bad_input_is_one_sentence_and_nothing_changes(stack: FocalStack, tmp_pa
         ([0], [photograph], "neither black nor white: expected white strokes on black"),
         ([0], [stack.folder / "depth.png"], "read and would be written over"),
     ):
-        with pytest.raises(InputError, match=match):
-            retouch_scene(stack.folder, slices, masks)
+        refused(match, retouch_scene, stack.folder, slices, masks)
     result = CliRunner().invoke(app, ["merge", str(stack.folder), "--from-slice", "1", "--mask", str(good), "--overwrite"])
     assert isinstance(result.exception, InputError) and "leave out --overwrite" in str(result.exception)
     assert state_of(stack.folder) == before
@@ -171,8 +171,6 @@ def test_bad_input_is_one_sentence_and_nothing_changes(stack: FocalStack, tmp_pa
 def test_one_merged_stack_is_retouched(stack: FocalStack, tmp_path: Path) -> None:
     good = painted_upright(tmp_path / "good.png", white(np.uint8))
     other = crossing_stack(tmp_path / "other")
-    with pytest.raises(InputError, match="not merged yet"):
-        retouch_scene(other.folder, [0], [good])
+    refused("not merged yet", retouch_scene, other.folder, [0], [good])
     shutil.copytree(other.folder, stack.folder.parent / "another")
-    with pytest.raises(InputError, match=r"has 2 stacks.*another"):
-        retouch_scene(stack.folder.parent, [0], [good])
+    refused(r"has 2 stacks.*another", retouch_scene, stack.folder.parent, [0], [good])

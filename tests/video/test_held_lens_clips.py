@@ -14,9 +14,9 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
-from mrbokeh.system.errors import InputError
 from mrbokeh.video.picture_source import open_source
 from tests.scenes.command_line import printed_by
+from tests.scenes.refusals import refused
 from tests.scenes.video_files import filmed, turned_clip
 
 WIDTH, HEIGHT = 96, 64
@@ -103,8 +103,7 @@ def test_photographs_that_turn_amid_the_sequence_are_refused(tmp_path: Path) -> 
     for number, quarters in enumerate((0, 2)):
         photographs(tmp_path, "png", quarters).with_name(f"taken_{quarters}.0.png").rename(tmp_path / f"in.{number}.png")
     source = open_source(tmp_path / "in.%d.png", "25")
-    with pytest.raises(InputError, match=r"EXIF says orientation 3 of .*in\.1\.png, but 1 of .*in\.0\.png: expected one way up"):
-        list(source.frames(0, 2))
+    refused(r"EXIF says orientation 3 of .*in\.1\.png, but 1 of .*in\.0\.png: expected one way up", list, source.frames(0, 2))
 
 
 def test_mirrored_photographs_are_mirrored_back(tmp_path: Path) -> None:

@@ -11,8 +11,8 @@ from mrbokeh.images.image_io import read_image, read_layer, write_image, write_l
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
-from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import read_frames
+from tests.scenes.refusals import refused
 from tests.scenes.video_files import encoded, filmed
 from tests.scenes.video_files import video as run
 
@@ -117,8 +117,7 @@ def test_video_of_high_dynamic_range_is_read_where_its_space_is_named(tmp_path: 
     codes = np.full((HEIGHT, WIDTH, 3), round(0.58 * 65535), np.uint16)
     frame = av.VideoFrame.from_ndarray(codes, "rgb48le").reformat(format="gbrp16le")
     encoded(clip, "ffv1", "gbrp16le", frame, color_trc=16, color_primaries=9)
-    with pytest.raises(InputError, match="HDR video"):
-        run(clip, *settings, "--out", tmp_path / "no.%d.exr")
+    refused("HDR video", run, clip, *settings, "--out", tmp_path / "no.%d.exr")
     run(clip, *settings, "--input-space", "Rec.2100-PQ - Display", "--out", tmp_path / "out.%d.exr")
     light = read_image(tmp_path / "out.0.exr")[5, 5]
     # OpenColorIO counts display light by 100 cd/m2.
@@ -135,8 +134,7 @@ def test_what_makes_no_sense_ends_in_a_sentence(tmp_path: Path, settings: list[s
         ("--output-space LogC9 --out out.mov", "has no colour space 'LogC9'"),
         ("--output-space ACEScg --ocio none.ocio --out out.mov", "expected an OpenColorIO configuration"),
     ):
-        with pytest.raises(InputError, match=message):
-            run(clip, *settings, *words.split())
+        refused(message, run, clip, *settings, *words.split())
     assert not list(tmp_path.glob("out*"))
 
 
