@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.optics.lens import Lens
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 from viewfinder.app.opening import LensBook
 from viewfinder.focus.sources import FirstKnown, FrameFocus, ManualFocus, open_focus
 from viewfinder.frames import CameraFrame, LensState
@@ -49,8 +49,7 @@ def test_by_hand() -> None:
 def test_wrong_by_hand_changes_nothing(wrong: float) -> None:
     manual = ManualFocus(LensState(1.0, 4.0))
     for call in (manual.focus, manual.set_f_number):
-        with pytest.raises(InputError, match="expected"):
-            call(wrong)
+        refused("expected", call, wrong)
     assert manual.state(frame(), None) == LensState(1.0, 4.0)
 
 
@@ -114,8 +113,7 @@ def test_choosing() -> None:
     book.choose("eighty")
     assert (book.chosen, book.lens.focal_length_mm, book.names) == ("eighty", 85.0, ["fifty", "eighty"])
     assert book.slider_dioptres == (0.0, pytest.approx(1 / 0.51))
-    with pytest.raises(InputError, match="one of the lenses fifty, eighty"):
-        book.choose("ninety")
+    refused("one of the lenses fifty, eighty", book.choose, "ninety")
 
 
 def test_offered_f_numbers_are_the_lens_and_smaller_openings() -> None:

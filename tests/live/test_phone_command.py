@@ -25,6 +25,7 @@ from mrbokeh.system.errors import InputError
 from tests.scenes.browser_sender import Canvas, sending
 from tests.scenes.command_line import printed_by
 from tests.scenes.phone_on_camera import CAMERA_FROM_PHONE, PHONE, VIEWS, camera_at, phone_at, picture, rig_error, view, write_files
+from tests.scenes.refusals import refused
 from tests.scenes.told_parts import ToldCamera, ToldTracker
 from tests.scenes.traced_board_clip import pose_error
 from tests.scenes.waiting import wait_until
@@ -97,8 +98,7 @@ def test_calibration_by_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     degrees, millimetres = rig_error(rig.camera_from_phone)
     assert degrees < 0.3 and millimetres < 3.0 and rig.pairs == 5 and rig.residual_deg < 0.3 and rig.residual_mm < 3.0
     assert set(threads()) <= before
-    with pytest.raises(InputError, match="--overwrite"):
-        calibrate(tmp_path)
+    refused("--overwrite", calibrate, tmp_path)
 
 
 def tracking_by(folder: Path, phone: str) -> TrackingOptions:
@@ -210,13 +210,10 @@ def test_exact_poses_give_the_rig_back_though_one_stream_is_late(late_s: float) 
 
 
 def test_too_few_and_contradicting_views_are_refused() -> None:
-    with pytest.raises(InputError, match="needs 5 pairs of poses or more, got 3"):
-        calibrated(3, 16)
-    with pytest.raises(InputError, match="disagree by"):
-        calibrated(VIEWS, 16, wrong_deg=6.0)
+    refused("needs 5 pairs of poses or more, got 3", calibrated, 3, 16)
+    refused("disagree by", calibrated, VIEWS, 16, wrong_deg=6.0)
     # Nobody stands still: each view lasts 0.3 s.
-    with pytest.raises(InputError, match="got 0: show both the board for longer"):
-        calibrated(VIEWS, 3)
+    refused("got 0: show both the board for longer", calibrated, VIEWS, 3)
 
 
 def test_a_moment_ends_where_the_board_is_lost() -> None:
@@ -244,8 +241,7 @@ def test_bad_files_are_refused_before_a_camera_is_opened(tmp_path: Path, monkeyp
         ("phone_camera", "none.json", "no such file"), ("board", "lens.json", "expected a ChArUco board"), ("lens", "board.json", "lens"),
         ("out", "nowhere/rig.json", "there is no"),
     ):  # fmt: skip
-        with pytest.raises(InputError, match=re.escape(sentence)):
-            calibrate(tmp_path, **{name: file})
+        refused(re.escape(sentence), calibrate, tmp_path, **{name: file})
 
 
 def test_cameras_that_are_not_there(tmp_path: Path) -> None:
@@ -257,8 +253,7 @@ def test_cameras_that_are_not_there(tmp_path: Path) -> None:
         ("test", "folder:none", ["--camera", "a.json"], "either --camera CAMERA.json or --lens"),
         ("test", "folder:none", ["--tls-key", "a.pem"], "--tls-key is for --tls"),
     ):  # fmt: skip
-        with pytest.raises(InputError, match=re.escape(sentence)):
-            calibrate(tmp_path, *more, source=source, phone=phone)
+        refused(re.escape(sentence), calibrate, tmp_path, *more, source=source, phone=phone)
     assert set(threads()) <= before and not (tmp_path / "rig.json").exists()
 
 
@@ -347,10 +342,8 @@ def test_one_wrong_pair_does_little() -> None:
 
 def test_calibrations_that_cannot_be() -> None:
     rng = np.random.default_rng(3)
-    with pytest.raises(InputError, match="5 pairs of poses or more, got 4"):
-        calibrate_rig(pairs(4, rng))
-    with pytest.raises(InputError, match="disagree by"):
-        calibrate_rig(pairs(10, rng, 10.0, 0.05))
+    refused("5 pairs of poses or more, got 4", calibrate_rig, pairs(4, rng))
+    refused("disagree by", calibrate_rig, pairs(10, rng, 10.0, 0.05))
 
 
 def test_rig_file(tmp_path: Path) -> None:
@@ -361,8 +354,7 @@ def test_rig_file(tmp_path: Path) -> None:
     text = (tmp_path / "rig.json").read_text()
     for wrong in (text.replace("mrbokeh-phone-rig", "other"), "[]", text.replace(str(CAMERA_FROM_PHONE[0, 0]), "7.0"), '{"format": 1}'):
         (tmp_path / "wrong.json").write_text(wrong)
-        with pytest.raises(InputError, match="not a phone rig"):
-            read_phone_rig(tmp_path / "wrong.json")
+        refused("not a phone rig", read_phone_rig, tmp_path / "wrong.json")
 
 
 def slid_at(time_s: float) -> np.ndarray:

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.system.errors import InputError
 from tests.scenes.made_viewfinder import made_viewfinder
+from tests.scenes.refusals import refused
 from viewfinder.options import ListeningOptions
 from viewfinder.server.access import LOOPBACK_NAMES, Access
 from viewfinder.server.endpoint import Endpoint, Interface, choose, interfaces, load_tls, on_stop, open_endpoint, page_url, qr_text
@@ -41,8 +41,7 @@ def test_none_or_several_are_named() -> None:
         ([LOOPBACK, BRIDGE, CABLE], None, None, r"found 2.*docker0.*eth0"),
         ([LOOPBACK], None, None, r"found 0.*one of none"), ([LOOPBACK, PUBLIC], None, PUBLIC.address, r"found 0.*wan"),
     ):  # fmt: skip
-        with pytest.raises(InputError, match=sentence):
-            choose(found, wanted, on_the_way)
+        refused(sentence, choose, found, wanted, on_the_way)
     pytest.importorskip("ifaddr")
     assert "127.0.0.1" in [each.address for each in interfaces()]
 
@@ -157,8 +156,7 @@ def test_what_cannot_be_used_is_named(make_certificate: Make, tmp_path: Path) ->
         (make_certificate("nameless", named=False), "names no host"),
     ]
     for files, expected in cases:
-        with pytest.raises(InputError, match=expected):
-            load_tls(*files)
+        refused(expected, load_tls, *files)
 
 
 def test_what_is_printed_for_a_network(capsys: pytest.CaptureFixture[str]) -> None:

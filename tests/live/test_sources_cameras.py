@@ -17,6 +17,7 @@ import pytest
 
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.color import linear_from_code
+from tests.scenes.refusals import refused
 from tests.scenes.video_files import filmed
 from tests.tether.test_gphoto2 import StandIn, Widget, gp, in_own_interpreter
 from viewfinder.frames import LensState
@@ -95,8 +96,7 @@ def test_a_thread_hands_over_the_newest_and_its_failure() -> None:
     assert went_on.wait(5)
     got = [first]
 
-    with pytest.raises(InputError, match="broken"):
-        got.extend(items)
+    refused("broken", got.extend, items)
     # The last of the hundred comes, few of those before it do.
     assert got[-2:] == [99, 100] and got == sorted(got) and len(got) < 20
 
@@ -220,5 +220,4 @@ def noted(source: Any) -> Iterator[list[str | None]]:
 
 
 def test_no_camera_at_the_start_is_refused() -> None:
-    with pytest.raises(InputError, match=r"no camera found.*switch it on"):
-        Gphoto2PreviewSource()
+    refused(r"no camera found.*switch it on", Gphoto2PreviewSource)

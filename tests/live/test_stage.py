@@ -20,6 +20,7 @@ from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.system.errors import InputError
 from tests.objects.test_scene_gltf import GlbWriter
+from tests.scenes.refusals import refused
 from tests.scenes.stage_scenes import FOCAL_PX, HEIGHT, LENS, ONE_CARD, WIDTH, backend, camera, centroid, scene_file
 from viewfinder.stage.stage import FADE_S, AdaptiveResolution, Fade, Stage
 from viewfinder.stage.stage_setup import live_renderer
@@ -195,8 +196,7 @@ def test_objects_are_moved_and_hidden(stage: Stage) -> None:
     stream.until(lambda: not stream.frame().shines_through.size)
     stage.show_object("card", True)
     stream.until(lambda: bool(stream.frame().shines_through.size))
-    with pytest.raises(InputError, match="expected the name of an object"):
-        stage.move_object("lamp", (0.0, 0.0, 0.0))
+    refused("expected the name of an object", stage.move_object, "lamp", (0.0, 0.0, 0.0))
 
 
 class Refusing:
@@ -221,8 +221,7 @@ class Slow:
 def test_renderers_are_switched_and_one_that_refuses_leaves_the_picture(stage: Stage) -> None:
     stream = Stream(stage, camera())
     stream.settled()
-    with pytest.raises(InputError, match="expected a renderer"):
-        live_renderer("crystal ball")
+    refused("expected a renderer", live_renderer, "crystal ball")
     refusing: Renderer = Refusing()
     stage.set_renderer("refusing", refusing)
     stream.until(lambda: stage.status.problem is not None)
@@ -284,8 +283,7 @@ def test_the_lens_of_the_file_and_a_file_that_is_wrong_and_the_thread_ends_with_
         assert stage.lens is not None and replace(stage.lens, aperture=LENS.aperture) == LENS
         assert threading.active_count() == before + 1
     assert threading.active_count() == before
-    with pytest.raises(InputError, match="expected a scene file"):
-        Stage(tmp_path / "other.toml", backend())
+    refused("expected a scene file", Stage, tmp_path / "other.toml", backend())
 
 
 def test_fading_goes_by_the_time_of_frames() -> None:

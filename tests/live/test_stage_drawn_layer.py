@@ -23,8 +23,8 @@ from mrbokeh.scene.mesh import rigid_motion
 from mrbokeh.scene.staging.picture_box import box_around, drawn_points_m
 from mrbokeh.scene.staging.scene_description import Lighting, RealThings, Sun
 from mrbokeh.scene.staging.staged_scene import Assets
-from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import UPRIGHT_FROM_WORLD, turned, turned_back, upright_camera
+from tests.scenes.refusals import refused
 from tests.scenes.stage_scenes import FOCAL_PX, HEIGHT, LENS, ONE_CARD, SHADOW, WIDTH, camera, centroid, render_setup, scene_file, staged
 from viewfinder.stage.drawing import Drawing, DrawRequest, draw, is_outdated, moved_px, sharp_layers
 from viewfinder.stage.occlusion import Mask, Occlusion, RealDepth, read_occlusion
@@ -182,8 +182,7 @@ class TestOcclusion:
         for occlusion in (by_depth, by_mask):
             assert not self.drawn_behind(tmp_path, occlusion).any()
         write_exr(tmp_path / "depth.exr", ExrPart({"Z": np.full((HEIGHT, HEIGHT), 0.9, np.float32)}))
-        with pytest.raises(InputError, match="expected the same picture"):
-            read_occlusion(RealThings(tmp_path / "depth.exr", tmp_path / "camera.json"), "-z")
+        refused("expected the same picture", read_occlusion, RealThings(tmp_path / "depth.exr", tmp_path / "camera.json"), "-z")
 
 
 class TestRedraw:
@@ -295,10 +294,8 @@ def test_a_tap_focuses_on_the_object_or_else_on_the_table(tmp_path: Path) -> Non
     assert depth_at_m(scene, 80.0, 56.0) == pytest.approx(1.0)
     # 0.1 m above the table, 40 px below the horizon: f h / y = 150 * 0.1 / 40.
     assert depth_at_m(scene, 10.0, 96.0) == pytest.approx(0.375)
-    with pytest.raises(InputError, match="point in the picture"):
-        depth_at_m(scene, -3.0, 0.0)
-    with pytest.raises(InputError, match="cannot focus at"):
-        depth_at_m(scene, 10.0, 10.0)
+    refused("point in the picture", depth_at_m, scene, -3.0, 0.0)
+    refused("cannot focus at", depth_at_m, scene, 10.0, 10.0)
 
 
 def test_views(tmp_path: Path) -> None:
@@ -315,8 +312,7 @@ def test_views(tmp_path: Path) -> None:
     # The near card is red (blue first: the last), the far one blue.
     near, far = pictures["depth"][centre].astype(int), pictures["depth"][56, 110].astype(int)
     assert near[2] > near[0] and far[0] > far[2] and not pictures["depth"][beside].any()
-    with pytest.raises(InputError, match="expected a view"):
-        view_picture("heat", PLATE, scene, TABLES)
+    refused("expected a view", view_picture, "heat", PLATE, scene, TABLES)
 
 
 @pytest.mark.parametrize(("focus_m", "colour"), [(1.0, (255, 255, 255)), (0.5, (0, 0, 255)), (3.0, (255, 0, 0))])

@@ -10,10 +10,10 @@ import av
 import numpy as np
 import pytest
 
-from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import probe, read_frames
 from mrbokeh.video.color import BT709, LIMITED, VideoColor, code_from_linear
 from mrbokeh.video.frames import display_bgr
+from tests.scenes.refusals import refused
 from tests.scenes.streaming_viewers import BARS, HEIGHT, WIDTH, bar_centres, bars, ignore, noise, output, streaming, taken
 from tests.scenes.waiting import wait_until
 from viewfinder.frames import OutputFrame
@@ -170,16 +170,13 @@ def test_a_file_appears_when_it_is_whole_and_none_is_overwritten(tmp_path: Path)
     recorder.start(path)
     assert recorder.wants_frame
     recorder.show(output(bars(), 0, 1.0))
-    with pytest.raises(InputError, match="one recording at a time"):
-        recorder.start(tmp_path / "other.mp4")
+    refused("one recording at a time", recorder.start, tmp_path / "other.mp4")
     assert not path.exists()
     recorder.stop()
     assert not recorder.wants_frame and list(tmp_path.iterdir()) == [path]
     for start, sentence in ((path, "exists already"), (tmp_path / "clip.gif", r"\.mp4")):
-        with pytest.raises(InputError, match=sentence):
-            recorder.start(start)
-    with pytest.raises(InputError, match="none was started"):
-        recorder.stop()
+        refused(sentence, recorder.start, start)
+    refused("none was started", recorder.stop)
     recorder.show(output(bars(), 1, 2.0))
     # It can be used again; stopped before the first picture it waits for one.
     recorder.start(tmp_path / "second.mp4")
@@ -195,8 +192,7 @@ def test_a_recording_of_nothing_leaves_nothing(tmp_path: Path, monkeypatch: pyte
     monkeypatch.setattr("viewfinder.streaming.recording._FIRST_PICTURE_S", 0.05)
     recorder = Recorder("bt709")
     recorder.start(tmp_path / "clip.mp4")
-    with pytest.raises(InputError, match="at least one picture"):
-        recorder.stop()
+    refused("at least one picture", recorder.stop)
     assert list(tmp_path.iterdir()) == []
     recorder.start(tmp_path / "clip.mp4")
     for _ in range(2):
@@ -238,8 +234,7 @@ def test_a_disk_that_refuses_gives_a_sentence(tmp_path: Path) -> None:
     recorder.start(tmp_path / "file" / "clip.mp4")
     recorder.show(output(bars(), 0, 1.0))
     wait_until(lambda: not recorder.wants_frame)
-    with pytest.raises(InputError, match="could not be written"):
-        recorder.stop()
+    refused("could not be written", recorder.stop)
 
 
 def push(stream: EncodedStream, *sequences: int, codec: str = "H264", captured_s: float | None = None) -> None:

@@ -13,9 +13,9 @@ import pytest
 from mrbokeh.compositing.overlay import Overlay, code_tables
 from mrbokeh.images.image_io import write_layer
 from mrbokeh.optics.lens_file import write_lens
-from mrbokeh.system.errors import InputError
 from mrbokeh.video.color import code_from_linear
 from tests.scenes.layer_viewfinder import HEIGHT, LENS, WIDTH, bright_square, write_plate
+from tests.scenes.refusals import refused
 from tests.scenes.streaming_viewers import ignore, output, streaming, taken
 from tests.scenes.waiting import wait_until
 from viewfinder.app.running import opened as serving
@@ -154,13 +154,11 @@ def test_a_device_that_is_unplugged_ends_it_with_a_sentence(opened: list[FakeCam
 
 def test_without_the_package_it_says_how_to_get_it_and_without_a_device_what_to_load(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyvirtualcam", None)
-    with pytest.raises(InputError, match="pip install pyvirtualcam"):
-        VirtualWebcam()
+    refused("pip install pyvirtualcam", VirtualWebcam)
     # Nothing is faked here: pyvirtualcam itself looks for the device.
     monkeypatch.undo()
     pytest.importorskip("pyvirtualcam")
-    with pytest.raises(InputError, match=r"the virtual webcam no-such-device could not be opened .*: on Linux load one with"):
-        VirtualWebcam("no-such-device")
+    refused(r"the virtual webcam no-such-device could not be opened .*: on Linux load one with", VirtualWebcam, "no-such-device")
 
 
 def test_the_webcam_shows_what_the_viewfinder_composites(opened: list[FakeCamera], tmp_path: Path) -> None:

@@ -12,11 +12,11 @@ from datasets_scripts.charuco_clip import HandHeld, Sheet, pack_table, trace_she
 from mrbokeh.images.color import display_rgb8
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
-from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.board_calibration import calibrated
 from mrbokeh.tracking.charuco import board as boards
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, black_rectangles_mm, board_from_json, board_to_json
 from mrbokeh.tracking.charuco.detector import CharucoDetector
+from tests.scenes.refusals import refused
 from tests.scenes.traced_board_clip import BOARD, tilted_views
 from viewfinder.tracking.printed_board import MARGIN_MM, BoardView, page_for, plan_board, write_board_pdf
 
@@ -62,16 +62,13 @@ def test_what_is_no_board_is_refused_with_a_sentence() -> None:
         ({"dictionary": "DICT_4X4_50", "grids": [plain | {"squares": [12, 11]}]}, "66 markers"),
         ({"squares": [5, 4]}, "expected a ChArUco board"),
     ):  # fmt: skip
-        with pytest.raises(InputError, match=re.escape(sentence)):
-            board_from_json({**board_to_json(SIMPLE), **change}, "board.json")
+        refused(re.escape(sentence), board_from_json, {**board_to_json(SIMPLE), **change}, "board.json")
 
 
 def test_grids_must_not_share_markers_or_paper() -> None:
     one = CharucoGrid((4, 4), 20.0, 15.0)
-    with pytest.raises(InputError, match="share marker ids"):
-        CharucoBoard((one, CharucoGrid((4, 4), 20.0, 15.0, (0.0, 90.0), 7)))
-    with pytest.raises(InputError, match="overlap"):
-        CharucoBoard((one, CharucoGrid((4, 4), 20.0, 15.0, (79.0, 0.0), 8)))
+    refused("share marker ids", CharucoBoard, (one, CharucoGrid((4, 4), 20.0, 15.0, (0.0, 90.0), 7)))
+    refused("overlap", CharucoBoard, (one, CharucoGrid((4, 4), 20.0, 15.0, (79.0, 0.0), 8)))
     assert CharucoBoard((one, CharucoGrid((4, 4), 20.0, 15.0, (80.0, 0.0), 8))).size_mm == (160.0, 80.0)
 
 
@@ -109,17 +106,14 @@ def test_paper_is_turned_chosen_or_refused() -> None:
     wide = CharucoBoard((CharucoGrid((9, 4), 30.0, 22.0),))
     assert (page_for(wide, "A4").width_mm, page_for(wide, "A4").height_mm) == (297.0, 210.0)
     large = CharucoBoard((CharucoGrid((8, 6), 60.0, 45.0),))
-    with pytest.raises(InputError, match="480x360 mm, but a3 has room for 277x378 or 400x255 mm"):
-        page_for(large, "a3")
+    refused("480x360 mm, but a3 has room for 277x378 or 400x255 mm", page_for, large, "a3")
     assert page_for(large, "board").holds(large.size_mm)
-    with pytest.raises(InputError, match="expected a paper of a4, a3, letter"):
-        page_for(large, "a5")
+    refused("expected a paper of a4, a3, letter", page_for, large, "a5")
 
 
 def test_a_board_that_was_printed_is_not_replaced(tmp_path: Path) -> None:
     write_board_pdf(tmp_path / "board.pdf", SIMPLE)
-    with pytest.raises(InputError, match="exists already"):
-        write_board_pdf(tmp_path / "board.pdf", BOARD)
+    refused("exists already", write_board_pdf, tmp_path / "board.pdf", BOARD)
     write_board_pdf(tmp_path / "board.pdf", BOARD, overwrite=True)
 
 
@@ -164,8 +158,7 @@ def test_two_scales_where_sharpness_varies_and_a_larger_paper_where_needed() -> 
 def test_where_no_paper_helps_the_plan_says_so() -> None:
     plan = plan_board(BoardView(Lens(50.0, 1.8, 0.8, 36.0), 0.5, 1.2, 1280))
     assert plan.board is None and "phone on the camera" in plan.sentence
-    with pytest.raises(InputError, match="nearest <= farthest"):
-        BoardView(Lens(50.0, 1.8, 0.8, 36.0), 1.5, 1.2, 1280)
+    refused("nearest <= farthest", BoardView, Lens(50.0, 1.8, 0.8, 36.0), 1.5, 1.2, 1280)
 
 
 @pytest.mark.parametrize(
@@ -189,5 +182,4 @@ def test_a_planned_board_with_too_few_corners_to_calibrate_by_says_so() -> None:
     plan = plan_board(BoardView(Lens(22.0, 5.6, 0.7, 24.0), 0.5, 2.0, 1280))
     assert plan.board is not None and len(plan.board.corners_m) == 6
     assert plan.sentence.endswith("its 6 corners are too few for `mrbokeh track clip --calibrate` (8): give it --camera")
-    with pytest.raises(InputError, match="only 0 frames show 8 corners"):
-        calibrated(plan.board, tilted_views(plan.board, np.linspace(-40.0, 40.0, 24), 0.6), 640, 360)
+    refused("only 0 frames show 8 corners", calibrated, plan.board, tilted_views(plan.board, np.linspace(-40.0, 40.0, 24), 0.6), 640, 360)

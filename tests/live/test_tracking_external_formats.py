@@ -20,6 +20,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.track import pose_between
 from mrbokeh.tracking.world_axes import inverted, pan_tilt_roll_deg, rigid
+from tests.scenes.refusals import refused
 from tests.scenes.tracking_senders import encode_opentrackio, freed_message, opentrackio_document, packets, write_freed
 from tests.scenes.waiting import wait_until
 from viewfinder.focus.sources import TrackedLensFocus
@@ -222,13 +223,10 @@ def test_wrong_lens_tables(tmp_path: Path) -> None:
         (["focus_m,0,1.0", "focus_m,10,2.0", "focus_m,20,1.5"], "turns between 10 and 20"), (["iris,0,2"], "line 2: expected one of"),
         (["focus_m,zero,2"], "line 2: expected one of"), (["focus_m,0,-2"], "line 2: expected one of"), ([], "found none"),
     ):  # fmt: skip
-        with pytest.raises(InputError, match=said):
-            read_encoder_table(write_table(tmp_path / "lens.csv", *rows))
-    with pytest.raises(InputError, match="cannot read it"):
-        read_encoder_table(tmp_path / "none.csv")
+        refused(said, read_encoder_table, write_table(tmp_path / "lens.csv", *rows))
+    refused("cannot read it", read_encoder_table, tmp_path / "none.csv")
     (tmp_path / "head.csv").write_text("count,value\n1,2\n")
-    with pytest.raises(InputError, match="first line axis,count,value"):
-        read_encoder_table(tmp_path / "head.csv")
+    refused("first line axis,count,value", read_encoder_table, tmp_path / "head.csv")
 
 
 def test_real_focus_pull_through_a_table(shared_data: Path, tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ import pycolmap
 import pytest
 
 from mrbokeh.optics.camera import Camera
-from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import inverted, rigid
+from tests.scenes.refusals import refused
 from tests.scenes.textured_room import FOCAL_PX, HEIGHT_PX, WIDTH_PX, picture, room_camera, similarity
 from tests.scenes.told_parts import ImmediateDetections
 from tests.scenes.waiting import wait_until
@@ -193,14 +193,12 @@ def test_looks_are_kept_and_renewed(room: tuple[Path, float, Pose], room_map: Sp
     doubled = read_sparse_map(folder, 2.0 * room[1])
     assert doubled.points_m == pytest.approx(2.0 * kept.points_m)
     (folder / CACHE_NAME).write_bytes(b"half a file")
-    with pytest.raises(InputError, match="cannot read the picture"):
-        read_sparse_map(folder)
+    refused("cannot read the picture", read_sparse_map, folder)
 
 
 def test_wrong_maps(room: tuple[Path, float, Pose], tmp_path: Path) -> None:
     def assert_refused(sentence: str, folder: Path = tmp_path, scale: float | None = 1.0) -> None:
-        with pytest.raises(InputError, match=sentence):
-            read_sparse_map(folder, scale)
+        refused(sentence, read_sparse_map, folder, scale)
 
     assert_refused("scale of the map", scale=None)
     assert_refused("expected a COLMAP model")

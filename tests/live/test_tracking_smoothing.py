@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.system.atomic_files import write_json
-from mrbokeh.system.errors import InputError
+from tests.scenes.refusals import refused
 from tests.scenes.told_parts import ToldTracker
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.smoothing import OneEuroPose, SmoothedTracker
@@ -145,8 +145,7 @@ def test_files_that_are_no_camera_are_refused(tmp_path: Path) -> None:
     skewed[0, 0] = 2.0
     write_json(tmp_path / "skewed.json", camera_to_json(replace(TRIPOD, camera_from_world=skewed)))
     for name, sentence in (("none", "no such file"), ("list", "expected width_px"), ("skewed", "rigid")):
-        with pytest.raises(InputError, match=sentence):
-            read_fixed_pose(tmp_path / f"{name}.json")
+        refused(sentence, read_fixed_pose, tmp_path / f"{name}.json")
 
 
 def test_smoothing_does_not_glide_from_a_wrong_pose_to_the_right_one() -> None:

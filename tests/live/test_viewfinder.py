@@ -28,6 +28,7 @@ from mrbokeh.video.color import code_from_linear, linear_from_code
 from tests.scenes.layer_viewfinder import HEIGHT, LENS, WIDTH, bright_square, running, set_focus, until, viewfinder, watching
 from tests.scenes.live_clip import write_live_clip
 from tests.scenes.live_viewfinder import Live, live
+from tests.scenes.refusals import refused
 from tests.scenes.told_parts import ToldCamera, ToldTracker
 from tests.scenes.waiting import comes_true
 from viewfinder.app.live_compositor import LiveCompositor
@@ -174,12 +175,9 @@ def test_the_slot_keeps_the_newest() -> None:
 def test_what_a_finished_layer_cannot_do_is_said(tmp_path: Path) -> None:
     with viewfinder(PatternSource(WIDTH, HEIGHT), tmp_path) as running_one:
         controls = running_one.site.controls
-        with pytest.raises(InputError, match="has not given a picture"):
-            controls.focus_at_point(0.5, 0.5)
-        with pytest.raises(InputError, match="focuses from"):
-            controls.focus_at_distance(0.02)
-        with pytest.raises(InputError, match="--scene"):
-            controls.move_object("lantern", (0.1, 0.0))
+        refused("has not given a picture", controls.focus_at_point, 0.5, 0.5)
+        refused("focuses from", controls.focus_at_distance, 0.02)
+        refused("--scene", controls.move_object, "lantern", (0.1, 0.0))
         assert controls.state()["dioptre_range"] == (0.0, pytest.approx(1 / 0.3)), "6 focal lengths of 50 mm"
 
 
@@ -189,8 +187,7 @@ def test_a_file_plays_in_its_own_time(plate: tuple[Path, np.ndarray]) -> None:
         with closing(VideoFileSource(plate[0], SizeLimit(WIDTH, HEIGHT), fps).frames(Event())) as frames:
             times_s = np.array([next(frames).captured_s for _ in range(20 // every)])
         assert times_s[-1] - times_s[0] == pytest.approx((20 // every - 1) * every / 50, abs=0.1)
-    with pytest.raises(InputError, match="aspect ratio"):
-        next(ExactSize(open_source(str(plate[0])), 100, 100).frames(Event()))
+    refused("aspect ratio", next, ExactSize(open_source(str(plate[0])), 100, 100).frames(Event()))
     assert next(ExactSize(open_source(str(plate[0])), 320, 180).frames(Event())).bgr.shape == (180, 320, 3)
 
 
@@ -243,8 +240,7 @@ def test_of_a_pose_that_is_not_certain_the_page_is_told_and_nothing_is_captured(
     try:
         certain = compositor(CameraFrame(plate, 1.0, 0), 0)
         unsure = compositor(CameraFrame(plate, 2.0, 1), 0)
-        with pytest.raises(InputError, match="pose is not known now"):
-            captures.capture()
+        refused("pose is not known now", captures.capture)
     finally:
         compositor.close()
     headers = [frame_header(each) for each in (certain, unsure)]

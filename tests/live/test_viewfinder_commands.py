@@ -36,6 +36,7 @@ from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, read_board
 from tests.scenes.command_line import mrbokeh, printed_by
 from tests.scenes.layer_viewfinder import control, watching
 from tests.scenes.phone_on_camera import PHONE
+from tests.scenes.refusals import refused
 from tests.scenes.thin_lens_board import Shot, camera_over, display_bgr, photograph
 from viewfinder.app.running import opened
 from viewfinder.cli import app, board_command
@@ -219,8 +220,7 @@ def test_a_board_to_print(tmp_path: Path) -> None:
     assert "print it at 100 %" in told and "blurs" in told and (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
     marker_px = LENS.focused_at(1.2).focal_px(1280) * read_board(tmp_path / "board.json").grids[0].marker_mm / 1000 / 0.8
     assert marker_px >= 6.0 * abs(float(LENS.coc_px(0.8, 1280)))
-    with pytest.raises(InputError, match="--overwrite"):
-        printed_by(board_command, *words)
+    refused("--overwrite", printed_by, board_command, *words)
     printed_by(board_command, *words, "--overwrite")
 
 
@@ -235,8 +235,7 @@ def test_a_board_to_print(tmp_path: Path) -> None:
 def test_boards_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, sentence: str) -> None:
     monkeypatch.chdir(tmp_path)
     write_lens(tmp_path / "lens.json", replace(LENS, f_number=1.0))
-    with pytest.raises(InputError, match=re.escape(sentence)):
-        printed_by(board_command, *words.split())
+    refused(re.escape(sentence), printed_by, board_command, *words.split())
     assert [path.name for path in tmp_path.iterdir()] == ["lens.json"]
 
 
