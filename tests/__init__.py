@@ -1,4 +1,4 @@
-"""Tests; types of arguments are checked as type checkers do: a whole number may stand for a float, as in `Lens(50, 2)` of the public API."""
+"""Tests; types of arguments are checked as type checkers do: a whole number may stand for a float, as in `Lens(50, 2)` of the API."""
 
 from beartype import BeartypeConf, beartype
 
