@@ -1,11 +1,16 @@
-"""`mrbokeh doctor`: what is installed, what is missing, and what it would enable."""
+"""`mrbokeh doctor`: what is installed, what is missing, and what it would enable; with --compile, all kernels ahead of their use."""
 
 import os
 import platform
 import shutil
+import subprocess
+import sys
+import tempfile
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import PackageNotFoundError, version
-from typing import NamedTuple
+from pathlib import Path
+from typing import Annotated, NamedTuple
 
 import typer
 from rich.console import Console
@@ -13,6 +18,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from mrbokeh import __version__
+from mrbokeh.system.console import progress_bars
+from mrbokeh.system.errors import InputError, install_command
 
 app = typer.Typer(add_completion=False)
 
@@ -25,38 +32,60 @@ class Component(NamedTuple):
 
 
 PACKAGES = (
-    ("rawpy", "reading RAW photographs", "pip install 'mrbokeh[capture]'"),
-    ("pyexiv2", "focus distance, focal length and f-number from photographs", "pip install 'mrbokeh[capture]'"),
-    ("exifread", "metadata of photographs that pyexiv2 cannot open", "pip install 'mrbokeh[capture]'"),
-    ("lensfunpy", "sensor sizes of cameras that do not state theirs", "pip install 'mrbokeh[capture]'"),
-    ("pycolmap", "camera poses and depth from several viewpoints", "pip install 'mrbokeh[capture]'"),
-    ("gphoto2", "shooting focal stacks with a tethered camera", "pip install 'mrbokeh[tether]'"),
-    ("torch", "training networks", "pip install 'mrbokeh[train]'"),
-    ("onnx", "exporting networks", "pip install 'mrbokeh[train]'"),
-    ("onnxruntime", "rendering with trained networks", "pip install mrbokeh"),
-    ("embreex", "rendering 3D objects", "pip install mrbokeh"),
-    ("av", "reading and writing videos", "pip install mrbokeh"),
-    ("aiohttp", "the viewfinder in a browser", "pip install 'mrbokeh[viewfinder]'"),
-    ("aiortc", "the viewfinder's video stream", "pip install 'mrbokeh[viewfinder]'"),
-    ("mitsuba", "path-traced objects, with reflections on the ground", "pip install 'mrbokeh[mitsuba]'"),
-    ("pyoidn", "denoising of path-traced objects", "pip install 'mrbokeh[denoise]'"),
-    ("opencolorio", "ACES and other colour spaces", "pip install 'mrbokeh[ocio]'"),
-    ("distributed", "videos composited by several machines", "pip install 'mrbokeh[cluster]'"),
+    ("rawpy", "reading RAW photographs", "capture"),
+    ("pyexiv2", "focus distance, focal length and f-number from photographs", "capture"),
+    ("exifread", "metadata of photographs that pyexiv2 cannot open", "capture"),
+    ("lensfunpy", "sensor sizes of cameras that do not state theirs", "capture"),
+    ("pycolmap", "camera poses and depth from several viewpoints", "capture"),
+    ("gphoto2", "shooting focal stacks with a tethered camera", "tether"),
+    ("torch", "training networks", "train"),
+    ("onnx", "exporting networks", "train"),
+    ("onnxruntime", "rendering with trained networks", ""),
+    ("embreex", "rendering 3D objects", ""),
+    ("av", "reading and writing videos", ""),
+    ("aiohttp", "the viewfinder in a browser", "viewfinder"),
+    ("aiortc", "the viewfinder's video stream", "viewfinder"),
+    ("mitsuba", "path-traced objects, with reflections on the ground", "mitsuba"),
+    ("pyoidn", "denoising of path-traced objects", "denoise"),
+    ("opencolorio", "ACES and other colour spaces", "ocio"),
+    ("distributed", "videos composited by several machines", "cluster"),
 )
 PROGRAMS = (
     ("exiftool", "metadata of more cameras (49 of 54 files are read without it)", "install exiftool with your system's package manager"),
     ("nvidia-smi", "training and rendering on an NVIDIA GPU", "install the GPU driver; everything works without one, slower"),
 )
+DATA = Path(__file__).resolve().parents[1] / "demo_data"
+_TRUTH, _ALIEN, _STACK = DATA / "raw_stack" / "truth" / "view_0", DATA / "objects" / "alien.glb", Path("scene") / "pcb_oblique"
+_SHARP = f"--rgb {_TRUTH / 'all_in_focus.exr'} --depth {_TRUTH / 'depth.exr'} --lens lens.json --focus-at 100,100".split()
+_PUT_IN = f"--object {_ALIEN} --at-pixel 100,150 --height 60px --shadow 0.5".split()
+WORK = (
+    (
+        ("lens", "new", "lens.json", "--focal-length", "50", "--f-number", "1.8", "--focus", "0.8"),
+        *(("render", *_SHARP, "--method", method, "--out", f"{method}.exr") for method in ("polygon", "laplacian", "low-rank", "scatter")),
+        *(("transfer", str(_TRUTH / "all_in_focus.exr"), *_SHARP[2:6], "--focus", "0.8", "--out", "transferred.png"),),
+    ),
+    (
+        ("capture", "process", str(DATA / "pcb_oblique"), "--max-width", "320", "--out", "scene"),
+        ("composite", str(_STACK), "--slice", "2", *_PUT_IN, "--out", "between.png"),
+        ("composite", str(_STACK), "--slice", "2", *_PUT_IN, "--mode", "over", "--grain", "auto", "--out", "over.png"),
+        ("refocus", str(_STACK), "--focus", "@100,100", "--out", "refocused"),
+    ),
+)
+"""Commands that need nearly all kernels: two rows, run side by side."""
 OPENCV = "opencv-contrib-python-headless"
 OTHER_OPENCV = ("opencv-python", "opencv-python-headless", "opencv-contrib-python")
 
 
 @app.command()
-def doctor() -> None:
+def doctor(
+    compile_all: Annotated[bool, typer.Option("--compile", help="Compile now what commands need, so that none waits later.")] = False,
+) -> None:
     """Say what is present, what is missing and what it would enable; nothing here is required for `mrbokeh demo` but the packages.
 
     Example: mrbokeh doctor
     """
+    if compile_all:
+        compile_kernels()
     table = Table(title=f"mrbokeh {__version__} on Python {platform.python_version()}, {platform.machine()}, {os.cpu_count()} cores")
     for column in ("what", "found", "enables", "if you want it"):
         table.add_column(column)
@@ -69,9 +98,38 @@ def doctor() -> None:
 
 def findings() -> list[Component]:
     """Every optional thing with its version or path, None where it is missing."""
-    packages = [Component(name, _version(name), enables, remedy) for name, enables, remedy in PACKAGES]
+    packages = [Component(name, _version(name), enables, install_command(extra)) for name, enables, extra in PACKAGES]
     programs = [Component(name, shutil.which(name), enables, remedy) for name, enables, remedy in PROGRAMS]
-    return [*packages, _opencv(), _cuda(), _graphics_device(), _llvm(), *programs]
+    return [*packages, _opencv(), _cuda(), _graphics_device(), _llvm(), _kernels(), *programs]
+
+
+def compile_kernels() -> None:
+    """Run WORK in a temporary folder. Raises InputError where one of its commands fails."""
+    with tempfile.TemporaryDirectory() as folder, progress_bars() as progress:
+        task = progress.add_task("compiling, once for this machine", total=sum(map(len, WORK)))
+
+        def run(row: tuple[tuple[str, ...], ...]) -> None:
+            for arguments in row:
+                command = [sys.executable, "-m", "mrbokeh.cli", *arguments]
+                done = subprocess.run(command, cwd=folder, env=os.environ | {"PYTHONSAFEPATH": "1"}, capture_output=True, text=True)
+                if done.returncode:
+                    raise InputError(f"`mrbokeh {' '.join(arguments)}` should have worked, but did not: {done.stderr.strip()[-500:]}")
+                progress.advance(task)
+
+        with ThreadPoolExecutor(len(WORK)) as pool:
+            list(pool.map(run, WORK))
+
+
+def _kernels() -> Component:
+    """Count the modules of kernels that have compiled ones here, or came with them."""
+    from mrbokeh.system import kernels
+
+    root = Path(__file__).resolve().parents[2]
+    sources = [path for package in ("mrbokeh", "capture", "viewfinder") for path in (root / package).rglob("*_numba.py")]
+    folders = [kernels.folder_of(path, ".".join(path.relative_to(root).with_suffix("").parts)) for path in sources]
+    ready = sum(folder is not None and any(folder.glob("*.nbc")) for folder in folders)
+    found = f"in {ready} of {len(folders)} modules" if ready else None
+    return Component("compiled kernels", found, "commands that begin at once", "mrbokeh doctor --compile")
 
 
 def _version(package: str) -> str | None:
@@ -94,7 +152,7 @@ def _cuda() -> Component:
 
 
 def _graphics_device() -> Component:
-    remedy = "pip install 'mrbokeh[viewfinder]' and a Vulkan, Metal or Direct3D 12 driver; the ray caster draws without one"
+    remedy = f"{install_command('viewfinder')} and a Vulkan, Metal or Direct3D 12 driver; the ray caster draws without one"
     return Component("graphics device", _quietly(_described_device), "rendering 3D objects on a graphics card", remedy)
 
 
@@ -107,7 +165,6 @@ def _llvm() -> Component:
 
 def _described_device() -> str | None:
     from mrbokeh.scene.choose import described_device
-    from mrbokeh.system.errors import InputError
 
     try:
         return described_device()

@@ -3,7 +3,8 @@
 numba keeps a compiled function beside its file and stamps it with that file alone: a changed callee in another file leaves a stale kernel
 behind, every checkout and installation compiles for itself, and two processes that start together compile everything twice. Here a kernel
 lies in the user's cache folder under the hash of its module and of all modules of ours which that imports, and whoever needs a kernel that
-another process compiles at the moment waits for it.
+another process compiles at the moment waits for it. A wheel brings the kernels of its platform (`make wheel`), compiled for all processors
+of the last ten years; what it lacks is compiled once on the machine, and that is said.
 """
 
 import hashlib
@@ -20,8 +21,10 @@ from pathlib import Path
 from typing import Any
 
 import llvmlite
+import llvmlite.binding
 import numba
 import numpy as np
+from numba.core import event
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, _CacheLocator
 from numba.core.compiler_lock import global_compiler_lock
 from numba.misc.appdirs import AppDirs
@@ -40,6 +43,12 @@ OURS = ("mrbokeh", "capture", "training", "viewfinder", "datasets_scripts")
 LONGEST_WAIT_S = 300.0
 """A process that was stopped while it compiled does not hold up others for ever."""
 
+SHIPPED = Path(__file__).resolve().parents[1] / "compiled_kernels"
+"""Folders of kernels in a wheel, named and filled as those in the user's cache folder are; a checkout has none."""
+PORTABLE_CPU, PORTABLE_FEATURES = "x86-64-v3", ("avx2", "bmi2", "f16c", "fma", "lzcnt", "movbe")
+"""The processor that shipped kernels are compiled for, and what this one must have for it. Kernels for this very one are no faster."""
+TELL_EVERY_S = 5.0
+
 _STARTED_S = time.time()
 _DAY_S = 86400.0
 _LOOK_S = 0.02
@@ -54,7 +63,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         kernel = numba.njit(**options)(function)
         if not _config.DISABLE_JIT:
             link_once(kernel)
-        folder = None if _config.DISABLE_JIT or not kept else _folder(Path(function.__code__.co_filename), function.__module__)
+        folder = None if _config.DISABLE_JIT or not kept else folder_of(Path(function.__code__.co_filename), function.__module__)
         if folder is not None:
             kernel._cache = _KernelCache(function)
             kernel.compile = _once_at_a_time(kernel.compile, kernel.overloads, folder / f"{function.__qualname__}.lock")
@@ -69,7 +78,7 @@ def fingerprint(file: Path, module: str) -> str | None:
     if root / _path_of(module) != file.resolve() or not file.is_file():
         return None
     sources = sorted(_with_imported(root, module))
-    versions = f"{numba.__version__} {llvmlite.__version__} {np.__version__} {sys.version_info[:2]}"
+    versions = f"{numba.__version__} {llvmlite.__version__} {np.__version__.split('.')[:2]} {sys.version_info[:2]}"
     hashed = hashlib.sha256(versions.encode())
     for source in sources:
         hashed.update(source.encode() + b"\0" + hashlib.sha256(_text_of(root, source).encode()).digest())
@@ -106,7 +115,7 @@ class _KernelLocator(_CacheLocator):  # type: ignore[misc]
 
     @classmethod
     def from_function(cls, py_func: Callable[..., Any], py_file: str) -> "_KernelLocator | None":
-        folder = _folder(Path(py_file), py_func.__module__)
+        folder = folder_of(Path(py_file), py_func.__module__)
         return cls(folder, py_file, py_func.__code__.co_firstlineno) if folder else None
 
 
@@ -133,22 +142,32 @@ class _KernelCache(FunctionCache):  # type: ignore[misc]
 
 
 @cache
-def _folder(file: Path, module: str) -> Path | None:
+def folder_of(file: Path, module: str) -> Path | None:
     """Return the folder of a module's kernels, marked as used today; None where nothing can be written or the source is not at hand.
 
     Sources that were changed since this process began may not be what it has loaded: their kernels are not kept.
     """
     base, name = _writable_base(), fingerprint(file, module)
-    if base is None or name is None or _newest_s(file, module) > _STARTED_S:
+    if name is None or _newest_s(file, module) > _STARTED_S:
         return None
+    shipped = SHIPPED / name if (SHIPPED / name).is_dir() else None
+    if base is None:
+        return shipped
     folder = base / name
     with suppress(OSError):
         if not folder.is_dir():
-            folder.mkdir(exist_ok=True)
+            _begin(folder, shipped)
             _forget_once(base)
         elif time.time() - folder.stat().st_mtime > _DAY_S:
             os.utime(folder)
     return folder if folder.is_dir() else None
+
+
+def _begin(folder: Path, shipped: Path | None) -> None:
+    """Make a folder of kernels, with those that the wheel brought; another process may do the same at this moment."""
+    with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".") as aside, suppress(OSError):
+        (Path(aside) / "new").mkdir() if shipped is None else shutil.copytree(shipped, Path(aside) / "new")
+        (Path(aside) / "new").rename(folder)
 
 
 _forget_once = cache(forget_unused)
@@ -222,6 +241,30 @@ def _locked(path: Path) -> Iterator[None]:
         yield
 
 
+class _Compiling(event.Listener):  # type: ignore[misc]
+    """Says on standard error that kernels are being compiled, how many, and that this happens once a machine."""
+
+    def __init__(self) -> None:
+        self._depth, self._count, self._took_s, self._began_s, self._told_s = 0, 0, 0.0, 0.0, 0.0
+
+    def on_start(self, _event: Any) -> None:
+        self._depth += 1
+        if self._depth > 1:  # what a kernel calls
+            return
+        self._count, self._began_s = self._count + 1, time.monotonic()
+        if self._count == 2:
+            print("compiling for this machine, which happens once and takes up to a minute ...", file=sys.stderr, flush=True)
+            self._told_s = self._began_s
+        elif self._count > 2 and self._began_s - self._told_s > TELL_EVERY_S:
+            print(f"compiled {self._count - 1} kernels in {self._took_s:.0f} s ...", file=sys.stderr, flush=True)
+            self._told_s = self._began_s
+
+    def on_end(self, _event: Any) -> None:
+        self._depth -= 1
+        if self._depth == 0:
+            self._took_s += time.monotonic() - self._began_s
+
+
 def _path_of(module: str) -> str:
     return module.replace(".", "/") + ".py"
 
@@ -262,3 +305,13 @@ def _newest_s(file: Path, module: str) -> float:
     root = file.resolve().parents[module.count(".")]
     paths = (root / _path_of(name) for name in _with_imported(root, module))
     return max((path.stat().st_mtime for path in paths if path.is_file()), default=0.0)
+
+
+def _as_shipped() -> None:
+    """Let numba compile for the processor of the shipped kernels, where there are any and this one can run them."""
+    if SHIPPED.is_dir() and not _config.CPU_NAME and all(map(llvmlite.binding.get_host_cpu_features().get, PORTABLE_FEATURES)):
+        _config.CPU_NAME, _config.CPU_FEATURES = PORTABLE_CPU, ""
+
+
+_as_shipped()
+event.register("numba:compile", _Compiling())

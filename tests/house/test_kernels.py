@@ -80,11 +80,40 @@ def test_a_second_checkout_finds_what_the_first_compiled_and_a_changed_callee_is
 def test_sources_changed_since_the_process_began_are_not_kept(tmp_path: Path) -> None:
     """What this process has loaded may be the text of before."""
     caller = checkout(tmp_path / "a") / "room/caller_numba.py"
-    assert kernels._folder(caller, "room.caller_numba") is None
+    assert kernels.folder_of(caller, "room.caller_numba") is None
     for path in caller.parent.iterdir():
         os.utime(path, (time.time() - 86400,) * 2)
-    kernels._folder.cache_clear()
-    assert kernels._folder(caller, "room.caller_numba") is not None
+    kernels.folder_of.cache_clear()
+    assert kernels.folder_of(caller, "room.caller_numba") is not None
+
+
+def test_kernels_that_a_wheel_brings_are_found_and_copied_to_where_more_can_be_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    caller = checkout(tmp_path / "a") / "room/caller_numba.py"
+    for path in caller.parent.iterdir():
+        os.utime(path, (time.time() - 86400,) * 2)
+    brought = tmp_path / "shipped" / str(kernels.fingerprint(caller, "room.caller_numba"))
+    brought.mkdir(parents=True)
+    (brought / "scaled.nbc").write_bytes(b"machine code")
+    monkeypatch.setattr(kernels, "SHIPPED", brought.parent)
+    for base, found in ((tmp_path, tmp_path / brought.name), (None, brought)):
+        monkeypatch.setattr(kernels, "_writable_base", lambda base=base: base)
+        assert kernels.folder_of.__wrapped__(caller, "room.caller_numba") == found
+        assert (found / "scaled.nbc").read_bytes() == b"machine code"
+
+
+def test_compiling_is_said_once_and_counted_now_and_then(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Kernels that another one calls do not count, and a single small one is not worth a word."""
+    compiling, clock = kernels._Compiling(), iter(range(0, 100, 2))
+    monkeypatch.setattr(kernels.time, "monotonic", lambda: float(next(clock)))
+    for _ in range(4):
+        compiling.on_start(None)
+        compiling.on_start(None)
+        compiling.on_end(None)
+        compiling.on_end(None)
+    first, *later = capsys.readouterr().err.splitlines()
+    assert "happens once" in first and later == ["compiled 3 kernels in 6 s ..."]
 
 
 def test_a_lock_that_another_process_never_gives_back_is_waited_for_only_so_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -115,20 +144,20 @@ def test_a_kernel_runs_where_nothing_can_be_written(
     monkeypatch.setattr(kernels.numba.config, "CACHE_DIR", str(tmp_path / "file" / "below"))
     monkeypatch.setattr(kernels.tempfile, "gettempdir", lambda: str(tmp_path / "file"))
     kernels._writable_base.cache_clear()
-    kernels._folder.cache_clear()
+    kernels.folder_of.cache_clear()
     try:
         kernel = kernels.njit(cache=True)(_doubled)
         assert kernel(2) == 4 and kernel.stats.cache_path is None
-        told = capsys.readouterr().err
-        assert told.count("\n") == 1 and "compiled anew each time" in told
+        told = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("compil")]
+        assert len(told) == 1 and "compiled anew each time" in told[0]
         monkeypatch.setattr(kernels.tempfile, "gettempdir", lambda: str(tmp_path))
         kernels._writable_base.cache_clear()
-        kept, told = kernels._writable_base(), capsys.readouterr().err
+        kept, text = kernels._writable_base(), capsys.readouterr().err
         assert kept is not None and kept.parent == tmp_path and kept.stat().st_mode & 0o077 == 0
-        assert told.count("\n") == 1 and f"kept in {kept}" in told
+        assert text.count("\n") == 1 and f"kept in {kept}" in text
     finally:
         kernels._writable_base.cache_clear()
-        kernels._folder.cache_clear()
+        kernels.folder_of.cache_clear()
 
 
 def _doubled(x: int) -> int:

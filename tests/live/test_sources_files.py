@@ -241,5 +241,5 @@ def test_anything_else_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatc
         assert "\n" not in str(caught.value)
     refused("--fps", open_source, "test", fps=0.0)
     monkeypatch.setattr("viewfinder.sources.choose.find_spec", lambda _name: None)
-    with pytest.raises(MissingExtraError, match=r"mrbokeh\[viewfinder\]"):
+    with pytest.raises(MissingExtraError, match=r"pip install .*\[viewfinder\]"):
         open_source("whip")
