@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 _UNSEEN = -2.0  # as plane_sweep.UNSEEN
 

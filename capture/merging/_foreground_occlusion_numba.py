@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 
 @njit(cache=True, fastmath=True)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import prange
 
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 NOTHING = -1
 # Without "ninf" and "nnan": a missed body is at infinity.

@@ -1,7 +1,7 @@
 """The truth tracer on Mitsuba's LLVM variant (Dr.Jit): one compiled loop over the rays of all pixels.
 
 Mitsuba is asked for intersections only. Pupil, light and film are those of `tracers.truth`, whose slow twin in NumPy stands in the
-tests (`tests/scenes/scalar_truth_tracer.py`).
+tests (`tests/support/scalar_truth_tracer.py`).
 """
 
 import importlib

@@ -122,11 +122,11 @@ def compile_kernels() -> None:
 
 def _kernels() -> Component:
     """Count the modules of kernels that have compiled ones here, or came with them."""
-    from mrbokeh.system import kernels
+    from mrbokeh.system import compiled
 
     root = Path(__file__).resolve().parents[2]
     sources = [path for package in ("mrbokeh", "capture", "viewfinder") for path in (root / package).rglob("*_numba.py")]
-    folders = [kernels.folder_of(path, ".".join(path.relative_to(root).with_suffix("").parts)) for path in sources]
+    folders = [compiled.folder_of(path, ".".join(path.relative_to(root).with_suffix("").parts)) for path in sources]
     ready = sum(folder is not None and any(folder.glob("*.nbc")) for folder in folders)
     found = f"in {ready} of {len(folders)} modules" if ready else None
     return Component("compiled kernels", found, "commands that begin at once", "mrbokeh doctor --compile")

@@ -6,7 +6,7 @@ p - u c / 2 of its sharp picture.
 
 import numpy as np
 
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 _ROUND = 1e-12
 _SPREAD = 6e-5

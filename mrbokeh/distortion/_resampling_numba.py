@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 _compiled = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 """Without counting references, as mrbokeh.scene's kernels: nothing is allocated in here and the arrays outlive the call."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 _BESIDE = ((0, 1), (1, 0), (1, 1), (1, -1))
 

@@ -7,7 +7,7 @@ the frame; those loops are so short that releasing the GIL (nogil) would cost mo
 
 import numpy as np
 
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 
 @njit(cache=True)

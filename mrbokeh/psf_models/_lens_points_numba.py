@@ -5,7 +5,7 @@ Also the exact light per pixel of a disc swept along a line.
 
 import numpy as np
 
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 
 @njit(cache=True, nogil=True)

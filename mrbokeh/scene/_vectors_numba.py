@@ -4,7 +4,7 @@ from math import sqrt
 
 import numpy as np
 
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 compiled = njit(cache=True, nogil=True, error_model="numpy", _nrt=False)
 """The kernels allocate nothing and the arrays outlive the call, so counting references is needless; it would be atomic,

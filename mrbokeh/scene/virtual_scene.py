@@ -101,7 +101,7 @@ def world_from_scene_placing(
 class SceneRenderer(Protocol):
     """Renders virtual objects with everything in focus; the lens blur comes afterwards.
 
-    What every backend owes (tests/objects/test_scene_backends.py asks all of them):
+    What every backend owes (tests/scene/test_scene_backends.py asks all of them):
     rgb is scene-linear, unclipped and premultiplied; emissive radiance L reads L.
     alpha is the covered share of the pixel's square. depth_m is exact at the pixel's centre, along the optical axis; at a pixel
     that is only partly covered it is the nearest covering surface where the centre sees nothing, never a mixture; inf where

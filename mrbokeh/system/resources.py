@@ -88,7 +88,7 @@ _KEPT_BYTES = 1 << 30
 def keep_few_arenas() -> None:
     """Limit glibc to two arenas: codecs create threads, and each new thread gets an arena that keeps what was in it.
 
-    Ten minutes with a recording every 15 s grew by 65 MB between the medians of their thirds (tests/live/test_viewfinder.py); with
+    Ten minutes with a recording every 15 s grew by 65 MB between the medians of their thirds (tests/viewfinder/test_viewfinder.py); with
     two arenas the same memory is used again.
     """
     _set(_M_ARENA_MAX, _MOST_ARENAS)

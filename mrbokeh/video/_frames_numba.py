@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 
 @njit(cache=True, nogil=True, inline="always")

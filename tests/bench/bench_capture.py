@@ -23,7 +23,7 @@ from datasets_scripts.scenes.stack_scenes import BOARD_MARKER_M, BOARD_SQUARE_M,
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from tests.bench.machine import machine_line
 from tests.bench.process_cost import mrbokeh
-from tests.scenes.capture_truth import Score, ViewTruth, score, view_truth
+from tests.support.capture_truth import Score, ViewTruth, score, view_truth
 
 LAB = Path("bench_out") / "lab_views"
 

@@ -22,7 +22,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from tests.bench.machine import in_turns, tell
-from tests.scenes.mixed_reality_cases import BASELINES, MixedCase, card_cases, traced_cases
+from tests.support.mixed_reality_cases import BASELINES, MixedCase, card_cases, traced_cases
 
 COLUMNS = (*BASELINES, *(mode for mode in MODES if mode != "front"))
 RIMS_PX = (0, 1, 2, -1, -2)

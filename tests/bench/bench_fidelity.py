@@ -18,7 +18,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.choose import BY_NAME, make_renderer
 from tests.bench.fidelity_baselines import BASELINES, gegl_lens_blur, has_gegl
 from tests.bench.machine import tell
-from tests.scenes.fidelity_cases import CARD_RADII_PX, Case, card_cases, truth_cases
+from tests.support.fidelity_cases import CARD_RADII_PX, Case, card_cases, truth_cases
 
 Blur = Callable[[Sequence[Layer], Lens], np.ndarray]
 Rows = dict[tuple[str, str], list[tuple[Case, dict[str, float]]]]

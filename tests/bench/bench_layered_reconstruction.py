@@ -24,7 +24,7 @@ from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
 from mrbokeh.stacks.light_field_samples_file import read_samples
 from tests.bench.machine import in_turns, tell
-from tests.scenes.sampled_planes import LENS, Plane, checker, fence_scene, sample_planes, truth, waves
+from tests.support.sampled_planes import LENS, Plane, checker, fence_scene, sample_planes, truth, waves
 
 SIZE_PX = 256
 REPEATS = 5

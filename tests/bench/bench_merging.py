@@ -23,7 +23,7 @@ from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack
 from tests.bench.machine import machine_line
 from tests.bench.process_cost import measured, mrbokeh
-from tests.scenes.capture_truth import ViewTruth, picture_db, view_truth
+from tests.support.capture_truth import ViewTruth, picture_db, view_truth
 
 LAB = Path("bench_out") / "lab"
 PHOTOGRAPHS = Path(__file__).resolve().parents[3] / "shared" / "data" / "stacks" / "button_macro"

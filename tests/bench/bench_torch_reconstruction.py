@@ -22,7 +22,7 @@ from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Sett
 from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import DeviceSamples, TorchReconstruction
 from mrbokeh.system.torch_device import has_triton
 from tests.bench.machine import tell, took
-from tests.scenes.sampled_planes import LENS, fence_scene, sample_planes
+from tests.support.sampled_planes import LENS, fence_scene, sample_planes
 
 WAIT_S = 20.0
 VARIANTS = {

@@ -23,8 +23,8 @@ from mrbokeh.tracking.charuco.detector import CharucoDetector, Grey, flow
 from mrbokeh.tracking.charuco.pose_from_points import poses_from_plane
 from mrbokeh.video.clip import read_display_frames
 from tests.bench.machine import tell
-from tests.scenes.told_parts import ImmediateDetections
-from tests.scenes.traced_board_clip import BOARD, LENS, PoseError, camera_frames, clip_of, pose_error
+from tests.support.told_parts import ImmediateDetections
+from tests.support.traced_board_clip import BOARD, LENS, PoseError, camera_frames, clip_of, pose_error
 from viewfinder.frames import CameraFrame
 from viewfinder.tracking.charuco_tracker import CharucoTracker, Detector
 from viewfinder.tracking.tracker import TrackedPose

@@ -30,7 +30,7 @@ from mrbokeh.video.clip import probe
 from mrbokeh.video.picture_source import open_source
 from mrbokeh.video.writer import VideoWriter
 from tests.bench.machine import machine_line
-from tests.scenes.shot_makers import Brighter, MovingDisc
+from tests.support.shot_makers import Brighter, MovingDisc
 
 WIDTH, HEIGHT, RATE = 1920, 1080, 25
 LENS = Lens(focal_length_mm=50.0, f_number=1.8, focus_distance_m=2.5, sensor_width_mm=36.0)

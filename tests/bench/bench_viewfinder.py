@@ -25,9 +25,9 @@ import numpy as np
 from mrbokeh.optics.lens import Lens
 from tests.bench.machine import tell
 from tests.bench.thread_times import ThreadTimes
-from tests.scenes.live_clip import SCENE, LiveClip, write_live_clip
-from tests.scenes.live_viewfinder import live
-from tests.scenes.plain_webrtc import plain_stream
+from tests.support.live_clip import SCENE, LiveClip, write_live_clip
+from tests.support.live_viewfinder import live
+from tests.support.plain_webrtc import plain_stream
 
 WIDTH, HEIGHT, TRACED = 640, 360, 45
 LENS = Lens(22.0, 2.0, 0.55, 24.0)
@@ -130,7 +130,7 @@ def measured(samples: list[float], sample: Any) -> Iterator[Spent]:
 
 async def _watched(url: str, count: int, time_s: float, spent: Spent) -> Watched:
     """Viewers in another process; what is spent counts from when all of them see pictures for three seconds, as theirs does."""
-    command = [sys.executable, "-m", "tests.scenes.live_viewers", url, str(count), str(time_s)]
+    command = [sys.executable, "-m", "tests.support.live_viewers", url, str(count), str(time_s)]
     process = await asyncio.create_subprocess_exec(*command, stdout=asyncio.subprocess.PIPE)
     assert process.stdout is not None
     await process.stdout.readline()

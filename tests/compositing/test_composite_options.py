@@ -20,8 +20,8 @@ from mrbokeh.stacks.exr_layers.composite_exr import write_deep_exr
 from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from tests.house.test_user_mistakes import said
-from tests.scenes.composite_exr_reader import read_composite_exr
-from tests.scenes.refusals import refused
+from tests.support.composite_exr_reader import read_composite_exr
+from tests.support.refusals import refused
 
 HEIGHT, WIDTH = 96, 144
 LENS = Lens(35.0, 2.0, 2.0, 23.5)

@@ -6,7 +6,7 @@ from mrbokeh.compositing.plate import Inserted, plate_of
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 LENS = Lens(50.0, 2.0, 1.0, 36.0)
 SIZE = (48, 64)

@@ -16,7 +16,7 @@ from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 LENS = Lens(100.0, 1.0, 1.0, 36.0)  # 20 px of blur per dioptre at 64 px
 WIDE = Lens(50.0, 1.4, 1.0, 36.0)

@@ -14,7 +14,7 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from tests.scenes.mixed_reality_cases import MixedCase, small_card_cases, wider
+from tests.support.mixed_reality_cases import MixedCase, small_card_cases, wider
 
 RENDERER = PolygonDifferences()
 EXACT_DB, RECOVERED = 0.1, 1.0 / 3.0

@@ -1,6 +1,6 @@
 """Objects between the blurred layers of a photograph against ray-traced truth: object alone, scene alone, both traced together.
 
-The cards are traced by tests/scenes/card_tracer.py, which runs everywhere; what the sets of datasets_scripts/mixed_reality.py give
+The cards are traced by tests/support/card_tracer.py, which runs everywhere; what the sets of datasets_scripts/mixed_reality.py give
 is in docs/compositing_results.md. The bounds are those of the project: 3 dB over the better of two simple ways on every picture,
 40 dB on average.
 """
@@ -11,7 +11,7 @@ import pytest
 from mrbokeh.compositing.choose import insertion_of
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from tests.scenes.mixed_reality_cases import card_cases, small_card_cases
+from tests.support.mixed_reality_cases import card_cases, small_card_cases
 
 RENDERER = PolygonDifferences()
 GAIN_DB, MEAN_DB = 3.0, 40.0

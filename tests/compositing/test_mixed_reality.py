@@ -21,10 +21,10 @@ from datasets_scripts.mixed_reality import (
 )
 from datasets_scripts.scenes.truth_scenes import make_scene
 from datasets_scripts.tracers.truth_scene import pack
-from tests.scenes.card_scene import FOCUS_CARD, mixed_cards
-from tests.scenes.mixed_reality_cases import traced_cases
-from tests.scenes.refusals import refused
-from tests.scenes.scalar_truth_tracer import require_mitsuba
+from tests.support.card_scene import FOCUS_CARD, mixed_cards
+from tests.support.mixed_reality_cases import traced_cases
+from tests.support.refusals import refused
+from tests.support.scalar_truth_tracer import require_mitsuba
 
 virtual_objects = cache(virtual_object)
 PLAN = TruthPlan(width_px=64, height_px=36, samples=4, scenes=("fence",), shapes=("disc",))

@@ -18,7 +18,7 @@ from mrbokeh.compositing.plate_look.exposure_match import (
 from mrbokeh.images.color import rec709_from_XYZ
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 CAST, BLACK = (1.6, 0.9, 0.5), (0.012, 0.015, 0.021)
 

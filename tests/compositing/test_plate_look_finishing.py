@@ -22,7 +22,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 from tests.compositing.test_plate_look_grain import READ, SHOT, smooth_scene, unit_noise
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 SIZE = (256, 384)
 LENS = Lens(50.0, 2.0, 1.0, 36.0)

@@ -13,7 +13,7 @@ from mrbokeh.compositing.plate_look.noise_measurement import REACH_PX, NoiseLeve
 from mrbokeh.images.image_io import read_image
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.video.clip import read_frames
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 SIZE = (256, 384)
 SHOT, READ = np.array([4e-4, 2e-4, 6e-4]), np.array([2e-5, 1e-5, 4e-5])

@@ -11,7 +11,7 @@ from mrbokeh.compositing.plate_look.grain import measured_grain, write_grain
 from mrbokeh.compositing.plate_look.vignetting import CameraAndLens, FlatField, RadialFalloff, lensfun_falloff
 from mrbokeh.images.image_io import write_image
 from tests.compositing.test_plate_look_grain import plate, smooth_scene
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 LENS_MODEL = "Canon EF 100mm f/2.8L Macro IS USM"
 

@@ -21,7 +21,7 @@ from mrbokeh.images.image_io import write_image
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.pixel_box import Box
 from mrbokeh.system.errors import InputError, MissingExtraError
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 FRAME = (112, 160)
 WHOLE = Box(0, 112, 0, 160)

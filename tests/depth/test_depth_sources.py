@@ -21,7 +21,7 @@ from mrbokeh.images.layer import opaque
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.system.errors import InputError
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 GREY = np.full((24, 32, 3), 0.2, np.float32)
 

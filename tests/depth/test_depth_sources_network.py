@@ -9,7 +9,7 @@ import pytest
 from mrbokeh.depth.depth_map import DepthSettings, KnownDistance
 from mrbokeh.depth.open_depth import IMAGENET_MEAN, IMAGENET_STD, NetworkInput, open_depth, predicted, read_network_input
 from mrbokeh.images.color import srgb_to_linear
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 onnx = pytest.importorskip("onnx", reason="the extra `train` brings onnx, which makes the test's networks")
 SIZE = (32, 48)

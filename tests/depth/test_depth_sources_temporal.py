@@ -11,7 +11,7 @@ from mrbokeh.depth.depth_filters import TemporalDepthFilter
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 SIZE = (80, 128)
 LENS = Lens(50.0, 2.0, 1.5, 10.0)

@@ -12,7 +12,7 @@ from mrbokeh.distortion import LensDistortion
 from mrbokeh.distortion.distortion import StMap, colmap_distortion, distortion_from_json, distortion_to_json, read_st_map
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.optics.camera import Camera
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 CAMERA = Camera(320, 214, (270.0, 265.0), (158.3, 109.6))
 OPENCV = {"k1": -0.21, "k2": 0.06, "p1": 1.5e-3, "p2": -0.8e-3, "k3": 0.01, "k4": 0.03, "k5": -0.01, "k6": 0.002}

@@ -10,7 +10,7 @@ from mrbokeh.images.layer import Layer, clear
 from mrbokeh.layering.motion import MOTION, with_motion
 from mrbokeh.layering.pixel_box import Box, lit_box
 from mrbokeh.optics.camera import Camera
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 PLATE = Camera(320, 214, (270.0, 265.0), (158.3, 109.6))
 BARREL = LensDistortion.of("opencv", k1=-0.25, k2=0.08, p1=1e-3, p2=-8e-4)

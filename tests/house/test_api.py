@@ -11,7 +11,7 @@ import mrbokeh as mb
 from mrbokeh.images.image_io import write_layer
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from tests.scenes.command_line import mrbokeh
+from tests.support.command_line import mrbokeh
 
 ROOT = Path(__file__).resolve().parents[2]
 LENS = mb.Lens(focal_length_mm=50, f_number=2.0, focus_distance_m=2.0)

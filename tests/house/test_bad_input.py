@@ -12,8 +12,8 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.stacks.focus_places import FocusLookup, parse_focus
 from mrbokeh.video.clip import Frame, read_frames
-from tests.scenes.command_line import mrbokeh
-from tests.scenes.refusals import refused
+from tests.support.command_line import mrbokeh
+from tests.support.refusals import refused
 
 TRANSFER = ("transfer", "photo.png", "--lens", "lens.json", "--depth", "sharp.exr", "--out", "out.exr")
 NEW_LENS = ("lens", "new", "new.json", "--focal-length", "50", "--f-number", "2", "--focus", "1")

@@ -16,7 +16,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.errors import FAULT
-from tests.scenes.command_line import mrbokeh
+from tests.support.command_line import mrbokeh
 from viewfinder.cli import app as viewfinder
 
 COMMANDS = [

@@ -30,8 +30,8 @@ from mrbokeh.images.image_io import write_image, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.camera import Camera
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from tests.scenes.command_line import mrbokeh
-from tests.scenes.refusals import refused
+from tests.support.command_line import mrbokeh
+from tests.support.refusals import refused
 
 
 @pytest.fixture(autouse=True)

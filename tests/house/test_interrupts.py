@@ -10,8 +10,8 @@ import pytest
 from capture.tether.focus_plan import FocusRange, plan_focus, write_plan
 from capture.tether.simulated_camera import SimulatedCamera
 from mrbokeh.optics.lens import Lens
-from tests.scenes.command_line import mrbokeh
-from tests.scenes.video_files import filmed
+from tests.support.command_line import mrbokeh
+from tests.support.video_files import filmed
 
 WORK = {
     "ingest": ("capture.stacks.ingest.ingest", "{0} --out {0}/scene", "finished slices are kept in {0}/scene"),

@@ -28,8 +28,8 @@ from mrbokeh.renderers.onnx_sessions import open_session
 from mrbokeh.scene.gltf.gltf_loader import load_glb
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.writer import VideoWriter
-from tests.scenes.command_line import mrbokeh
-from tests.scenes.refusals import refused
+from tests.support.command_line import mrbokeh
+from tests.support.refusals import refused
 
 RNG = np.random.default_rng(0)
 

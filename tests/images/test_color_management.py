@@ -10,7 +10,7 @@ from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.images.color_management import REC709_LINEAR, ColorConversion, open_config, rec709_name
 from mrbokeh.images.exr_io import AP1, rec709_from_chromaticities
 from mrbokeh.system.errors import MissingExtraError
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 ocio = pytest.importorskip("PyOpenColorIO")
 

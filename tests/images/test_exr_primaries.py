@@ -18,7 +18,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.stacks.focal_stack import FocalStack, write_merged
 from mrbokeh.stacks.light_field_samples_file import read_samples, write_samples
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 # Primaries and white of the Academy's documents S-2014-004 (ACEScg) and SMPTE ST 2065-1 (ACES), of ITU-R BT.2020 and BT.709.
 ACESCG = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)

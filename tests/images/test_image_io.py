@@ -8,7 +8,7 @@ from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
 from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer, write_preview
 from mrbokeh.images.layer import Layer
 from mrbokeh.system.errors import InputError
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 
 def picture(highest: float = 1.0) -> np.ndarray:

@@ -3,7 +3,7 @@ import pytest
 from skimage.metrics import structural_similarity
 
 from mrbokeh.images.image_metrics import depth_edge_mask, energy_ratio, flicker, leak, light_error, psnr, ssim
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 
 def picture(seed: int) -> np.ndarray:

@@ -5,7 +5,7 @@ import pytest
 
 from mrbokeh.images.layer import Layer, clear, flatten, opaque, over
 from mrbokeh.system.errors import InputError
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 
 def flat(rgb: tuple[float, float, float], alpha: float, depth_m: float) -> Layer:

@@ -13,8 +13,8 @@ from mrbokeh.images.color import srgb_to_linear
 from mrbokeh.images.image_io import read_image, write_image, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.stacks.photograph import read_photograph
-from tests.scenes.made_photographs import only_stack, sources
-from tests.scenes.refusals import refused
+from tests.support.made_photographs import only_stack, sources
+from tests.support.refusals import refused
 
 CODES = np.random.default_rng(0).integers(0, 256, (24, 32, 3), np.uint8)
 

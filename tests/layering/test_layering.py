@@ -11,7 +11,7 @@ from mrbokeh.layering.psf_over_field import Frame, blur_colours
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 SIZE = (72, 96)
 LENS = Lens(focal_length_mm=50.0, f_number=0.7, focus_distance_m=0.5, sensor_width_mm=12.0)  # up to 64 px of blur at infinity

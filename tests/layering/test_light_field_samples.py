@@ -11,8 +11,8 @@ from mrbokeh.layering.light_field_samples import LightFieldSamples, joined
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.light_field_samples_file import CHANNELS, read_samples, write_samples
 from mrbokeh.system.errors import InputError
-from tests.scenes.refusals import refused
-from tests.scenes.sampled_planes import LENS, Plane, even, fence_scene, sample_planes, waves
+from tests.support.refusals import refused
+from tests.support.sampled_planes import LENS, Plane, even, fence_scene, sample_planes, waves
 
 SIZE_PX = 16
 

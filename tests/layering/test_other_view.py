@@ -11,7 +11,7 @@ from mrbokeh.layering.layering import Layering, render_layers
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 WIDTH, HEIGHT = 96, 64
 CAMERA = Camera(WIDTH, HEIGHT, (96.0, 96.0), (WIDTH / 2, HEIGHT / 2))

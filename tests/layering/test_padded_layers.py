@@ -7,7 +7,7 @@ from mrbokeh.images.layer import Layer, clear, opaque
 from mrbokeh.layering.padded_layers import PaddedLayer, Pixels, coc_px_of, pad_layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.resources import CallingThread
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 LENS = Lens(focal_length_mm=50.0, f_number=2.0, focus_distance_m=2.0, sensor_width_mm=36.0)
 SIZE = (12, 17)

@@ -28,7 +28,7 @@ from mrbokeh.optics.psf_bank_file import read_bank
 from mrbokeh.renderers.scatter_reference import ScatterReference, scatter
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 SIZE = (132, 196)
 FOCI_M = (0.5, 0.68, 1.3)  # the wall lies from 0.6 m to 0.9 m

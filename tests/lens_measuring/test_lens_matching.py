@@ -27,7 +27,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 HEIGHT, WIDTH = 214, 320
 LENS = Lens(50.0, 1.8, 1.0, 14.0)

@@ -12,7 +12,7 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.scatter_reference import blur_layer
-from tests.scenes.blended_slices import all_in_focus
+from tests.support.blended_slices import all_in_focus
 
 SLICES = 5
 COC_STEP_PX = 2.5

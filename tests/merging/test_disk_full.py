@@ -15,7 +15,7 @@ from capture.stacks.slice_files import DiskFullError, find_slices, reporting_ful
 from mrbokeh.images.exr_io import ExrPart
 from mrbokeh.images.image_io import write_image
 from mrbokeh.system.atomic_files import atomic_path
-from tests.scenes.made_photographs import make_shoot
+from tests.support.made_photographs import make_shoot
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.scatter_reference import blur_layer
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
-from tests.scenes.blended_slices import all_in_focus
+from tests.support.blended_slices import all_in_focus
 
 SIZE = (96, 128)
 SLICES = 7

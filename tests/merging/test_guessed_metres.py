@@ -30,9 +30,9 @@ from mrbokeh.stacks.guessed_metres import (
 )
 from tests.compositing.test_composite_command import CAKE
 from tests.house.test_user_mistakes import said
-from tests.scenes.card_stack import CARD_PX, LENS, SIZE, make_card_stack
-from tests.scenes.guessed_stack import guessed_twin
-from tests.scenes.refusals import refused
+from tests.support.card_stack import CARD_PX, LENS, SIZE, make_card_stack
+from tests.support.guessed_stack import guessed_twin
+from tests.support.refusals import refused
 from training.export.onnx_export import network_facts_of
 from training.fitting.run_folder import load_run
 

@@ -14,7 +14,7 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.scatter_reference import blur_layer
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 SIZE = (96, 128)
 FOCUS = (2.0, 1.5, 1.0)
@@ -128,9 +128,9 @@ def test_slices_that_are_equally_sharp_share_their_noise() -> None:
 
 def test_a_light_before_a_wall_leaves_no_ring() -> None:
     """The light's disc lies over the wall in the slice where the wall is sharp; with depth its light is known and taken off."""
-    from tests.renderers.test_lights import LIGHT_AT, RADIANCE, scene
-    from tests.renderers.test_lights import SIZE as WALL
-    from tests.renderers.test_lights import slices as photographed
+    from tests.merging.test_restored_lights import LIGHT_AT, RADIANCE, scene
+    from tests.merging.test_restored_lights import SIZE as WALL
+    from tests.merging.test_restored_lights import slices as photographed
 
     stack = photographed(scene())
     five = SliceOptics.of_slices((5.0, 4.0, 3.0, 2.0, 1.0), [4.0] * 5, Aperture.blades(6))

@@ -19,7 +19,7 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
-from tests.scenes.blended_slices import all_in_focus
+from tests.support.blended_slices import all_in_focus
 
 SIZE = (64, 256)
 AT_PX = np.array([40.3, 30.6])

@@ -22,7 +22,7 @@ from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.images.image_metrics import depth_edge_mask, psnr
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 VIEW = "view_1"
 

@@ -15,7 +15,7 @@ from capture.stacks.ingest import ingest
 from mrbokeh.images.color import convert, linear_to_srgb
 from mrbokeh.images.picture_codec import stored_rgb, write_stored
 from mrbokeh.stacks.focal_stack import FocalStack, write_merged
-from tests.scenes.made_photographs import Picture, make_shoot, only_stack
+from tests.support.made_photographs import Picture, make_shoot, only_stack
 
 
 def merged_like_its_first_slice(stack: FocalStack, picture: Picture | None = None) -> FocalStack:

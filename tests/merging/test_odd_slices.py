@@ -16,8 +16,8 @@ from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.odd_slices import Candidate, blown, duplicates, odd_sizes, other_scenes
 from capture.stacks.slice_looks import look_at, look_of, one_scene, same_photograph
 from mrbokeh.images.image_io import write_image
-from tests.scenes.made_photographs import Picture, defocused, make_shoot, only_stack, scene_rgb, sources
-from tests.scenes.refusals import refused
+from tests.support.made_photographs import Picture, defocused, make_shoot, only_stack, scene_rgb, sources
+from tests.support.refusals import refused
 
 CHECKS = (blown, duplicates, other_scenes)
 

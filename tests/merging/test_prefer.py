@@ -23,8 +23,8 @@ from capture.merging.preferred_side import (
 )
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
-from tests.scenes.blended_slices import all_in_focus
-from tests.scenes.crossing_stack import DISTANCES_M, FAR, NEAR, SIZE, THREAD, crossing_slices, crossing_stack, threads, unmoved, wall
+from tests.support.blended_slices import all_in_focus
+from tests.support.crossing_stack import DISTANCES_M, FAR, NEAR, SIZE, THREAD, crossing_slices, crossing_stack, threads, unmoved, wall
 
 INSIDE = (slice(12, -12), slice(12, -12))
 

@@ -11,7 +11,7 @@ from scipy.ndimage import affine_transform, uniform_filter
 from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.stack_ingest import Development
 from mrbokeh.images.image_io import read_image
-from tests.scenes.made_photographs import Picture, only_stack, sources
+from tests.support.made_photographs import Picture, only_stack, sources
 
 DEMO_STACK = Path(__file__).resolve().parents[2] / "mrbokeh" / "demo_data" / "raw_stack"
 

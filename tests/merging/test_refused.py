@@ -13,7 +13,7 @@ from capture.stacks.session import undone_when_refused
 from capture.stacks.slice_files import DiskFullError
 from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack, write_focal_stack
 from mrbokeh.system.errors import InputError
-from tests.scenes.made_photographs import make_raw_photo, make_shoot, only_stack, scene_rgb
+from tests.support.made_photographs import make_raw_photo, make_shoot, only_stack, scene_rgb
 
 Kept = Callable[[Sequence[FocalStack]], bool]
 

@@ -18,9 +18,9 @@ from capture.merging.registration.plane_transforms import (
 )
 from capture.merging.registration.registration_file import Registration
 from mrbokeh.images.image_io import read_image
-from tests.scenes.crossing_stack import crossing_slices
-from tests.scenes.jittered_stack import HEIGHT_PX, SLICES, WIDTH_PX, JitteredStack, jittered_stack
-from tests.scenes.refusals import refused
+from tests.support.crossing_stack import crossing_slices
+from tests.support.jittered_stack import HEIGHT_PX, SLICES, WIDTH_PX, JitteredStack, jittered_stack
+from tests.support.refusals import refused
 
 # The issue of a lens lab asks for 0.3 px where the breathing alone leaves more than 1.
 ALLOWED_PX = 0.15

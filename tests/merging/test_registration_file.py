@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from capture.merging.registration.registration_file import Breathing, Registration, read_registration, write_registration
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 REGISTRATION = Registration(
     reference=1,

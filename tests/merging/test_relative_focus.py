@@ -22,7 +22,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack
 from tests.house.test_user_mistakes import said
-from tests.scenes.blended_slices import all_in_focus
+from tests.support.blended_slices import all_in_focus
 
 SIZE = (200, 280)
 # Uneven steps of focus, in dioptres, nearest first; 30 px of blur to each: 2.4 to 6 px from one slice to the next.

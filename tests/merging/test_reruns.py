@@ -17,8 +17,8 @@ from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.slice_files import find_slices
 from capture.stacks.stack_ingest import Development
 from mrbokeh.images.image_io import write_image
-from tests.scenes.made_photographs import make_raw_photo, make_shoot, only_stack, scene_rgb, sources
-from tests.scenes.refusals import refused
+from tests.support.made_photographs import make_raw_photo, make_shoot, only_stack, scene_rgb, sources
+from tests.support.refusals import refused
 
 
 @pytest.fixture

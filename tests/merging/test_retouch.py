@@ -16,8 +16,8 @@ from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
 from mrbokeh.images.picture_codec import stored_rgb, write_stored
 from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack
 from mrbokeh.system.errors import InputError
-from tests.scenes.crossing_stack import DISTANCES_M, FAR, NEAR, SIZE, crossing_stack, unmoved
-from tests.scenes.refusals import refused
+from tests.support.crossing_stack import DISTANCES_M, FAR, NEAR, SIZE, crossing_stack, unmoved
+from tests.support.refusals import refused
 
 ON_ITS_SIDE = 6
 """EXIF: a quarter turn clockwise brings the picture upright."""

@@ -13,7 +13,7 @@ from capture.merging.registration.registered_slices import SmallSlice, tint_gain
 from capture.merging.registration.registration_file import write_registration
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 SIZE = (240, 360)
 SCALES = (1.03, 1.02, 1.01, 1.0)

@@ -20,7 +20,7 @@ from mrbokeh.psf_models.simple_lens import SimpleLens
 from mrbokeh.renderers.bank.kernel_files import build_spreadlets, spreadlets_beside
 from mrbokeh.renderers.kernels.spreadlets import Sparsification, Spreadlet, sparsify
 from mrbokeh.system.errors import InputError
-from tests.scenes.command_line import printed_by
+from tests.support.command_line import printed_by
 
 SMALL = ["--diameter", "12", "--counts", "4"]
 

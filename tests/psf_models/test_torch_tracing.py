@@ -23,7 +23,7 @@ from mrbokeh.psf_models.simple_lens import SimpleLens, Stylized
 from mrbokeh.psf_models.volume import Volume
 from mrbokeh.system.errors import InputError, MissingExtraError
 from tests.psf_models.test_physical_lens import pair
-from tests.scenes.command_line import printed_by
+from tests.support.command_line import printed_by
 
 torch = pytest.importorskip("torch")
 

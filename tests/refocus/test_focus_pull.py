@@ -7,7 +7,7 @@ import pytest
 
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.focus_pull import FocusPull, parse_focus_keys, quantisation_steps, read_focus_pull, smoothed_within_steps
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 
 def venice(shared_data: Path) -> Path:

@@ -21,9 +21,9 @@ from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
 from mrbokeh.stacks.focus_places import FocusLookup, parse_focus
-from tests.scenes.card_stack import CARD_PX, LENS, SIZE, make_card_stack
-from tests.scenes.command_line import printed_by
-from tests.scenes.refusals import refused
+from tests.support.card_stack import CARD_PX, LENS, SIZE, make_card_stack
+from tests.support.command_line import printed_by
+from tests.support.refusals import refused
 
 BETWEEN_M = 0.52
 
@@ -107,7 +107,7 @@ def test_residuals_hold_the_light_that_an_all_in_focus_picture_lost(tmp_path: Pa
 @pytest.mark.slow
 def test_residuals_gain_on_a_traced_stack(tmp_path: Path) -> None:
     """Path-traced slices with noise, left out one by one: at least 0.5 dB more with residuals in each, and far above the nearest slice."""
-    from tests.scenes.traced_focal_stack import traced, write_stack
+    from tests.support.traced_focal_stack import traced, write_stack
 
     for each in leave_one_out(write_stack(tmp_path / "traced", traced()), PolygonDifferences(threads=1)):
         assert each.rendered_db > 38.0 and each.with_residuals_db > each.rendered_db + 0.5

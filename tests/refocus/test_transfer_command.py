@@ -21,7 +21,7 @@ from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.stacks.photograph import Photograph
 from mrbokeh.video.clip import read_frames
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 LENS = Lens(50.0, 2.0, 1.0, 9.0)
 SIZE = (48, 72)

@@ -21,7 +21,7 @@ from mrbokeh.renderers.bank.lattice import SIDES, BankLattice
 from mrbokeh.renderers.bank.renderers import decompose_bank
 from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
 from mrbokeh.system.errors import InputError
-from tests.scenes.renderer_banks import BRIGHT_RIM, CAT_RING, HIGHS, LENS, bank_of, discs_bank, rings_bank, rings_polygons, slanted
+from tests.support.renderer_banks import BRIGHT_RIM, CAT_RING, HIGHS, LENS, bank_of, discs_bank, rings_bank, rings_polygons, slanted
 
 # Contours stray from an outline by what a pixel smooths: a share of its area that falls as its diameter grows; a soft kernel also
 # lacks what four levels cannot tell. Bounds at 12 and 30 px; measured 0.020 and 0.014 for the disc, 0.089 and 0.093 for the bright rim.

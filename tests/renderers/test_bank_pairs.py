@@ -17,7 +17,7 @@ from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.stacks.focal_stack_dataset import file_troubles, read_focal_stack_dataset
 from mrbokeh.system.errors import InputError
-from tests.scenes.command_line import printed_by
+from tests.support.command_line import printed_by
 from training.data.dataset import read_pair
 
 PLAN = PairsPlan(scenes=2, focuses=2, width_px=64, height_px=40)

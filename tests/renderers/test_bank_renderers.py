@@ -20,7 +20,7 @@ from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 from mrbokeh.system.errors import InputError
-from tests.scenes.renderer_banks import (
+from tests.support.renderer_banks import (
     CAT_RING,
     FEW,
     HIGH_PX,

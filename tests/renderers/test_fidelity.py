@@ -22,7 +22,7 @@ import pytest
 
 from mrbokeh.renderers.choose import make_renderer
 from tests.bench.fidelity_baselines import BASELINES
-from tests.scenes.fidelity_cases import Case, card_cases, truth_cases
+from tests.support.fidelity_cases import Case, card_cases, truth_cases
 
 TRUTH = Path(__file__).parents[1] / "data" / "truth"
 FAST = ("polygon", "low-rank")

@@ -4,7 +4,7 @@ import pytest
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.kernels.laplacian_integration import STENCIL, integrate, integrate_by_pyramid, laplacian
 from mrbokeh.system.errors import InputError
-from tests.scenes.spreadlet_references import integrate_reference
+from tests.support.spreadlet_references import integrate_reference
 
 
 def disc(diameter_px: float, size: int) -> np.ndarray:

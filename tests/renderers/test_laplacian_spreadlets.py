@@ -24,8 +24,8 @@ from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets, highlights_among
 from mrbokeh.renderers.spreadlets.sums import FOUR, Laid, Window, _Splatting, gains_for, splat
 from mrbokeh.system.errors import InputError
-from tests.scenes.sampled_planes import LENS, Plane, sample_planes, truth
-from tests.scenes.spreadlet_references import highlights_among_reference, splat_reference, stands_out_reference
+from tests.support.sampled_planes import LENS, Plane, sample_planes, truth
+from tests.support.spreadlet_references import highlights_among_reference, splat_reference, stands_out_reference
 
 DISC, PENTAGON = Aperture.disc(), Aperture.blades(5)
 SIZE = (96, 120)

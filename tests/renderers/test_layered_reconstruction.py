@@ -13,7 +13,7 @@ from mrbokeh.layering.motion import MOTION
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
 from mrbokeh.system.errors import InputError
-from tests.scenes.sampled_planes import LENS, Plane, checker, even, fence_scene, sample_planes, truth, waves
+from tests.support.sampled_planes import LENS, Plane, checker, even, fence_scene, sample_planes, truth, waves
 
 SIZE_PX = 64
 PAPER = Settings(screen_filter="sheared", recursive_passes=1, enough=np.inf)

@@ -8,7 +8,7 @@ from mrbokeh.renderers.layered_reconstruction._filter_numba import axes, morton,
 from mrbokeh.renderers.layered_reconstruction._partitions_numba import partitions_of_tile, rows_of_tile, seeded, xorshift
 from mrbokeh.renderers.layered_reconstruction._samples import bucket_of, motion_cells
 from mrbokeh.renderers.layered_reconstruction._tile_data import Choice, Light
-from tests.scenes.sampled_planes import LENS, Plane, even, sample_planes
+from tests.support.sampled_planes import LENS, Plane, even, sample_planes
 
 SIZE_PX = 64
 WINDOW = np.array([0.25, 0.0, 0.25, 1.0 / 12.0])

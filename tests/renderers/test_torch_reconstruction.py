@@ -17,7 +17,7 @@ from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
 from mrbokeh.stacks.light_field_samples_file import read_samples
 from mrbokeh.system.errors import InputError, MissingExtraError
-from tests.scenes.sampled_planes import LENS, fence_scene, sample_planes
+from tests.support.sampled_planes import LENS, fence_scene, sample_planes
 
 torch = pytest.importorskip("torch")
 
@@ -160,7 +160,7 @@ import torch
 from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import TorchReconstruction, _merging, _reprojection
 from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._triton import splat_by_kernel
 from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._triton import sweep_by_kernel
-from tests.scenes.sampled_planes import LENS, fence_scene, sample_planes
+from tests.support.sampled_planes import LENS, fence_scene, sample_planes
 
 torch.set_num_threads(1)
 plain_sweep, plain_splat = _merging.sweep_row_by_row, _reprojection.splat_in_chunks

@@ -24,7 +24,7 @@ from mrbokeh.renderers.kernels.spreadlets import UNRELAXED, sparsify, whole_lapl
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 from mrbokeh.renderers.spreadlets.sums import add_light, window_of
 from mrbokeh.system.errors import InputError
-from tests.scenes.spreadlet_references import integrate_reference, splat_reference
+from tests.support.spreadlet_references import integrate_reference, splat_reference
 
 torch = pytest.importorskip("torch")
 
@@ -294,7 +294,7 @@ from triton import compile
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 from mrbokeh.renderers.spreadlets.torch_spreadlets._splat_triton import _splat
-from tests.scenes.spreadlet_references import integrate_reference, splat_reference  # noqa: E402
+from tests.support.spreadlet_references import integrate_reference, splat_reference  # noqa: E402
 sizes = {"CHANNELS": 6, "COLUMNS": 3, "WIDE": 8, "PIXELS": 64, "SEGMENT": 128}
 types = {"sums": "*i64", "values": "*fp32", "weights": "*fp64", **dict.fromkeys(("pixels", "width", "window_width", "corner"), "i32")}
 signature = {name: "constexpr" if name in sizes else types.get(name, "*i32") for name in _splat.arg_names}

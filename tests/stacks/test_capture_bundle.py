@@ -19,8 +19,8 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.stacks.capture_bundle import is_bundle, read_bundle, write_bundle
 from mrbokeh.system.errors import InputError
-from tests.scenes.command_line import mrbokeh
-from tests.scenes.refusals import refused
+from tests.support.command_line import mrbokeh
+from tests.support.refusals import refused
 from viewfinder.app.live_compositor import CompositedFrame, LiveCompositor
 from viewfinder.app.live_controls import Captures
 from viewfinder.frames import CameraFrame, FrameStatus, OutputFrame

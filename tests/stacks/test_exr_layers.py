@@ -14,7 +14,7 @@ from mrbokeh.stacks.exr_layers.cryptomatte import ObjectSplit
 from mrbokeh.stacks.exr_layers.render_channels import FlatRender, LayerReader, RenderChannels
 from mrbokeh.stacks.exr_layers.sequence import ExrSequence
 from mrbokeh.system.errors import InputError
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 HEIGHT, WIDTH = 12, 16
 # Rendered by Blender 4.2.23 (Cycles, 80x56 px, pixels 1.2 times as tall as wide) of a red cube in motion before a green ball;

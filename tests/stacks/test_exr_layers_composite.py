@@ -10,8 +10,8 @@ from mrbokeh.images.image_io import read_depth, read_image
 from mrbokeh.images.layer import Layer
 from mrbokeh.stacks.exr_layers.composite_exr import CompositeLayers, write_composite_exr
 from mrbokeh.stacks.exr_layers.render_channels import FlatRender
-from tests.scenes.composite_exr_reader import read_composite_exr
-from tests.scenes.refusals import refused
+from tests.support.composite_exr_reader import read_composite_exr
+from tests.support.refusals import refused
 
 HEIGHT, WIDTH = 10, 14
 SIZE = (HEIGHT, WIDTH)

@@ -14,7 +14,7 @@ from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.stacks.exr_layers.cryptomatte import ObjectSplit, cryptomattes, id_bits, murmur3_32
 from mrbokeh.stacks.exr_layers.render_channels import FlatRender, RenderChannels
 from mrbokeh.system.errors import InputError
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 HEIGHT, WIDTH = 6, 10
 BLENDER = Path(__file__).parents[1] / "data" / "blender" / "render.0002.exr"

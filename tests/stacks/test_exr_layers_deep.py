@@ -17,9 +17,9 @@ from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces, is_
 from mrbokeh.stacks.exr_layers.render_channels import LayerReader
 from mrbokeh.stacks.exr_layers.sequence import ExrSequence
 from mrbokeh.system.errors import InputError
-from tests.scenes.deep_pixels_reference import DeepSample, flattened, split, tidied
-from tests.scenes.deep_pixels_reference import merged as merged_samples
-from tests.scenes.refusals import refused
+from tests.support.deep_pixels_reference import DeepSample, flattened, split, tidied
+from tests.support.deep_pixels_reference import merged as merged_samples
+from tests.support.refusals import refused
 
 Pixels = dict[tuple[int, int], list[DeepSample]]
 

@@ -13,10 +13,10 @@ from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.shots.inputs import Moment
 from mrbokeh.shots.layer_sources import AmongDeep, LayerFiles, sources_by_depth
 from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, cut_at, interleaved, merged, peeled
-from tests.scenes.command_line import printed_by
-from tests.scenes.deep_pixels_reference import DeepSample, flattened, tidied
-from tests.scenes.refusals import refused
 from tests.stacks.test_exr_layers_deep import Pixels, fog, point, random_pixels, write_deep
+from tests.support.command_line import printed_by
+from tests.support.deep_pixels_reference import DeepSample, flattened, tidied
+from tests.support.refusals import refused
 
 SIZE = (6, 9)
 

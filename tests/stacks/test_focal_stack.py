@@ -11,7 +11,7 @@ from mrbokeh.images.image_io import write_image
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, find_focal_stacks, read_focal_stack, write_focal_stack, write_merged
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 
 def stack_in(folder: Path, distances_m: tuple[float | None, ...] = (0.6, 0.9, 1.8)) -> FocalStack:

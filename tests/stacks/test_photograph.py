@@ -10,7 +10,7 @@ from mrbokeh.compositing.plate import open_plate
 from mrbokeh.images.color import srgb_to_linear
 from mrbokeh.images.exif import as_stored, upright
 from mrbokeh.stacks.photograph import read_photograph
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 shared = pytest.mark.skipif(not DATA.is_dir(), reason="the photographs beside the project are not here")

@@ -14,7 +14,7 @@ from capture.tether.live_view import Spot, read_live, show_live
 from capture.tether.simulated_camera import SimulatedCamera, SimulatedMotor
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 LENS = Lens(35.0, 2.0, 1.0, 23.5)
 

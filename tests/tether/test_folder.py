@@ -14,7 +14,7 @@ from capture.tether.shoot import ShootOptions, Surroundings, shoot
 from capture.tether.watched_folder import WatchedFolder, is_whole
 from datasets_scripts.made_sets.simulated_camera import SensorModel, ShotMetadata, write_dng
 from mrbokeh.optics.lens import Lens
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 LENS = Lens(35.0, 2.0, 1.0, 23.5)
 

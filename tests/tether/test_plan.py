@@ -15,8 +15,8 @@ from capture.tether.focus_plan import FocusPlan, FocusRange, on_scale, plan_focu
 from mrbokeh.optics.lens import Lens, film_plane_m, lens_distance_m
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.errors import InputError
-from tests.scenes.command_line import printed_by
-from tests.scenes.refusals import refused
+from tests.support.command_line import printed_by
+from tests.support.refusals import refused
 
 LENS = Lens(35.0, 2.8, 1.0, 36.0)
 COMMAND = ["--focal-length", "35", "--f-number", "2", "--sensor-width", "23.5", "--near", "0.5", "--far", "2", "--image-width", "480"]

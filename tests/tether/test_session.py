@@ -15,7 +15,7 @@ from capture.stacks.stack_ingest import Development
 from mrbokeh.images.image_io import write_image
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.system.errors import InputError
-from tests.scenes.made_photographs import defocused, make_raw_photo, make_shoot, only_stack, scene_rgb, set_exif, set_neutral, sources
+from tests.support.made_photographs import defocused, make_raw_photo, make_shoot, only_stack, scene_rgb, set_exif, set_neutral, sources
 
 
 @pytest.fixture

@@ -24,8 +24,8 @@ from datasets_scripts.made_sets.simulated_camera import SensorModel, ShotMetadat
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.system.errors import InputError
-from tests.scenes.command_line import printed_by
-from tests.scenes.refusals import refused
+from tests.support.command_line import printed_by
+from tests.support.refusals import refused
 
 LENS = Lens(35.0, 2.0, 1.0, 23.5)
 NEAR_M, FAR_M = 0.5, 2.5

@@ -22,10 +22,10 @@ from mrbokeh.tracking.camera_track.formats import read_track
 from mrbokeh.tracking.camera_track.track import CameraTrack
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, write_board
 from mrbokeh.tracking.charuco.detector import Corners
-from tests.scenes.command_line import printed_by
-from tests.scenes.refusals import refused
-from tests.scenes.traced_board_clip import BOARD, MOTION, clip_of, pose_error, tilted_views
-from tests.scenes.video_files import filmed, turned_clip
+from tests.support.command_line import printed_by
+from tests.support.refusals import refused
+from tests.support.traced_board_clip import BOARD, MOTION, clip_of, pose_error, tilted_views
+from tests.support.video_files import filmed, turned_clip
 
 FRAMES, HIDDEN = 16, (6, 7, 8)
 CAMERA = Camera(640, 360, (609.0, 609.0), (320.0, 180.0))

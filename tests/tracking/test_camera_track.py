@@ -15,9 +15,9 @@ from mrbokeh.tracking.camera_track.board_track import Intrinsics, intrinsics_of_
 from mrbokeh.tracking.camera_track.formats import write_track
 from mrbokeh.tracking.camera_track.track import DISTORTION_NAMES, CameraTrack, TrackedFrame, fixed_track
 from mrbokeh.tracking.world_axes import UPRIGHT_FROM_WORLD, upright_camera
-from tests.scenes.command_line import printed_by
-from tests.scenes.refusals import refused
-from tests.scenes.video_files import filmed
+from tests.support.command_line import printed_by
+from tests.support.refusals import refused
+from tests.support.video_files import filmed
 
 
 def camera_at(place_m: tuple[float, float, float], turn: Rotation) -> Camera:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.tracking.camera_track.formats import FORMATS, read_track, write_track
 from mrbokeh.tracking.camera_track.track import ROTATION_ORDERS, CameraTrack, TrackedFrame, TrackOptions
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 SIZE_PX = (640, 360)
 NAMES = {"json": "track.json", "chan": "track.chan", "nerfstudio": "transforms.json", "opentrackio": "track.jsonl"}

@@ -8,7 +8,7 @@ import pytest
 
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, black_rectangles_mm, read_board, write_board
 from mrbokeh.tracking.charuco.detector import CharucoDetector
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 EVEN = CharucoBoard((CharucoGrid((5, 4), 24.0, 18.0),), legacy=True)
 ODD = CharucoBoard((CharucoGrid((4, 5), 24.0, 18.0),), legacy=True)

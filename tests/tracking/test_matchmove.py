@@ -25,10 +25,10 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.formats import read_track
 from mrbokeh.tracking.camera_track.track import CameraTrack
 from mrbokeh.video.clip import probe
-from tests.scenes.command_line import printed_by
-from tests.scenes.refusals import refused
-from tests.scenes.textured_room import picture, room_camera, similarity
-from tests.scenes.video_files import filmed
+from tests.support.command_line import printed_by
+from tests.support.refusals import refused
+from tests.support.textured_room import picture, room_camera, similarity
+from tests.support.video_files import filmed
 
 
 def walking(count: int) -> list[Camera]:

@@ -15,9 +15,9 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.video.picture_source import open_source
-from tests.scenes.command_line import printed_by
-from tests.scenes.refusals import refused
-from tests.scenes.video_files import filmed, turned_clip
+from tests.support.command_line import printed_by
+from tests.support.refusals import refused
+from tests.support.video_files import filmed, turned_clip
 
 WIDTH, HEIGHT = 96, 64
 # A heart has no symmetry but left and right, a tilt none. 25 mm of aperture, 51.3 mm to the sensor and 16 px per mm: 10 px at 1 m.

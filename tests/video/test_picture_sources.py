@@ -14,8 +14,8 @@ from mrbokeh.video.clip import read_frames
 from mrbokeh.video.image_sequence import NumberedFiles, is_pattern, numbered, pattern_of_folder
 from mrbokeh.video.picture_source import FrameIndex, PictureSource, VideoSource, open_source, parse_rate
 from mrbokeh.video.writer import VideoWriter
-from tests.scenes.refusals import refused
-from tests.scenes.video_files import encoded
+from tests.support.refusals import refused
+from tests.support.video_files import encoded
 
 CLIPS = ("iphone_xr_chart.mov", "ducks_720p.mp4", "nikon_d90_chart.avi")
 

@@ -24,9 +24,9 @@ from mrbokeh.video.clip import read_frames
 from mrbokeh.video.color import color_of
 from mrbokeh.video.frames import has_alpha, linear_rgb, stored_alpha
 from mrbokeh.video.picture_source import PictureSource, open_source
-from tests.scenes.shot_makers import Brighter
-from tests.scenes.video_files import encoded, filmed, turned_clip
-from tests.scenes.video_files import video as run
+from tests.support.shot_makers import Brighter
+from tests.support.video_files import encoded, filmed, turned_clip
+from tests.support.video_files import video as run
 
 WIDTH, HEIGHT, COUNT = 96, 64, 5
 LENS = Lens(focal_length_mm=50.0, f_number=2.0, focus_distance_m=2.0, sensor_width_mm=6.0)

@@ -26,12 +26,12 @@ from mrbokeh.tracking.camera_track.focus_pull import parse_focus_keys
 from mrbokeh.video.clip import read_frames
 from mrbokeh.video.writer import VideoWriter
 from tests.compositing.test_plate_look_options import photo_with_exif
-from tests.scenes.refusals import refused
-from tests.scenes.shot_makers import wait_for
-from tests.scenes.stage_scenes import HEIGHT, ONE_CARD, WIDTH, camera, scene_file
-from tests.scenes.video_files import filmed
-from tests.scenes.video_files import video as run
 from tests.stacks.test_exr_layers_cryptomatte import beauty, crypto_channels, header
+from tests.support.refusals import refused
+from tests.support.shot_makers import wait_for
+from tests.support.stage_scenes import HEIGHT, ONE_CARD, WIDTH, camera, scene_file
+from tests.support.video_files import filmed
+from tests.support.video_files import video as run
 
 LENS = Lens(focal_length_mm=50.0, f_number=2.0, focus_distance_m=2.0, sensor_width_mm=6.0)
 # One 16-bit step of BT.709 codes, in linear light at white, where the curve is steepest: 1 / 65535 * 1 / 0.495.

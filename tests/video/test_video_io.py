@@ -12,8 +12,8 @@ import pytest
 from mrbokeh.video.clip import probe, read_display_frames, read_frames
 from mrbokeh.video.color import code_from_linear, decode_table, encode_table, linear_from_code, rec709_from_primaries
 from mrbokeh.video.writer import VideoWriter
-from tests.scenes.refusals import refused
-from tests.scenes.video_files import encoded, filmed
+from tests.support.refusals import refused
+from tests.support.video_files import encoded, filmed
 
 LUMA = {"709": (0.2126, 0.0722), "601": (0.299, 0.114)}
 H273 = {"709": 1, "601": 6, "untagged": 2}

@@ -13,7 +13,7 @@ from mrbokeh.shots.shot import Shot
 from mrbokeh.video.clip import read_frames
 from mrbokeh.video.picture_source import open_source
 from mrbokeh.video.writer import VideoWriter
-from tests.scenes.shot_makers import Brighter
+from tests.support.shot_makers import Brighter
 
 BEGINS_S = 0.5
 PICTURES, RATE = 30, 25

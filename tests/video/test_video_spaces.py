@@ -12,9 +12,9 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.video.clip import read_frames
-from tests.scenes.refusals import refused
-from tests.scenes.video_files import encoded, filmed
-from tests.scenes.video_files import video as run
+from tests.support.refusals import refused
+from tests.support.video_files import encoded, filmed
+from tests.support.video_files import video as run
 
 pytest.importorskip("PyOpenColorIO")
 

@@ -33,8 +33,8 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
-from tests.scenes.command_line import printed_by
-from tests.scenes.refusals import refused
+from tests.support.command_line import printed_by
+from tests.support.refusals import refused
 
 FOCUS = np.linspace(1.6, 0.5, 10)
 LENS = Lens(35.0, 2.0, 1.0, 23.5)

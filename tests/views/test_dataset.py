@@ -20,8 +20,8 @@ from mrbokeh.images.exr_io import read_exr
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
 from mrbokeh.stacks.focal_stack_dataset import read_focal_stack_dataset
-from tests.scenes.command_line import printed_by
-from tests.scenes.refusals import refused
+from tests.support.command_line import printed_by
+from tests.support.refusals import refused
 
 SIZE = (24, 32)
 LENS = Lens(50.0, 1.4, 1.0, 36.0)

@@ -44,8 +44,8 @@ from capture.dense.guided_depth import (
 from capture.dense.scene_depth import on_original_pixels, patch_match_obstacle, patch_match_prior
 from capture.dense.sweep_view import SweepView
 from mrbokeh.optics.camera import Camera
-from tests.scenes.dense_references import aggregate_reference, weighted_medians_reference
-from tests.scenes.plane_sweep_scenes import FOCAL_PX, HEIGHT_PX, WIDTH_PX, TracedViews, card, grey_card, traced, wall
+from tests.support.dense_references import aggregate_reference, weighted_medians_reference
+from tests.support.plane_sweep_scenes import FOCAL_PX, HEIGHT_PX, WIDTH_PX, TracedViews, card, grey_card, traced, wall
 
 RANGE = (0.4, 1.7)
 RNG = np.random.default_rng(0)

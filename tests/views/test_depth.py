@@ -22,9 +22,9 @@ from mrbokeh.images.image_io import read_image
 from mrbokeh.optics.camera import Camera
 from mrbokeh.stacks.focal_stack import find_focal_stacks, read_focal_stack
 from mrbokeh.system.atomic_files import write_json
-from tests.scenes.capture_truth import ViewTruth, picture_db, view_truth
-from tests.scenes.command_line import printed_by
-from tests.scenes.refusals import refused
+from tests.support.capture_truth import ViewTruth, picture_db, view_truth
+from tests.support.command_line import printed_by
+from tests.support.refusals import refused
 
 RAW = DATA / "raw_stack"
 POINTS_A_VIEW = 400

@@ -1,4 +1,4 @@
-"""Focus solved from the blur of a board, on pictures through a thin lens whose focus is known (tests/scenes/thin_lens_board)."""
+"""Focus solved from the blur of a board, on pictures through a thin lens whose focus is known (tests/support/thin_lens_board)."""
 
 import time
 from dataclasses import replace
@@ -10,7 +10,7 @@ import pytest
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid
-from tests.scenes.thin_lens_board import DARK, LIGHT, Shot, camera_over, display_bgr, photograph
+from tests.support.thin_lens_board import DARK, LIGHT, Shot, camera_over, display_bgr, photograph
 from viewfinder.focus.board_focus import BlurOfBoardFocus, BlurSettings, FocusEvidence, focus_candidates, settled
 from viewfinder.focus.edge_blur import EdgeBlurs, board_edges, edge_blurs, edge_rise
 from viewfinder.frames import CameraFrame, LensState

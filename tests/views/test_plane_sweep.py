@@ -20,9 +20,9 @@ from capture.dense.plane_sweep import (
 )
 from capture.dense.sweep_view import BRIGHTEST, SweepView, structure_of
 from mrbokeh.optics.camera import Camera
-from tests.scenes.dense_references import scores_of_surface
-from tests.scenes.plane_sweep_scenes import FOCAL_PX, card, traced, wall
-from tests.scenes.refusals import refused
+from tests.support.dense_references import scores_of_surface
+from tests.support.plane_sweep_scenes import FOCAL_PX, card, traced, wall
+from tests.support.refusals import refused
 
 INNER = np.s_[8:-8, 12:-12]
 

@@ -8,8 +8,8 @@ import pytest
 from capture.dense.dense_depth import DenseSettings, dense_depth
 from capture.dense.plane_sweep import Matching, plane_sweep
 from capture.dense.sweep_view import SweepView
-from tests.scenes.plane_sweep_scenes import card, traced, wall
-from tests.scenes.refusals import refused
+from tests.support.plane_sweep_scenes import card, traced, wall
+from tests.support.refusals import refused
 from tests.views.test_plane_sweep import turned_view
 
 torch = pytest.importorskip("torch")

@@ -32,8 +32,8 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack
 from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError, MissingExtraError
-from tests.scenes.command_line import printed_by
-from tests.scenes.refusals import refused
+from tests.support.command_line import printed_by
+from tests.support.refusals import refused
 
 needs_colmap = pytest.mark.skipif(find_spec("pycolmap") is None, reason="pycolmap (extra `capture`) is not installed")
 

@@ -22,7 +22,7 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack
-from tests.scenes.traced_focal_stack import FOCUS_M, LENS, SLICES, TracedStack, traced, write_stack
+from tests.support.traced_focal_stack import FOCUS_M, LENS, SLICES, TracedStack, traced, write_stack
 
 # Half the usual slices: half the time, and blur here is small.
 REBLUR = Reblur(PolygonDifferences(layering=Layering(slices=8), threads=1))

@@ -29,8 +29,8 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
 from mrbokeh.system.atomic_files import write_json
-from tests.scenes.command_line import printed_by
-from tests.scenes.traced_focal_stack import FOCUS_M, traced, write_stack
+from tests.support.command_line import printed_by
+from tests.support.traced_focal_stack import FOCUS_M, traced, write_stack
 
 REBLUR = Reblur(PolygonDifferences(layering=Layering(slices=8), threads=1))
 

@@ -26,8 +26,8 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack, write_focal_stack
 from mrbokeh.system.atomic_files import read_json, write_json
-from tests.scenes.command_line import printed_by
-from tests.scenes.traced_focal_stack import HEIGHT_PX, SLICES, WIDTH_PX, traced, write_stack
+from tests.support.command_line import printed_by
+from tests.support.traced_focal_stack import HEIGHT_PX, SLICES, WIDTH_PX, traced, write_stack
 
 NAMES = ("view_0", "view_1")
 

@@ -24,8 +24,8 @@ from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.images.image_io import read_image
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
 from mrbokeh.system.atomic_files import write_json
-from tests.scenes.command_line import printed_by
-from tests.scenes.refusals import refused
+from tests.support.command_line import printed_by
+from tests.support.refusals import refused
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Made = tuple[list[Rgb], Rgb]

@@ -27,7 +27,7 @@ from capture.scale.focus import FocusSample, focus_scale, sharpness_curves, shar
 from mrbokeh.optics.camera import Camera
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, read_board
-from tests.scenes.refusals import refused
+from tests.support.refusals import refused
 
 METRES_PER_UNIT = 0.2
 BOARD = CharucoBoard((CharucoGrid((8, 6), 30.0, 22.0),))

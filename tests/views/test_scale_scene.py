@@ -15,7 +15,7 @@ from capture.scale.metric_scale import ScaledScene, ScaleRequest, scale_lines, s
 from mrbokeh.images.color import display_rgb8
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.system.errors import InputError
-from tests.scenes.traced_views import (
+from tests.support.traced_views import (
     BOARD,
     FOCUS_M,
     LENS,

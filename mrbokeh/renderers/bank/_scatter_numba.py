@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from mrbokeh.optics._aperture_numba import fill_psf
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 
 @njit(cache=True, nogil=True)

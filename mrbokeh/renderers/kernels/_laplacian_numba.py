@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 NONE = -1
 _STRETCH_PX = 32

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 SHARP, NOT_FINITE = 0, 1
 IN_FRONT, BEHIND, NEGATIVE = 2, 4, 8

@@ -9,7 +9,7 @@ import math
 import numpy as np
 
 from mrbokeh.renderers.layered_reconstruction._tile_data import BLOCKS, BLOCKS_ACROSS, Light, Partitions, Slope
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 
 @njit(cache=True, nogil=True)

@@ -11,7 +11,7 @@ import numpy as np
 
 from mrbokeh.renderers.layered_reconstruction._filter_numba import PIXEL_VARIANCE, axes, evened_out, reproject, sheared_axes, sheared_filter
 from mrbokeh.renderers.layered_reconstruction._tile_data import Choice, Light, Partitions, Slope
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 _LEAST_VARIANCE = 1e-3
 _MOST_PROBES = 16

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 _THICKNESS_PX = 1.0
 _FIXED_POINT_ROUNDS = 3

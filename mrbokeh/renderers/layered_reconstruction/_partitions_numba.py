@@ -11,7 +11,7 @@ import numpy as np
 
 from mrbokeh.renderers.layered_reconstruction._filter_numba import SUMS, blur_px, extents, morton, slope_distance
 from mrbokeh.renderers.layered_reconstruction._tile_data import BLOCKS, BLOCKS_ACROSS, Choice, Light, Partitions
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 WIDEST_PX = 6.0
 """Slopes may differ by the tolerance times the blur, and by that times so many pixels (a standard deviation) where the blur is

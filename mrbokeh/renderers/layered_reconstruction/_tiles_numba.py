@@ -11,7 +11,7 @@ from mrbokeh.renderers.layered_reconstruction._gaussians_numba import WINDOWS, g
 from mrbokeh.renderers.layered_reconstruction._partitions_numba import partitions_of_tile
 from mrbokeh.renderers.layered_reconstruction._tile_data import BLOCKS, Choice, Light, Partitions, Pupil, WindowLayer
 from mrbokeh.renderers.layered_reconstruction._windows_numba import composite, lay_parts, own_means, share_out, window_guards, window_layer
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 COARSE_PX = 4
 """Side of the pixels on which the whole and its parts are compared."""

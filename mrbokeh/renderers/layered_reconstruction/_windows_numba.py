@@ -10,7 +10,7 @@ import numpy as np
 
 from mrbokeh.renderers.layered_reconstruction._filter_numba import PIXEL_VARIANCE, evened_out, reproject, sheared_slopes
 from mrbokeh.renderers.layered_reconstruction._tile_data import Choice, Light, Partitions, Pupil, Slope, WindowLayer
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 STRIPS_FOR_PX = 2.0
 """Up to this radius the coarsest drawing of the pupil does, up to twice of it the next."""

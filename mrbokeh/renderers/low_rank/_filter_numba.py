@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 TILE_FLOATS = 128
 _ROWS_AT_ONCE = 4

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 ALIKE = 1e-12
 """Areas closer than this are the same; of such walks the one with fewer lines is taken."""

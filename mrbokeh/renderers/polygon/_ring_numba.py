@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 
 @njit(cache=True)

@@ -5,7 +5,7 @@ Loops over tiles do so little work that releasing the GIL (nogil) would cost mor
 
 import numpy as np
 
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 TILE_PX = 8
 """Side of the tiles in which light is counted; at most the half side of the smallest window, so that a pixel's own tile lies in it."""

@@ -17,7 +17,7 @@ from numba.core.cgutils import get_or_insert_function
 from numba.extending import intrinsic
 
 from mrbokeh.renderers.kernels._vectors_numba import Lowering, data_of, filled, load_vector, shuffled
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 # ruff: noqa: ARG001  (numba reads the arguments of an intrinsic by their names)
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from mrbokeh.system.kernels import njit
+from mrbokeh.system.compiled import njit
 
 _THIN = 1e-30
 # Light without alpha (a flame) has a place too: it counts this much where nothing else in the slice says where it is.

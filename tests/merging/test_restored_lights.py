@@ -1,0 +1,100 @@
+"""Lights in a focal stack: found, given to their sharp slice, and their energy read where they are out of focus."""
+
+import numpy as np
+import pytest
+
+from capture.merging.depth_from_focus import focus_map
+from capture.merging.focus_volume import focus_volume
+from capture.merging.lights import Lights, find_lights, no_lights
+from capture.merging.restored_lights import restored_lights, with_restored_lights
+from capture.photos.libraw import neutral_where_full
+from mrbokeh.images.layer import opaque
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.renderers.scatter_reference import blur_layer
+from tests.support.blended_slices import all_in_focus
+
+SIZE = (80, 400)
+LIGHT_AT = (40, 60)
+SHARP_SLICE = 1
+FULL = 2.0
+RADIANCE = np.array([90.0, 80.0, 60.0], np.float32)
+
+
+def texture() -> np.ndarray:
+    return np.random.default_rng(0).uniform(0.1, 0.3, (*SIZE, 3)).astype(np.float32)
+
+
+def scene(radiance: np.ndarray = RADIANCE) -> np.ndarray:
+    """A textured wall, sharp in slice 3, and in front of it one light of a single pixel, sharp in slice 1."""
+    rgb = texture()
+    rgb[LIGHT_AT] = radiance
+    return rgb
+
+
+def slices(rgb: np.ndarray) -> list[np.ndarray]:
+    """Five photographs; the sensor is full at 2."""
+    index = np.full(SIZE, 3.0, np.float32)
+    index[LIGHT_AT] = SHARP_SLICE
+    photographs = []
+    for i in range(5):
+        blurred = blur_layer(opaque(rgb, np.ones(SIZE, np.float32)), 4.0 * (index - i), Aperture.blades(6))
+        photographs.append(np.minimum(blurred.rgb, FULL))
+    return photographs
+
+
+def test_the_light_is_found_in_its_sharp_slice_and_merged_without_a_ghost_ring() -> None:
+    stack = slices(scene())
+    lights = find_lights(lambda: stack)
+    assert lights.sharpest.tolist() == [SHARP_SLICE]
+    assert lights.focus_index[0] == pytest.approx(SHARP_SLICE, abs=0.1)
+    assert lights.core[LIGHT_AT] and lights.zone[LIGHT_AT] == 1
+    # Its largest disc, 12 px wide in slice 4, lies within the zone.
+    assert all(lights.zone[LIGHT_AT[0] + dy, LIGHT_AT[1] + dx] == 1 for dy, dx in ((0, 6), (0, -6), (5, 0), (-5, 0)))
+    assert lights.zone[:, 120:].max() == 0
+    ring = np.s_[LIGHT_AT[0] - 5 : LIGHT_AT[0] + 6, LIGHT_AT[1] + 2 : LIGHT_AT[1] + 7]
+    # Every slice but the light's own has light thrown on the ring; the texture alone never exceeds 0.3.
+    assert max(each[ring].max() for each in stack) > 0.8
+    assert merged_with_lights(stack)[0][ring].max() < 0.32
+
+
+def test_a_stack_without_lights_has_none_nor_has_white_paper() -> None:
+    stack = [texture()] * 3
+    lights = find_lights(lambda: stack)
+    assert len(lights.sharpest) == 0 and lights.zone.max() == 0 and not lights.core.any()
+    assert restored_lights(lambda: stack, stack[0])[1] == []
+    rgb = texture()
+    rgb[10:70, 100:300] = 0.97
+    stack = [rgb] * 3
+    assert len(find_lights(lambda: stack).sharpest) == 0
+
+
+def merged_with_lights(stack: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray, Lights]:
+    merged = all_in_focus(stack, focus_map(focus_volume(stack), no_lights(SIZE)).focus_index)
+    lights, restored = restored_lights(lambda: stack, merged)
+    return with_restored_lights(merged, restored), merged, lights
+
+
+def test_energy_lost_to_saturation_is_found_in_the_discs_and_light_that_fits_left_alone() -> None:
+    restored, merged, lights = merged_with_lights(slices(scene()))
+    assert merged.max() <= FULL
+    # In slice 4 the disc of 12 px spreads the light over 94 px, 0.95 above the wall: nothing is full there.
+    np.testing.assert_allclose(restored[LIGHT_AT], RADIANCE, rtol=0.03)
+    away = lights.zone == 0
+    np.testing.assert_array_equal(restored[away], merged[away])
+    # At 1.8 it is below what fills the sensor; it stays as bright as its sharp slice shows it.
+    stack = slices(scene(np.array([1.8, 1.7, 1.6], np.float32)))
+    restored, merged, lights = merged_with_lights(stack)
+    assert len(lights) == 0
+    np.testing.assert_array_equal(restored, merged)
+    np.testing.assert_allclose(merged[LIGHT_AT], stack[SHARP_SLICE][LIGHT_AT], rtol=0.05)
+
+
+@pytest.mark.parametrize(("pixel", "expected"), [
+    ((2.0, 1.0, 1.6), (2.0, 2.0, 2.0)),  # all full: white, not magenta
+    ((1.5, 1.0, 1.2), (1.5, 1.5, 1.2)),  # green is full: at least as bright as red
+    ((2.0, 0.3, 0.1), (2.0, 0.3, 0.1)),  # a red light stays red
+    ((0.9, 0.9, 0.9), (0.9, 0.9, 0.9)),  # below the ceiling nothing changes
+])  # fmt: skip
+def test_full_channels_do_not_take_the_tint_of_the_white_balance(pixel: tuple[float, ...], expected: tuple[float, ...]) -> None:
+    result = neutral_where_full(np.full((2, 2, 3), pixel, np.float32), (2.0, 1.0, 1.6))
+    np.testing.assert_allclose(result[0, 0], expected, rtol=1e-6)
