@@ -6,7 +6,7 @@
 OUT is a data set with a manifest (`mrbokeh.stacks.focal_stack_dataset`): OUT/SCENE/view_NN/ are focal stacks with all-in-focus picture and
 depth, OUT/lens.json is the lens. Finished files are kept, so an interrupted run goes on where it stopped; `--scenes` gives machines a
 share of the work each. With --pull OUT.pull/ becomes one test view at many focus distances, to see whether blur changes smoothly.
-It needs Mitsuba 3 (`pip install 'mrbokeh[datasets]'`) and LLVM's library (Debian: libllvm19).
+It needs Mitsuba 3 (`pip install -e '.[datasets]'`) and LLVM's library (Debian: libllvm19).
 """
 
 from collections.abc import Iterator

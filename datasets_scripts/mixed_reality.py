@@ -5,7 +5,7 @@
 The object, a ball in a hoop, a box and leaves, hangs behind a fence or leaves and before everything else. OUT/SCENE_SEED/view_NN/ holds
 meta.json (lens, camera, openings, conventions), scene/all_in_focus.exr, scene/depth.exr, scene/OPENING_FOCUS.exr (the photographs),
 object.exr (sharp, RGBA and Z), both/OPENING_FOCUS.exr (the truth) and sheet.png. Finished files are kept, so an interrupted run goes on
-where it stopped. It needs Mitsuba 3 (`pip install 'mrbokeh[datasets]'`) and LLVM's library (Debian: libllvm19).
+where it stopped. It needs Mitsuba 3 (`pip install -e '.[datasets]'`) and LLVM's library (Debian: libllvm19).
 """
 
 from collections.abc import Iterator

@@ -4,7 +4,7 @@
 
 OUT/SCENE_SEED/view_NN/ holds meta.json (lens, camera, openings, conventions), all_in_focus.exr, depth.exr, layers/NN.exr where a
 thin foreground hides what is behind it, truth/OPENING_FOCUS.exr and sheet.png. Finished files are kept, so an interrupted run goes
-on where it stopped. It needs Mitsuba 3 (`pip install 'mrbokeh[datasets]'`) and LLVM's library (Debian: libllvm19).
+on where it stopped. It needs Mitsuba 3 (`pip install -e '.[datasets]'`) and LLVM's library (Debian: libllvm19).
 """
 
 from functools import partial

@@ -44,7 +44,7 @@ class SubCommand(NamedTuple):
 
 SUB_COMMANDS = {
     "capture": SubCommand("capture.cli", "Photographs at many focus distances become an all-in-focus image with depth."),
-    "train": SubCommand("training.cli", "Focal stacks become a network that blurs like this very lens."),
+    "train": SubCommand("training.cli", "Train a network that reproduces the blur of one lens."),
     "lens": SubCommand("mrbokeh.commands.lens", "Make, inspect and draw lens files and banks of PSFs."),
     "render": SubCommand("mrbokeh.commands.render", "Blur layers as a lens does."),
     "composite": SubCommand("mrbokeh.commands.composite", "Put virtual objects into a photograph."),
@@ -55,7 +55,7 @@ SUB_COMMANDS = {
     "track": SubCommand("mrbokeh.commands.track", "The camera of every frame of a clip, and its files."),
     "viewfinder": SubCommand("viewfinder.cli", "Stream a camera with virtual objects in it to a browser."),
     "blender-addon": SubCommand("mrbokeh.commands.blender_addon", "Write the add-on that exports scenes from Blender."),
-    "demo": SubCommand("mrbokeh.commands.demo", "The whole way on shipped photographs, with a report."),
+    "demo": SubCommand("mrbokeh.commands.demo", "The whole pipeline on shipped photographs, with a report."),
     "doctor": SubCommand("mrbokeh.commands.doctor", "What is installed, what is missing, and what it would enable."),
 }
 

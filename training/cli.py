@@ -7,7 +7,7 @@ from training.commands.evaluate import evaluate_command
 from training.commands.export import export_command
 from training.commands.fit import fit_command
 
-app = typer.Typer(no_args_is_help=True, help="Focal stacks become a network that blurs like this very lens.")
+app = typer.Typer(no_args_is_help=True, help="Train a network that reproduces the blur of one lens.")
 app.command("fit")(fit_command)
 app.command("export")(export_command)
 app.command("evaluate")(evaluate_command)

@@ -1,4 +1,6 @@
-"""`mrbokeh capture merge`: registered slices, all-in-focus picture and depth for every stack of a scene."""
+"""`mrbokeh capture merge`: registered slices, all-in-focus picture and depth for every stack of a scene.
+
+`depth_from_focus` chooses the sharpest slice at each pixel."""
 
 import shutil
 from collections.abc import Sequence

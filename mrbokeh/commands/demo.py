@@ -1,4 +1,4 @@
-"""`mrbokeh demo`: the whole way on shipped photographs, with a report."""
+"""`mrbokeh demo`: the whole pipeline on shipped photographs, with a report."""
 
 from pathlib import Path
 from typing import Annotated

@@ -70,7 +70,7 @@ class Part:
 
 
 def coc_px_of(layer: Layer, lens: Lens) -> Plane:
-    """Return signed diameters of all pixels; a pixel that covers nothing is in focus, so that it has no say."""
+    """Return signed diameters of all pixels; a pixel that covers nothing is in focus, so that it is ignored."""
     covered = layer.alpha > 0
     if not (covered <= (layer.depth_m > 0)).all():
         raise InputError("every visible pixel needs a finite circle of confusion: depth must be positive (or inf), not 0 or NaN")

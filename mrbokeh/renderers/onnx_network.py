@@ -1,4 +1,4 @@
-"""A trained network (.onnx) as a Renderer, and the facts that its file states about itself (JSON in its metadata, contract 2).
+"""A trained network (.onnx) as a Renderer, and the facts that its file states about itself (JSON in its metadata).
 
 The graph takes `rgb` (B, 3, H, W) linear radiance and `coc_px` (B, 1, H, W) signed diameters and gives `blurred` (B, 3, H, W);
 tiles, the sign of the circle of confusion and the range of the network are handled in the graph. If its facts say so it also

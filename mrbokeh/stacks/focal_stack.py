@@ -1,4 +1,4 @@
-"""FocalStack: one viewpoint photographed at many focus distances, and the folder that holds it (contract 1).
+"""FocalStack: one viewpoint photographed at many focus distances, and the folder that holds it.
 
 Pictures are stored in linear white-balanced camera RGB (1.0 is the raw white of green); `rec709_from_camera` leads from
 there to Rec.709, and is None where the pictures are Rec.709 already (JPEG, EXR). Methods named camera_rgb give what is stored.

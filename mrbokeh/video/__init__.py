@@ -1,7 +1,6 @@
 """Video clips: frames decoded, encoded, joined, with their colour, alpha, sound and times.
 
-picture_source   PictureSource: frames of a video or of numbered pictures, any stretch of them; open_source
-video_source     VideoSource: frames of a video by their number; FrameIndex
+picture_source   PictureSource: frames of a video or of numbered pictures, any stretch of them, by number; open_source
 image_sequence   ImageSequence: numbered pictures (frames.%04d.exr)
 clip             frames of a video decoded one after the other; VideoInfo
 frames, color    stored frames to linear light and back

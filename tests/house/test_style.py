@@ -102,6 +102,18 @@ def test_pages_name_files_and_modules_that_exist() -> None:
     assert not missing
 
 
+def test_lists_of_packages_name_modules_that_exist() -> None:
+    """Lines such as "lights, retouch   what they do" in the docstring of an `__init__.py` name modules or folders beside it."""
+    missing = list[str]()
+    for path in (path for path in FILES if path.name == "__init__.py"):
+        text = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8"))) or ""
+        listed = re.findall(r"^ *([a-z][a-z0-9_./]*(?:, [a-z][a-z0-9_./]*)*)  +\S", text, re.MULTILINE)
+        names = [name.strip("/").replace(".", "/") for line in listed for name in line.split(", ")]
+        beside = [(path.parent / name, path.parent / f"{name}.py", path.parent / f"_{name}.py") for name in names]
+        missing += [f"{path}: {each[0].name}" for each in beside if not any(file.exists() for file in each)]
+    assert not missing
+
+
 def is_module(name: str) -> bool:
     path = ROOT.joinpath(*name.split("."))
     return path.with_suffix(".py").is_file() or path.is_dir()

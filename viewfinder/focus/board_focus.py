@@ -1,4 +1,4 @@
-"""BlurOfBoardFocus: the focus of a lens that tells nobody, solved about once a second from how blurred the tracked board is.
+"""BlurOfBoardFocus: the focus of a lens that does not report it, solved about once a second from how blurred the tracked board is.
 
 FollowingOptics gives it the lens and the f-number that the page was told last. Solved is c = k |1/d_f - 1/z| (Lens.coc_px) over many
 edges of known depth. One depth leaves two answers, one nearer and one farther than it. Edges at several depths tell them apart: towards

@@ -2,9 +2,8 @@
 
 What lies where (scene files, staged scenes and shadows are mrbokeh.scene.staging):
     overlay_source             OverlaySource: the protocol of what lies over the picture; its status
-    stage                      Stage: what the compositing thread calls; how a lost track fades
+    stage                      Stage: what the compositing thread calls; how a lost track fades; the thread that draws, and how finely
     stage_setup                one version of the scene with its renderers; what changed on disk
-    drawing_thread             the thread that draws, and how finely
     drawing                    Drawing: the blurred layer with the depth, camera and lens that it was drawn for; when it is too old
     reprojection               the depth of a blurred layer, and Drawing -> Overlay at the newest pose (late reprojection)
     occlusion                  real things that hide virtual ones

@@ -6,8 +6,8 @@ filmed = FilmedScene(staged.scene_at, track.camera_at, ShutterTiming(frame_rate=
 layer = moving_layer(renderer, filmed, time_s)
 
 filmed_scene    FilmedScene: scene and camera by time; ShutterTiming: when which row is exposed
-paths           Paths of the surfaces seen at every pixel while the shutter is open
-moving_layer    one picture with motion channels, or an accumulation if paths are bent; shadows; rolling shutter
+moving_layer    Paths of the surfaces seen at every pixel while the shutter is open;
+                one picture with motion channels, or an accumulation if paths are bent; shadows; rolling shutter
 """
 
 from mrbokeh.scene.moving_layers.filmed_scene import FilmedScene, ShutterTiming
