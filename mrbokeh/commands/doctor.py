@@ -55,14 +55,17 @@ PROGRAMS = (
     ("nvidia-smi", "training and rendering on an NVIDIA GPU", "install the GPU driver; everything works without one, slower"),
 )
 DATA = Path(__file__).resolve().parents[1] / "demo_data"
-_TRUTH, _ALIEN, _STACK = DATA / "raw_stack" / "truth" / "view_0", DATA / "objects" / "alien.glb", Path("scene") / "pcb_oblique"
-_SHARP = f"--rgb {_TRUTH / 'all_in_focus.exr'} --depth {_TRUTH / 'depth.exr'} --lens lens.json --focus-at 100,100".split()
-_PUT_IN = f"--object {_ALIEN} --at-pixel 100,150 --height 60px --shadow 0.5".split()
+_TRUTH, _STACK = DATA / "raw_stack" / "truth" / "view_0", Path("scene") / "pcb_oblique"
+_BLUR = ("--depth", str(_TRUTH / "depth.exr"), "--lens", "lens.json")
+_PUT_IN = ("--object", str(DATA / "objects" / "alien.glb"), "--at-pixel", "100,150", "--height", "60px", "--shadow", "0.5")
 WORK = (
     (
         ("lens", "new", "lens.json", "--focal-length", "50", "--f-number", "1.8", "--focus", "0.8"),
-        *(("render", *_SHARP, "--method", method, "--out", f"{method}.exr") for method in ("polygon", "laplacian", "low-rank", "scatter")),
-        *(("transfer", str(_TRUTH / "all_in_focus.exr"), *_SHARP[2:6], "--focus", "0.8", "--out", "transferred.png"),),
+        *(
+            ("render", "--rgb", str(_TRUTH / "all_in_focus.exr"), *_BLUR, "--method", method, "--out", f"{method}.exr")
+            for method in ("polygon", "laplacian", "low-rank", "scatter")
+        ),
+        ("transfer", str(_TRUTH / "all_in_focus.exr"), *_BLUR, "--focus", "0.8", "--out", "transferred.png"),
     ),
     (
         ("capture", "process", str(DATA / "pcb_oblique"), "--max-width", "320", "--out", "scene"),
@@ -86,14 +89,17 @@ def doctor(
     """
     if compile_all:
         compile_kernels()
+        return
     table = Table(title=f"mrbokeh {__version__} on Python {platform.python_version()}, {platform.machine()}, {os.cpu_count()} cores")
-    for column in ("what", "found", "enables", "if you want it"):
+    for column in ("what", "found", "enables"):
         table.add_column(column)
-    for component in findings():
-        table.add_row(
-            component.name, component.found or "[yellow]missing[/]", component.enables, "" if component.found else escape(component.remedy)
-        )
+    components = findings()
+    for component in components:
+        table.add_row(component.name, escape(component.found or "") or "[yellow]missing[/]", component.enables)
     Console().print(table)
+    for component in components:
+        if not component.found:
+            Console().print(f"{component.name}: {component.remedy}", markup=False, highlight=False, soft_wrap=True)
 
 
 def findings() -> list[Component]:

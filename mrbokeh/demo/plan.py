@@ -76,6 +76,12 @@ def demo_stages(out: Path, minutes: float) -> list[Stage]:
     ]
 
 
+def quick_stages(out: Path) -> list[Stage]:
+    """Return the stages of the quick demo: the photographs of a circuit board merged, an object in two of them, no network."""
+    merged = merged_stages(out, "photographs of a circuit board", DATA / "pcb_oblique", BOARD_VIEWS, ["--max-width", "512"])
+    return [*merged, *(_composite(out, out / "scene" / BOARD_VIEWS[0], placement, "lens") for placement in BOARD)]
+
+
 def _network(folder: Path, minutes: float, held_out: str | None) -> list[Stage]:
     scene, run, network = folder / "scene", folder / "network", folder / "lens.onnx"
     fit = ["train", "fit", str(scene), "--preset", "demo", "--minutes", f"{minutes:g}", "--out", str(run)]
@@ -109,7 +115,7 @@ def _composites(folder: Path, stack: Path, placements: tuple[Placement, ...]) ->
 
 def _composite(folder: Path, stack: Path, placement: Placement, renderer: str) -> Stage:
     picture = folder / f"{placement.name}_{renderer}.png"
-    blur = ("--lens", str(folder / "lens.onnx")) if renderer == "network" else ("--renderer", "scatter")
+    blur = {"network": ("--lens", str(folder / "lens.onnx")), "reference": ("--renderer", "scatter"), "lens": ()}[renderer]
     arguments = (
         *("composite", str(stack), "--slice", str(placement.slice_index), "--object", str(DATA / "objects" / placement.glb)),
         *("--at-pixel", placement.at_pixel, "--height", f"{placement.height_m:g}", "--turn", f"{placement.turn_deg:g}"),

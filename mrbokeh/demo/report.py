@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from mrbokeh import __version__
-from mrbokeh.demo.plan import BOARD, DATA, DESK, HELD_OUT_VIEW, VIEWS, Placement
+from mrbokeh.demo.plan import BOARD, BOARD_VIEWS, DATA, DESK, HELD_OUT_VIEW, VIEWS, Placement
 from mrbokeh.demo.stages import Done
 from mrbokeh.figures.stack_pictures import depth_picture, write_stack_pictures
 from mrbokeh.images.color import srgb_to_linear
 from mrbokeh.images.exr_io import read_exr
-from mrbokeh.images.image_io import read_image, read_layer, write_preview
+from mrbokeh.images.image_io import read_image, read_layer, write_image, write_preview
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.optics.camera import Camera, camera_from_json
 from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack
@@ -173,7 +173,7 @@ def network_measurements(evaluation_folder: Path) -> list[Measurement]:
     ]
 
 
-PACKAGES = ("numpy", "opencv-python-headless", "OpenEXR", "rawpy", "pycolmap", "torch", "onnxruntime", "embreex", "numba")
+PACKAGES = ("numpy", "opencv-contrib-python-headless", "OpenEXR", "rawpy", "pycolmap", "torch", "onnxruntime", "embreex", "numba")
 
 Plane = Float[np.ndarray, "height width"]
 Rgb = Float32[np.ndarray, "height width 3"]
@@ -188,6 +188,29 @@ def write_story(out: Path, done: Sequence[Done]) -> list[Measurement]:
     write_json(out / "numbers.json", [vars(each) for each in measurements])
     write_report(out / "report.html", measurements, sections, done)
     return measurements
+
+
+def write_quick_story(out: Path, done: Sequence[Done]) -> None:
+    """Write quick.html into `out`: slices before and after an object was put in, the merged picture and its depth."""
+    stack, page = read_focal_stack(out / "quick" / "scene" / BOARD_VIEWS[0]), out / "quick.html"
+    blocks = []
+    for each in BOARD:
+        before = out / "pictures" / f"quick_before_{each.slice_index}.png"
+        write_image(before, stack.slice_rgb(each.slice_index))
+        blocks += [
+            figure(before, page, f"the photograph: slice {each.slice_index} of {len(stack)}"),
+            figure(out / "quick" / f"{each.name}_lens.png", page, "with a rendered alien, with the blur and the occlusion of this place"),
+        ]
+    merged = [figure(path, page, caption) for path, caption in write_stack_pictures(stack, out / "pictures")[-2:]]
+    first = "A circuit board, photographed at seven focus distances. The alien stands on the same spot in two of the photographs."
+    how = "What made it possible: the slices merged into one picture that is sharp everywhere, and its depth, found from focus."
+    body = [
+        "<h1>mrbokeh: a rendered object with the blur of the lens</h1>",
+        section("Before and after", first, blocks),
+        section("From the focus stack", how, merged),
+        section("Stages", "Every stage is a command that you can run yourself.", [_stage_table(done)]),
+    ]
+    write_page(page, "mrbokeh demo --quick", body)
 
 
 def write_report(path: Path, measurements: Sequence[Measurement], sections: Sequence[str], done: Sequence[Done]) -> None:

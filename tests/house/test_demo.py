@@ -26,7 +26,7 @@ from mrbokeh.demo.report import (
 )
 from mrbokeh.demo.stages import Record, Stage, must_be_anew, read_record, run_stages, write_record
 from mrbokeh.images.exr_io import ExrPart, write_exr
-from mrbokeh.images.image_io import write_image, write_layer
+from mrbokeh.images.image_io import read_image, write_image, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.camera import Camera
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
@@ -111,6 +111,19 @@ def test_every_stage_of_the_plan_names_its_outputs(tmp_path: Path) -> None:
     assert all(stage.outputs and str(tmp_path) in stage.command_line for stage in planned)
     capture = {("capture", name) for name in ("ingest", "merge", "poses", "scale", "depth", "report")}
     assert capture | {("train", "fit"), ("train", "export"), ("train", "evaluate")} <= {stage.arguments[:2] for stage in planned}
+
+
+def test_the_quick_demo_shows_an_object_before_and_after_and_is_not_done_twice(tmp_path: Path) -> None:
+    """The first command that people try, whole: the page names pictures that exist, and the object changes the photograph where it stands."""
+    for again in (False, True):
+        done = mrbokeh("demo", "--quick", "--out", tmp_path)
+        assert done.returncode == 0 and done.stdout.count("done already") == (4 if again else 0), done.stdout + done.stderr
+    page = (tmp_path / "quick.html").read_text()
+    pictures = [tmp_path / name for name in re.findall(r'img src="([^"]+)"', page)]
+    assert len(pictures) == 6 and all(path.stat().st_size > 0 for path in pictures)
+    for before, after in (pictures[:2], pictures[2:4]):
+        difference = np.abs(read_image(before) - read_image(after)).sum(axis=2)
+        assert difference[200:250, 170:200].mean() > 0.05 and difference[:, 400:].max() < 0.01, "there, and only there"
 
 
 def test_merging_again_takes_everything_after_it_again(tmp_path: Path) -> None:
