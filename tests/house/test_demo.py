@@ -114,7 +114,7 @@ def test_every_stage_of_the_plan_names_its_outputs(tmp_path: Path) -> None:
 
 
 def test_the_quick_demo_shows_an_object_before_and_after_and_is_not_done_twice(tmp_path: Path) -> None:
-    """The first command that people try, whole: the page names pictures that exist, and the object changes the photograph where it stands."""
+    """The first command people try, whole: its page names pictures that exist, and the object changes the photograph where it stands."""
     for again in (False, True):
         done = mrbokeh("demo", "--quick", "--out", tmp_path)
         assert done.returncode == 0 and done.stdout.count("done already") == (4 if again else 0), done.stdout + done.stderr
