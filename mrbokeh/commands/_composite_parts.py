@@ -3,7 +3,7 @@ beside it.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -24,17 +24,28 @@ from mrbokeh.scene.staging.scene_description import SceneDescription
 from mrbokeh.stacks.capture_bundle import CaptureBundle
 from mrbokeh.stacks.guessed_metres import GUESSED
 from mrbokeh.system.atomic_files import require_safe_outputs
+from mrbokeh.system.console import flag
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.typed_numbers import numbers_in
 from mrbokeh.video.image_sequence import read_numbers
 
 
 def plate_by(
-    photo: Path, options: PlateOptions, colour: ColourOptions, bundle: CaptureBundle | None, *, lens: Lens | None, focus_m: float | None
+    photo: Path,
+    options: PlateOptions,
+    colour: ColourOptions,
+    bundle: CaptureBundle | None,
+    *,
+    lens: Lens | None,
+    focus_m: float | None,
+    facts: Mapping[str, float],
 ) -> Plate:
-    """Open the photograph, slice or bundle, with depth and matte from their files. lens, focus_m: in place of its own."""
+    """Open the photograph, slice or bundle, with depth and matte from their files. lens, focus_m, facts: in place of its own."""
+    if facts and photo.is_dir():
+        told = " and ".join(flag(name) for name in facts)
+        raise InputError(f"{told} would change the lens that {photo} states itself: leave that out, or give --lens LENS.json")
     if bundle is None:
-        plate = open_plate(photo, 0 if options.all_slices else options.slice_, lens, focus_m)
+        plate = open_plate(photo, 0 if options.all_slices else options.slice_, lens, focus_m, facts)
     else:
         plate = bundle_plate(bundle, lens, focus_m)
     if colour.of_plate is not None:

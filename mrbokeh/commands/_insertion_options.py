@@ -1,6 +1,6 @@
 """Options that `mrbokeh composite` and `mrbokeh video` have in common: what is inserted, how it is rendered, colour spaces, look."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,6 +10,8 @@ from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
     from mrbokeh.images.color_management import NamedSpace
+    from mrbokeh.optics.lens import Lens
+    from mrbokeh.renderers.base import Renderer
     from mrbokeh.scene.moving_layers import ShutterTiming
     from mrbokeh.scene.staging.filming import Filming
 
@@ -111,6 +113,31 @@ class RenderingOptions:
 
         distortion = read_distortion(self.distortion)
         return Filming(self.scene_renderer, self.samples, catches=self.catch, distortion=distortion, shutter=shutter)
+
+
+@dataclass(frozen=True)
+class LensFacts:
+    """Facts of the lens in place of those of --lens or of the photograph; None leaves them."""
+
+    PANEL = LENS
+
+    focal_length_mm: Annotated[float | None, typer.Option("--focal-length", metavar="MM", help="Focal length in mm.")] = None
+    f_number: Annotated[float | None, typer.Option(metavar="N", help="f-number.")] = None
+    sensor_width_mm: Annotated[float | None, typer.Option("--sensor-width", metavar="MM", help="Width of the sensor in mm.")] = None
+
+    @property
+    def told(self) -> dict[str, float]:
+        """Facts that were given, by their names in `Lens` and `Photograph`."""
+        return {name: value for name, value in vars(self).items() if value is not None}
+
+    def on(self, lens: "Lens | None", renderer: "Renderer | None" = None) -> "Lens":
+        """Return the lens with these facts; without one the lens of `Lens.default`. Raises InputError if a network brought the lens."""
+        from mrbokeh.optics.lens import Lens
+        from mrbokeh.renderers.onnx_network import OnnxNetwork
+
+        if self.told and isinstance(renderer, OnnxNetwork):
+            raise InputError("a network blurs as the lens that it learned: leave --focal-length, --f-number and --sensor-width out")
+        return replace(Lens.default() if lens is None else lens, **self.told)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)

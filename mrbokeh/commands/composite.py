@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from mrbokeh.commands import _composite_options as options
-from mrbokeh.commands._insertion_options import ColourOptions, LookGroup, VirtualOptions
+from mrbokeh.commands._insertion_options import ColourOptions, LensFacts, LookGroup, VirtualOptions
 from mrbokeh.commands._option_groups import grouped
 
 if TYPE_CHECKING:
@@ -28,6 +28,7 @@ def composite(
     rendering: options.RenderingOptions,
     look: LookGroup,
     optics: options.LensOptions,
+    facts: LensFacts,
     out: options.OutOption,
     colour: ColourOptions,
     result: options.ResultOptions,
@@ -63,7 +64,8 @@ def composite(
     check_outputs(out, result, read, all_slices=taken.all_slices)
     bundle = read_bundle(photo) if is_bundle(photo) else None
     lens, renderer = lens_and_renderer(optics.lens, optics.renderer or (bundle.renderer if bundle and optics.lens is None else None))
-    plate = plate_by(photo, taken, colour, bundle, lens=lens, focus_m=optics.focus)
+    lens = lens if lens is None or not facts.told else facts.on(lens, renderer)
+    plate = plate_by(photo, taken, colour, bundle, lens=lens, focus_m=optics.focus, facts={} if lens else facts.told)
     _tell_metres(photo, virtual, standing, lens)
     layers_for = layers_by(virtual, standing, rendering, plate, bundle)
     mode = virtual.mode or best_mode(plate)

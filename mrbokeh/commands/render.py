@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from mrbokeh.commands._insertion_options import LensFacts
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.commands._render_inputs import FocusOptions, SharpOptions
 from mrbokeh.images.layer import Layer
@@ -43,16 +44,21 @@ class ResultOptions:
 @app.command()
 @grouped
 def render(
-    lens: Annotated[Path, typer.Option(help="Lens file (LENS.json), see `mrbokeh lens new`.")],
     out: Annotated[Path, typer.Option(help="Where the result goes: .exr, or .png, .tif, .jpg (over black).")],
     given: SharpOptions,
     blur: BlurOptions,
+    facts: LensFacts,
     focus: FocusOptions,
     result: ResultOptions,
+    lens: Annotated[
+        Path | None, typer.Option(help="Lens file (LENS.json), see `mrbokeh lens new`. Default: 50 mm f/1.8, focused at infinity.")
+    ] = None,
 ) -> None:
     """Blur a picture with depth, or layers, as a lens does. Layers lie in front of the picture.
 
     Example: mrbokeh render --rgb aif.exr --depth z.exr --lens lens.json --focus-at 640,360 --out blurred.exr
+
+    Example: mrbokeh render --rgb aif.exr --depth z.exr --focal-length 85 --f-number 1.4 --focus 2 --out portrait.png
     """
     from mrbokeh.commands._render_inputs import focused, read_sharp, reconstructed
     from mrbokeh.images.image_io import INTEGER_SUFFIXES, require_suffix
@@ -69,7 +75,7 @@ def render(
     if given.samples is not None and (given.shows_pictures or focus.is_given):
         raise InputError("--samples holds all there is to see, with its focus and its motion: leave out pictures, layers, motion and focus")
     sharp = {} if given.samples is not None else read_sharp(given)
-    used = focused(read_lens(lens), sharp, focus)
+    used = focused(facts.on(None if lens is None else read_lens(lens)), sharp, focus)
     with working("rendering (the first time on a machine it takes a minute to compile)"):
         renderer = chosen_renderer(blur.method, blur.psf, threads=blur.threads, layering=Layering(slices=blur.slices), device=blur.device)
         if given.samples is None:
@@ -77,7 +83,7 @@ def render(
         else:
             blurred = reconstructed(renderer, blur.method, given.samples, used)
     _write(out, blurred, result.alpha_out)
-    typer.echo(f"wrote {out}")
+    typer.echo(f"wrote {out} ({used.told})")
 
 
 def _write(out: Path, blurred: Layer, alpha_out: bool) -> None:

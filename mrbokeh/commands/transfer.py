@@ -14,6 +14,7 @@ import numpy as np
 import typer
 from jaxtyping import Float32
 
+from mrbokeh.commands._insertion_options import LensFacts
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.depth.depth_map import DepthSettings, parse_known, parse_near_far, parse_stereo
 from mrbokeh.optics.lens import Lens
@@ -106,12 +107,13 @@ def transfer(
     photo: Annotated[
         Path, typer.Argument(help="All-in-focus photograph, or a merged focal stack; of a phone's JPEG with depth the sharp original.")
     ],
-    lens: Annotated[Path, typer.Option(help="LENS.json, or LENS.onnx to blur with a trained network.")],
     out: Annotated[Path, typer.Option(help="A picture, a film (.mov, .mp4, .mkv: a focus pull), or a folder (a focal stack).")],
     depth: DepthOptions,
     focusing: FocusOptions,
     blur: BlurOptions,
+    facts: LensFacts,
     result: ResultOptions,
+    lens: Annotated[Path | None, typer.Option(help="LENS.json, or LENS.onnx to blur with a trained network. Default: 50 mm f/1.8.")] = None,
 ) -> None:
     """Blur a sharp photograph with depth as another lens would.
 
@@ -127,11 +129,10 @@ def transfer(
     _require_outputs(out, result, (photo, lens, depth.depth))
     settings = depth.settings
     given, blurs = lens_and_renderer(lens, blur.renderer)
-    assert given is not None
     sharp = open_sharp(photo, depth.depth, settings)
     for note in dict.fromkeys(filter(None, (metres_note(sharp.stack) if sharp.stack else "", note_of_file(depth.depth)))):
         typer.echo(note)
-    held = lens_for_photograph(given, sharp.photograph, photo)
+    held = lens_for_photograph(facts.on(given, blurs), sharp.photograph, photo)
     chosen = seen_like(held, sharp.photograph, photo) if blur.same_view else held
     distances_m = _distances(chosen, sharp, focusing)
     check_out(out, len(distances_m))
@@ -148,7 +149,8 @@ def transfer(
     if result.save_depth is not None:
         _write_depth(result.save_depth, sharp)
     coc_px = max(float(np.abs(chosen.focused_at(each).coc_px(sharp.depth.depth_m, rgb.shape[1])).max()) for each in distances_m)
-    typer.echo(f"wrote {out} (depth: {sharp.depth.note}; largest circle of confusion {coc_px:.1f} px)")
+    focus = "" if len(distances_m) > 1 else f"{chosen.focused_at(distances_m[0]).told}; "
+    typer.echo(f"wrote {out} ({focus}depth: {sharp.depth.note}; largest circle of confusion {coc_px:.1f} px)")
 
 
 def _require_outputs(out: Path, result: ResultOptions, inputs: tuple[Path | None, ...]) -> None:

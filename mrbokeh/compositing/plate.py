@@ -9,7 +9,7 @@ Every insertion owes these (tests/compositing/test_compositing.py asks all of th
 - linearity: twice the light in plate and layers gives twice the picture.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -81,10 +81,17 @@ class Plate:
         return pixels / self.camera.focal_px[1] * depth_m
 
 
-def open_plate(photo: Path, slice_index: int | None = None, lens: Lens | None = None, focus_m: float | None = None) -> Plate:
+def open_plate(
+    photo: Path,
+    slice_index: int | None = None,
+    lens: Lens | None = None,
+    focus_m: float | None = None,
+    facts: Mapping[str, float] | None = None,
+) -> Plate:
     """Open a photograph with a lens, or a slice of a merged focal stack, which brings its own lens and depth.
 
     lens: replaces that of the photograph's metadata or of the stack, but keeps the focus of a slice. focus_m replaces all.
+    facts: of a photograph's lens, in place of what its metadata state or lack (`Photograph.stating`).
     """
     if photo.is_dir() and not (photo / FILE_NAME).is_file():
         raise InputError(
@@ -95,7 +102,7 @@ def open_plate(photo: Path, slice_index: int | None = None, lens: Lens | None = 
         return _stack_plate(photo, slice_index, lens, focus_m)
     if slice_index is not None:
         raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}: leave it out")
-    photograph = read_photograph(photo)
+    photograph = read_photograph(photo).stating(facts or {})
     lens = photograph.lens(photo, focus_m) if lens is None else lens_for_photograph(lens, photograph, photo)
     focused = lens if focus_m is None else lens.focused_at(focus_m)
     return with_own_alpha(plate_of(photograph.rgb, focused), photo, read_alpha(photo, photograph.orientation))

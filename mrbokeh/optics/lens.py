@@ -59,10 +59,21 @@ class Lens:
         if not abs(self.petzval_radius_mm) > 0:
             raise InputError(f"petzval_radius_mm must be a length other than 0 (inf: a flat field), got {self.petzval_radius_mm}")
 
+    @classmethod
+    def default(cls) -> "Lens":
+        """Return the lens of commands that are told nothing else: 50 mm f/1.8 with a round opening, focused at infinity."""
+        return cls(50.0, 1.8)
+
     @property
     def has_flat_focus(self) -> bool:
         """Return whether one depth is in focus over the whole picture."""
         return not any(self.tilt_rad) and bool(np.isinf(self.petzval_radius_mm))
+
+    @property
+    def told(self) -> str:
+        """Describe the lens in a few words, such as "50 mm f/1.8 focused at 1.5 m, sensor 36 mm wide"."""
+        focus = "infinity" if math.isinf(self.focus_distance_m) else f"{self.focus_distance_m:.3g} m"
+        return f"{self.focal_length_mm:.4g} mm f/{self.f_number:.3g} focused at {focus}, sensor {self.sensor_width_mm:.4g} mm wide"
 
     @property
     def aperture_diameter_mm(self) -> float:

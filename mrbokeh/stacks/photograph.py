@@ -11,6 +11,7 @@ for clips, which videos turn by their metadata and numbered photographs by EXIF.
 """
 
 import logging
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
@@ -23,6 +24,12 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 
 _log = logging.getLogger(__name__)
+_OPTION_OF = {
+    "focal length": "--focal-length MM",
+    "f-number": "--f-number N",
+    "sensor width": "--sensor-width MM",
+    "focus distance": "--focus METRES",
+}
 _READER = "capture.photos.developing"
 
 
@@ -50,6 +57,14 @@ class Photograph:
         """Return the counter-clockwise quarter turns that brought the stored picture upright."""
         return quarter_turns(self.orientation)
 
+    def stating(self, facts: Mapping[str, float]) -> "Photograph":
+        """Return the photograph as if its file stated these facts: focal_length_mm, f_number, sensor_width_mm of the camera held level."""
+        told = dict(facts)
+        if "sensor_width_mm" in told and self.quarter_turns % 2:
+            width_px, height_px = self.cut_from_px or (self.rgb.shape[1], self.rgb.shape[0])
+            told["sensor_width_mm"] *= width_px / height_px
+        return replace(self, **told)  # type: ignore[arg-type]
+
     def lens(self, path: Path, focus_m: float | None = None) -> Lens:
         """Return the lens with a round opening. focus_m replaces the file's own focus. Raises InputError if parts are unknown."""
         focus = self.focus_distance_m if focus_m is None else focus_m
@@ -62,8 +77,8 @@ class Photograph:
         missing = [name for name, value in told.items() if value is None]
         if self.focal_length_mm is None or self.f_number is None or self.sensor_width_mm is None or focus is None:
             raise InputError(
-                f"{path} does not tell its lens (unknown: {', '.join(missing)}): give --lens LENS.json (see `mrbokeh lens new`)"
-                + (" or --focus METRES" if missing == ["focus distance"] else "")
+                f"{path} does not tell its lens (unknown: {', '.join(missing)}): give "
+                f"{' '.join(_OPTION_OF[name] for name in missing)}, or --lens LENS.json (see `mrbokeh lens new`)"
             )
         if self.cut_from_px is not None:
             _log.warning(

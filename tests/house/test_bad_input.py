@@ -47,6 +47,11 @@ def replaced(words: tuple[str, ...], option: str, value: str) -> tuple[str, ...]
     ("words", "told"),
     [
         (replaced(RENDER, "--rgb", "loop.exr"), "expected a picture at loop.exr, but it is a link to loop.exr, which leads nowhere"),
+        ((*RENDER, "--f-number", "0"), "positive focal_length_mm, f_number"),
+        (
+            ("composite", "photo.png", "--focus", "1", "--f-number", "2", "--layer", "layer.exr", "--out", "out.exr"),
+            "unknown: focal length, sensor width): give --focal-length MM --sensor-width MM, or --lens",
+        ),
         (replaced(RENDER, "--rgb", "."), "expected a picture at ., but it is a folder"),
         (replaced(RENDER, "--lens", "deep.json"), "brackets lie too deep"),
         (replaced(RENDER, "--depth", "no_depth.exr"), "expected metres above 0 in Z, but the largest is 0"),

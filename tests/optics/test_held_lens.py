@@ -43,6 +43,13 @@ def test_the_lens_file_agrees_with_the_metadata(tmp_path: Path, orientation: int
     assert open_plate(path, lens=UPRIGHT).lens.sensor_width_mm == pytest.approx(width_mm)
 
 
+@pytest.mark.parametrize(("orientation", "width_mm"), [(1, 23.5), (6, 23.5 * 64 / 96)])
+def test_a_stated_sensor_width_is_that_of_the_camera_held_level(tmp_path: Path, orientation: int, width_mm: float) -> None:
+    path = photo(tmp_path / "photo.jpg", (96, 64), orientation)
+    lens = open_plate(path, facts={"sensor_width_mm": 23.5, "f_number": 4.0}).lens
+    assert lens.sensor_width_mm == pytest.approx(width_mm) and (lens.focal_length_mm, lens.f_number) == (50.0, 4.0)
+
+
 def test_an_upright_picture_has_the_blur_of_the_level_one(tmp_path: Path) -> None:
     """The same camera at the same distance: a disc is as many pixels large, however the camera was held."""
     level, upright = (open_plate(photo(tmp_path / f"{each}.jpg", (96, 64), each), lens=LEVEL) for each in (1, 6))

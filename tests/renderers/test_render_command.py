@@ -53,6 +53,17 @@ def run(folder: Path, *arguments: str, out: str = "out.exr") -> Path:
 PICTURE = ("--rgb", "aif.exr", "--depth", "z.exr", "--lens", "lens.json", "--method", "scatter")
 
 
+def test_a_lens_can_be_told_in_options_instead_of_a_file(folder: Path) -> None:
+    """Options go before the file's facts; without a file the lens is 50 mm f/1.8 on 36 mm, with a round opening."""
+    picture = ("--rgb", "aif.exr", "--depth", "z.exr", "--method", "scatter", "--focus", "2")
+    (folder / "round.json").write_text(json.dumps(LENS | {"focal_length_mm": 40, "aperture": {"shape": "disc"}}))
+    by_file = read_image(run(folder, *picture, "--lens", "round.json", "--focal-length", "50"))
+    by_options = read_image(run(folder, *picture, "--sensor-width", "12", out="options.exr"))
+    assert np.array_equal(by_file, by_options)
+    wide = read_image(run(folder, *picture, "--sensor-width", "12", "--f-number", "16", out="wide.exr"))
+    assert psnr(wide, by_options) < 40.0, "the f-number is heard"
+
+
 def test_a_picture_with_depth_is_what_the_library_renders(folder: Path) -> None:
     done = read_exr(run(folder, *PICTURE))[0]
     assert sorted(done.channels) == ["B", "G", "R"]
