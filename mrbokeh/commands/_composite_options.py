@@ -36,7 +36,16 @@ class PlateOptions(shared.NearOptions):
     all_slices: Annotated[bool, typer.Option("--all-slices", help="Put it into every slice of the stack; OUT is a new stack.")] = False
     depth: Annotated[
         Path | None,
-        typer.Option(help="Depth of the photograph: EXR with Z, PNG or TIFF, a phone's JPEG, disparity (.npz) or a depth network (.onnx)."),
+        typer.Option(
+            help="Depth of the photograph: EXR with Z, PNG or TIFF, a phone's JPEG, disparity (.npz) or a depth network (.onnx). Default: "
+            "PHOTO's own."
+        ),
+    ] = None
+    rgb: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="SHARP", help="The photograph all in focus, as of another program: what blurred near things hide is taken from it."
+        ),
     ] = None
     disparity: Annotated[
         str | None, typer.Option(metavar="NEAR:FAR", help="--depth is even in 1/distance, largest number at NEAR, 0 at FAR metres.")

@@ -14,6 +14,7 @@ from mrbokeh.commands._composite_options import LensOptions, ObjectOptions, Plat
 from mrbokeh.commands._insertion_options import ColourOptions, LookGroup, VirtualOptions
 from mrbokeh.compositing.plate import Inserted, Plate, bundle_plate, open_plate, with_depth, with_matte, with_own_alpha
 from mrbokeh.depth.depth_map import DepthSettings, parse_near_far
+from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.alpha_io import HOLDING_ALPHA, alpha_with
 from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.images.image_io import INTEGER_SUFFIXES, require_suffix
@@ -23,6 +24,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.scene.staging.scene_description import SceneDescription
 from mrbokeh.stacks.capture_bundle import CaptureBundle
 from mrbokeh.stacks.guessed_metres import GUESSED
+from mrbokeh.stacks.photograph import read_photograph
 from mrbokeh.system.atomic_files import require_safe_outputs
 from mrbokeh.system.console import flag
 from mrbokeh.system.errors import InputError
@@ -50,9 +52,14 @@ def plate_by(
         plate = bundle_plate(bundle, lens, focus_m)
     if colour.of_plate is not None:
         plate = _from_space(plate, photo, colour.of_plate)
-    if options.depth is not None:
-        near_far_m = None if options.disparity is None else parse_near_far(options.disparity)
-        plate = with_depth(plate, options.depth, DepthSettings(near_far_m, options.depth_scale))
+    near_far_m = None if options.disparity is None else parse_near_far(options.disparity)
+    phone = None if photo.is_dir() else read_phone_photo(photo, None if options.depth else near_far_m)
+    sharp_rgb = read_photograph(options.rgb).rgb if options.rgb else phone.original_rgb if phone else None
+    if sharp_rgb is not None:
+        plate = replace(plate, sharp_rgb=sharp_rgb)
+    source = options.depth or (photo if phone else None)
+    if source is not None:
+        plate = with_depth(plate, source, DepthSettings(near_far_m, options.depth_scale))
     return plate if options.matte is None else with_matte(plate, options.matte)
 
 
@@ -71,7 +78,7 @@ def require_options_of_stacks(
 ) -> None:
     """Raise InputError if an option is given that is of one picture, and that --all-slices would not follow."""
     one_picture = (
-        (taken, ("slice_", "depth", "disparity", "depth_scale", "matte", "near_distance")),
+        (taken, ("slice_", "depth", "rgb", "disparity", "depth_scale", "matte", "near_distance")),
         (optics, ("focus",)),
         (look, tuple(vars(look))),
         (colour, ("input_space", "output_space")),

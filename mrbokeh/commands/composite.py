@@ -58,7 +58,17 @@ def composite(
     from mrbokeh.stacks.capture_bundle import is_bundle, read_bundle
     from mrbokeh.system.console import working
 
-    read = (photo, taken.depth, taken.matte, *virtual.files, standing.object_, standing.environment, rendering.distortion, optics.lens)
+    read = (
+        photo,
+        taken.depth,
+        taken.rgb,
+        taken.matte,
+        *virtual.files,
+        standing.object_,
+        standing.environment,
+        rendering.distortion,
+        optics.lens,
+    )
     if taken.all_slices:
         require_options_of_stacks(taken, optics, look, colour, result)
     check_outputs(out, result, read, all_slices=taken.all_slices)

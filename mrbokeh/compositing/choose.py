@@ -152,6 +152,4 @@ def insertion_of(mode: str, near_m: float | None = None, *, exact_depth: bool = 
 
 def best_mode(plate: Plate) -> str:
     """Return the best mode that the known data of the plate allow."""
-    if plate.near_alpha is not None or (plate.depth_m is not None and plate.sharp_rgb is not None):
-        return "between"
-    return "over" if plate.depth_m is not None else "front"
+    return "front" if plate.near_alpha is None and plate.depth_m is None else "between"

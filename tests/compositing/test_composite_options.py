@@ -8,8 +8,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from mrbokeh import composite
+from mrbokeh.commands._composite_options import PlateOptions
+from mrbokeh.commands._composite_parts import plate_by
+from mrbokeh.commands._insertion_options import ColourOptions
 from mrbokeh.commands.composite import app
+from mrbokeh.compositing.choose import best_mode
 from mrbokeh.demo.plan import DATA
+from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer
 from mrbokeh.images.layer import Layer, flatten
@@ -74,6 +80,23 @@ def test_depth_hides_a_part_and_may_come_as_disparity(files: Path) -> None:
     stated = put_in(files, "--depth", files / "depth.exr", "--mode", "over")
     assert changed(put_in(files, *words), stated).mean() < 0.01
     np.testing.assert_allclose(put_in(files, card="deep.exr"), put_in(files), atol=2e-3)
+
+
+def test_a_sharp_picture_of_the_photograph_gives_what_stands_behind_the_near_edge(files: Path) -> None:
+    """As the same arrays do from Python; without it the edge is put together of the photograph alone."""
+    with_sharp = put_in(files, "--depth", files / "depth.exr", "--rgb", files / "depth.exr")
+    plate, depth_m, card = read_image(files / "photo.exr"), read_layer(files / "depth.exr").depth_m, read_layer(files / "card.exr")
+    by_arrays = composite(plate, card, LENS, depth_m=depth_m, all_in_focus=plate_rgb())
+    np.testing.assert_allclose(with_sharp, by_arrays, atol=2e-3)
+    assert changed(with_sharp, put_in(files, "--depth", files / "depth.exr"))[30:70, 40:56].any()
+
+
+def test_a_phones_photograph_brings_its_depth_and_its_sharp_original(shared_data: Path) -> None:
+    path = shared_data / "rgbd" / "phone_lens_blur_gdepth.jpg"
+    phone, plate = read_phone_photo(path), plate_by(path, PlateOptions(), ColourOptions(), None, lens=LENS, focus_m=None, facts={})
+    assert phone is not None and plate.sharp_rgb is not None and plate.depth_m is not None and best_mode(plate) == "between"
+    np.testing.assert_array_equal(plate.sharp_rgb, phone.original_rgb)
+    assert 12.42 <= plate.depth_m.min() < plate.depth_m.max() <= 390.6, "within Near and Far of the file"
 
 
 def test_a_matte_with_its_distance_does_without_depth(files: Path) -> None:

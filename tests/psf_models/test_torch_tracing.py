@@ -135,5 +135,5 @@ def test_a_device_that_is_not_there_is_a_mistake(tmp_path: Path, monkeypatch: py
     for module in [each for each in sys.modules if each.startswith("mrbokeh.psf_models.torch_tracing")]:
         monkeypatch.delitem(sys.modules, module)
     monkeypatch.setitem(sys.modules, "torch", None)
-    with pytest.raises(MissingExtraError, match=r"mrbokeh\[train\]"):
+    with pytest.raises(MissingExtraError, match=r"pip install .*\[train\]"):
         SimpleLens(device="cpu").kernel(np.array([[3.0, 4.0]]), 1024, 0)

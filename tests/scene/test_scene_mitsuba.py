@@ -282,5 +282,5 @@ class TestSettings:
         with pytest.raises(MissingExtraError, match="pyoidn"):
             MitsubaTracer(denoise=True)
         monkeypatch.setitem(sys.modules, "mitsuba", None)
-        with pytest.raises(MissingExtraError, match=r"mrbokeh\[mitsuba\]"):
+        with pytest.raises(MissingExtraError, match=r"pip install .*\[mitsuba\]"):
             MitsubaTracer()
