@@ -118,15 +118,29 @@ def blur_told(plate: Plate, sharp: Sequence[Layer]) -> str:
         return told
     coc_px = np.abs(lens.coc_px(np.array([seen_m.min(), np.median(seen_m), seen_m.max()]), width_px))
     size = f", {_size_px(sharp)} px" if plate.metres_guessed else ""
-    return (
-        f"{told}; put in at {seen_m.min():.3g} to {seen_m.max():.3g} {unit}{size}, blurred by {coc_px.min():.1f} to {coc_px.max():.1f} px"
-    )
+    far = f"{seen_m.min():.3g} to {seen_m.max():.3g} {unit} from the lens"
+    return f"{told}; put in at {far}{size}, blurred by {coc_px.min():.1f} to {coc_px.max():.1f} px"
 
 
 def _size_px(sharp: Sequence[Layer]) -> str:
     """Width x height of what is put in."""
     rows, columns = np.nonzero(np.maximum.reduce([layer.alpha for layer in sharp]) > 0.5)
     return f"{np.ptp(columns) + 1}x{np.ptp(rows) + 1}"
+
+
+def size_warning(sharp: Sequence[Layer], height: str | None) -> str | None:
+    """Return a warning if what is put in is smaller than a pixel or reaches across the whole picture, which nobody means, else None.
+
+    height: the option --height as typed, which mends it.
+    """
+    alpha = np.maximum.reduce([layer.alpha for layer in sharp])
+    rows, columns = np.nonzero(alpha > 0.5)
+    unit = "its file may count in another unit: say --height METRES, or such as --height 200px"
+    mend = f"--height {height} may be wrong" if height else unit
+    if float(alpha.sum()) < 1.0:
+        return f"what is put in is smaller than a pixel; {mend}"
+    whole = len(rows) and (np.ptp(rows) + 1, np.ptp(columns) + 1) == alpha.shape
+    return f"what is put in reaches across the whole picture; {mend}" if whole else None
 
 
 def write_results(

@@ -50,6 +50,7 @@ def composite(
         layers_by,
         plate_by,
         require_options_of_stacks,
+        size_warning,
         write_results,
     )
     from mrbokeh.compositing.choose import best_mode, insertion_of
@@ -87,6 +88,8 @@ def composite(
     sharp = layers_for(plate)
     if not any((layer.alpha > 0).any() for layer in sharp):
         typer.echo("warning: nothing of what is put in is in the picture: is it behind the camera, or beside the frame?", err=True)
+    elif standing.object_ is not None and (warning := size_warning(sharp, standing.height)):
+        typer.echo(f"warning: {warning}", err=True)
     with working("blurring (the first time on a machine it takes a minute to compile)"):
         inserted = finished(insertion.insert(plate, sharp, renderer), plate, finishing)
     write_results(out, inserted, plate, sharp, colour, result)

@@ -26,6 +26,7 @@ from mrbokeh.stacks.exr_layers.composite_exr import write_deep_exr
 from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from tests.house.test_user_mistakes import said
+from tests.support.command_line import mrbokeh
 from tests.support.composite_exr_reader import read_composite_exr
 from tests.support.refusals import refused
 
@@ -97,6 +98,21 @@ def test_a_phones_photograph_brings_its_depth_and_its_sharp_original(shared_data
     assert phone is not None and plate.sharp_rgb is not None and plate.depth_m is not None and best_mode(plate) == "between"
     np.testing.assert_array_equal(plate.sharp_rgb, phone.original_rgb)
     assert 12.42 <= plate.depth_m.min() < plate.depth_m.max() <= 390.6, "within Near and Far of the file"
+
+
+@pytest.mark.parametrize(
+    ("at", "height", "told"),
+    [
+        ("0,0.15,1.5", "0.001", "smaller than a pixel; --height 0.001"),
+        ("0,2,1.5", "4", "across the whole picture; --height 4"),
+        ("0,0.15,1.5", "0.3", ""),
+    ],
+)
+def test_a_size_that_nobody_means_is_told(files: Path, at: str, height: str, told: str) -> None:
+    """The cake stands at 1.5 m, where a pixel is 7 mm wide: the frame of 144 x 96 px is about 1 m x 0.7 m there."""
+    words = (files / "photo.exr", "--lens", files / "lens.json", "--object", CAKE, "--at", at, "--height", height)
+    done = mrbokeh("composite", *words, "--out", files / "out.exr")
+    assert done.returncode == 0 and ("warning" in done.stderr) == bool(told) and told in done.stderr
 
 
 def test_a_matte_with_its_distance_does_without_depth(files: Path) -> None:

@@ -167,7 +167,7 @@ def test_a_layer_takes_the_blur_of_the_surface_at_its_pixel(known: FocalStack, g
     common = ("--slice", 0, "--renderer", "scatter", "--mode", "over", "--out")
     run("composite", known.folder, "--layer", tmp_path / "right.exr", *common, tmp_path / "truth.exr")
     told = run("composite", guessed.folder, "--layer", tmp_path / "odd.exr", "--at-pixel", ON_WALL, *common, tmp_path / "made.exr")
-    assert "metres are guessed" in told and "put in at 2 to 2 guessed metres, 20x16 px" in told
+    assert "metres are guessed" in told and "put in at 2 to 2 guessed metres from the lens, 20x16 px" in told
     np.testing.assert_allclose(read_image(tmp_path / "made.exr"), read_image(tmp_path / "truth.exr"), atol=2e-3)
     told = run("composite", guessed.folder, "--layer", tmp_path / "odd.exr", *common, tmp_path / "beside.exr")
     assert "--at-pixel X,Y puts them onto the surface" in told
