@@ -6,12 +6,16 @@ most like the opening itself does, but never larger than it is: between 1.5 and 
 two hundredths. Up to one pixel kernels stay the identity.
 """
 
+import hashlib
+from contextlib import suppress
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Float32
 
 from mrbokeh.optics.aperture import Aperture
+from mrbokeh.system.atomic_files import atomic_path
 
 Plane = Float32[np.ndarray, "height width"]
 Transfers = Float[np.ndarray, "_ values"]
@@ -47,7 +51,28 @@ def drawn_diameters_px(coc_px: Plane, aperture: Aperture) -> Plane:
 
 @lru_cache(maxsize=64)
 def _table(aperture: Aperture) -> Float32[np.ndarray, " steps"]:
-    """Return the diameters to draw for 0, 1 / STEPS_PER_PX, ... px of blur; the last one determines how it continues."""
+    """Return the diameters to draw for 0, 1 / STEPS_PER_PX, ... px of blur; the last one determines how it continues.
+
+    It takes half a second and is kept where compiled kernels are.
+    """
+    from mrbokeh.system.compiled import folder_of
+
+    modifiers = (aperture.weights, aperture.cat_eye, aperture.spherical_aberration, aperture.axial_chromatic, aperture.lateral_chromatic)
+    name = hashlib.sha256(b"".join([repr(modifiers).encode(), *(each.tobytes() for each in aperture.outlines)])).hexdigest()[:32]
+    folder = folder_of(Path(__file__), __name__)
+    path = None if folder is None else folder / f"{name}.npy"
+    with suppress(OSError, ValueError, EOFError):
+        if path is not None and path.is_file():
+            return np.load(path)
+    made = _made_table(aperture)
+    with suppress(OSError):
+        if path is not None:
+            with atomic_path(path) as temporary, temporary.open("wb") as file:
+                np.save(file, made)
+    return made
+
+
+def _made_table(aperture: Aperture) -> Float32[np.ndarray, " steps"]:
     steps_px = np.arange(_WIDEST_PX * STEPS_PER_PX + 1.0) / STEPS_PER_PX
     off = _distances(_drawn_transfers(aperture), _transfers(aperture))
     meant = np.maximum.accumulate([_lowest(_BLURS_PX, row) for row in off]) + _RISE * _DRAWN_PX

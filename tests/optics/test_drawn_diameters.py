@@ -1,6 +1,7 @@
 """Drawn kernels blur as much as a lens does, so that slices whose focus is right are not called wrong."""
 
 from functools import cache
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -10,10 +11,12 @@ from capture.report.examination import STEP_PX
 from capture.report.slice_fit import Prediction, SliceFit, fit_slice
 from capture.report.stack_view import Reblur
 from mrbokeh.images.image_metrics import psnr
+from mrbokeh.optics import drawn_diameters
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.drawn_diameters import drawn_diameters_px
 from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.system import compiled
 
 FINER = 5
 HEIGHT_PX, WIDTH_PX = 64, 96
@@ -116,3 +119,18 @@ def test_every_renderer_blurs_a_picture_of_pixels_as_the_lens_does(name: str, mo
         monkeypatch.setattr(f"{module}.drawn_diameters_px", lambda coc_px, _: coc_px)
     wrong = psnr(reblur(picture(1), coc_px, Aperture.disc())[INNER], photographed[INNER])
     assert right > wrong + 2.0
+
+
+def test_a_kept_table_is_the_one_that_was_made_and_a_damaged_one_is_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compiled, "folder_of", lambda _file, _module: tmp_path)
+    apertures = (Aperture.disc(), Aperture.blades(6), Aperture.blades(7))
+    made = [drawn_diameters._table.__wrapped__(each) for each in apertures]
+    assert len(list(tmp_path.iterdir())) == len(apertures), "one for each opening"
+    monkeypatch.setattr(drawn_diameters, "_made_table", None)
+    for each, table in zip(apertures, made, strict=True):
+        np.testing.assert_array_equal(drawn_diameters._table.__wrapped__(each), table)
+    monkeypatch.undo()
+    monkeypatch.setattr(compiled, "folder_of", lambda _file, _module: tmp_path)
+    for path in tmp_path.iterdir():
+        path.write_bytes(b"x")
+    np.testing.assert_array_equal(drawn_diameters._table.__wrapped__(apertures[0]), made[0])

@@ -36,7 +36,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 from threading import Lock
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 from weakref import WeakKeyDictionary
 
 import numpy as np
@@ -47,9 +47,6 @@ from mrbokeh.layering.layering import Layering, render_layers
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.psf_bank import PsfBank
-from mrbokeh.renderers.bank.apertures import BankApertures, fit_apertures
-from mrbokeh.renderers.bank.lattice import BankLattice
-from mrbokeh.renderers.bank.renderers import BankRenderer, by_polygons
 from mrbokeh.renderers.kernels._vectors_numba import CHUNK_PX
 from mrbokeh.renderers.polygon._differences_numba import settle, splat_parts
 from mrbokeh.renderers.polygon._ring_numba import ALIASED_ROWS, BLOCK_ROWS, GUARD, Corners, Picture, Ring, Scratch, Target, lay_out
@@ -60,6 +57,10 @@ from mrbokeh.renderers.polygon.surveyed_light import NO_HIGHLIGHTS, SurveyedLigh
 from mrbokeh.renderers.polygon.tables import ApertureTables, tables_of
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import ZeroedMemory, cores, workers
+
+if TYPE_CHECKING:
+    from mrbokeh.renderers.bank.apertures import BankApertures
+    from mrbokeh.renderers.bank.renderers import BankRenderer
 
 
 def ring_of(tables: ApertureTables, margin: int, width: int, planes: np.ndarray) -> Ring:
@@ -266,7 +267,7 @@ class PolygonDifferences:
     layering: Layering = field(default_factory=Layering)
     threads: int = 0
     bank: PsfBank | None = None
-    apertures: BankApertures | None = field(default=None, repr=False)
+    apertures: "BankApertures | None" = field(default=None, repr=False)
     _memory: ZeroedMemory = field(default_factory=ZeroedMemory, repr=False, compare=False)
     _tables: WeakKeyDictionary[Aperture, ApertureTables] = field(default_factory=WeakKeyDictionary, repr=False, compare=False)
 
@@ -284,9 +285,13 @@ class PolygonDifferences:
         return self._of_bank.render(layers, lens, self.layering)
 
     @cached_property
-    def _of_bank(self) -> BankRenderer | None:
+    def _of_bank(self) -> "BankRenderer | None":
         if self.bank is None:
             return None
+        from mrbokeh.renderers.bank.apertures import fit_apertures
+        from mrbokeh.renderers.bank.lattice import BankLattice
+        from mrbokeh.renderers.bank.renderers import by_polygons
+
         return by_polygons(self.bank, self.apertures or fit_apertures(BankLattice(self.bank)), self.sum_kernels, self.tables_of)
 
     def sum_kernels(
