@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+import mrbokeh
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.typed_numbers import numbers_in
@@ -14,6 +15,8 @@ from viewfinder.options import CalibrationOptions, ListeningOptions, PhoneOption
 app = typer.Typer(add_completion=False)
 
 _SOURCE_HELP = "Video played in a loop, number of a webcam, rtsp/http/udp URL, folder:PATH, gphoto2, whip (a browser), or test."
+
+_DEMO = Path(mrbokeh.__file__).parent / "demo_data" / "live"
 
 BoardOption = Annotated[Path | None, typer.Option(help="BOARD.json of `mrbokeh viewfinder board`: the camera is tracked by it.")]
 CameraOption = Annotated[Path | None, typer.Option(help="CAMERA.json with the source's intrinsics; else those of the lens.")]
@@ -34,6 +37,7 @@ QrOption = Annotated[bool, typer.Option("--qr/--no-qr", help="With --lan: print 
 def viewfinder(
     context: typer.Context,
     source: Annotated[str | None, typer.Option(help=_SOURCE_HELP)] = None,
+    demo: Annotated[bool, typer.Option("--demo", help="The shipped clip, board, lens and cake; other options go before.")] = False,
     scene: Annotated[Path | None, typer.Option(help="SCENE.toml: objects, light, shadow, lens; read again when it changes.")] = None,
     layer: Annotated[
         Path | None, typer.Option(metavar="RGBAZ.exr", help="Instead of a scene: an all-in-focus layer before a camera that stands still.")
@@ -84,12 +88,17 @@ def viewfinder(
 ) -> None:
     """Show a camera with virtual objects in it, blurred by the lens, on a page for phones; Ctrl-C ends it.
 
+    Example: mrbokeh viewfinder --demo
+
     Example: mrbokeh viewfinder --source 0 --scene table.toml --board board.json --lens lens.json --lan
 
     Example: mrbokeh viewfinder --source clip.mp4 --layer lantern.exr --lens lens.json
     """
     if context.invoked_subcommand is not None:
         return
+    if demo and source is None:
+        source, board, lens = str(_DEMO / "clip.mp4"), board or _DEMO / "board.json", lens or [_DEMO / "lens.json"]
+        scene = scene or (_DEMO / "scene.toml" if layer is None else None)
     if source is None:
         typer.echo(context.get_help())
         raise typer.Exit(2)

@@ -69,11 +69,14 @@ class FrameSink(Protocol):
 class Pipeline:
     """Pipeline that runs while open (`with`). If the camera fails for good, sinks get a sentence, and the pipeline stands still.
 
+    preparing: whether frames are composited though nobody watches yet, so that what is costly once is done before.
     failure: that sentence. problem: a sentence while frames come that cannot be composited.
     """
 
-    def __init__(self, source: FrameSource, compositor: Compositor, sinks: Sequence[FrameSink]) -> None:
-        self.source, self._compositor, self._sinks = source, compositor, list(sinks)
+    def __init__(
+        self, source: FrameSource, compositor: Compositor, sinks: Sequence[FrameSink], preparing: Callable[[], bool] = lambda: False
+    ) -> None:
+        self.source, self._compositor, self._sinks, self._preparing = source, compositor, list(sinks), preparing
         self.failure: str | None = None
         self.problem: str | None = None
         self.dropped = 0
@@ -116,7 +119,7 @@ class Pipeline:
         shown_s = 0.0
         while not self._stopping.is_set() and self.failure is None:
             wanting = [sink for sink in self._sinks if sink.wants_frame]
-            if not wanting:
+            if not wanting and not self._preparing():
                 self._stopping.wait(_POLL_S)
                 continue
             frame = self._newest.take(max(0.0, shown_s + _REPEAT_S - time.monotonic()))
@@ -187,7 +190,16 @@ async def _served(viewfinder: Viewfinder, endpoint: Endpoint) -> None:
             typer.echo(f"also a webcam for other programs: {viewfinder.webcam.name}")
         if "whip" in viewfinder.site.parts:
             endpoint.announce_camera(url)
+        telling = asyncio.create_task(_tell_when_shown(viewfinder.compositor))
         await stopped.wait()
+        telling.cancel()
+
+
+async def _tell_when_shown(compositor: LiveCompositor) -> None:
+    """The page says what keeps it; the terminal says when there is something to see."""
+    while not is_shown(compositor):
+        await asyncio.sleep(_REPEAT_S)
+    typer.echo("the scene is shown")
 
 
 @contextmanager
@@ -217,7 +229,7 @@ def running(parts: Parts) -> Iterator[Viewfinder]:
         if parts.webcam is not None:
             sinks.append(parts.webcam)
             closing.callback(parts.webcam.close)
-        pipeline = closing.enter_context(Pipeline(parts.source, compositor, sinks))
+        pipeline = closing.enter_context(Pipeline(parts.source, compositor, sinks, Preparing(compositor)))
         controls = LiveControls(parts, compositor, manual, recorder, trouble=lambda: pipeline.failure or pipeline.problem or _remark(parts))
         of_site: dict[str, Part] = {"whep": Whep(stream), "obs": ObsPart(Whep(alone))}
         if isinstance(parts.source, Part):
@@ -225,6 +237,29 @@ def running(parts: Parts) -> Iterator[Viewfinder]:
         of_site |= parts.cameras
         site = Site(controls=controls, access=parts.access, broadcaster=jpeg.broadcaster, parts=of_site, matte=lambda: matte_of(compositor))
         yield Viewfinder(pipeline, compositor, site, parts.webcam)
+
+
+_UNASKED_S = 5.0
+
+
+class Preparing:
+    """Whether frames are composited before anybody watches: until the scene is shown, while it is drawn and for seconds after that.
+
+    What is done once, such as loading kernels, is done then when the page is opened. A camera that is not tracked is not waited for.
+    """
+
+    def __init__(self, compositor: LiveCompositor) -> None:
+        self._compositor, self._until_s = compositor, time.monotonic() + _UNASKED_S
+
+    def __call__(self) -> bool:
+        if self._compositor.overlays.status.busy:
+            self._until_s = time.monotonic() + _UNASKED_S
+        return not is_shown(self._compositor) and time.monotonic() < self._until_s
+
+
+def is_shown(compositor: LiveCompositor) -> bool:
+    """Return whether something virtual lies over the last frame."""
+    return compositor.last is not None and compositor.last.overlay.rgb.size > 0
 
 
 def _remark(parts: Parts) -> str | None:

@@ -97,7 +97,8 @@ class DrawingThread:
 
     @property
     def problem(self) -> str | None:
-        return self._of_file or self._of_drawing or None
+        preparing = "preparing the scene; the first time on a machine that takes a minute" if self.newest is None and self.busy else ""
+        return self._of_file or self._of_drawing or preparing or None
 
     @property
     def draws_per_s(self) -> float:
