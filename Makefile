@@ -36,16 +36,18 @@ check: $(READY)
 bench: $(READY)
 	for bench in tests/bench/bench_*.py; do $(RUN)/python -m tests.bench.$$(basename $$bench .py) || exit 1; done
 
-# The committed files with the kernels of this platform, compiled for all processors with AVX2: commands begin at once where it is installed.
-wheel: PORTABLE = NUMBA_CPU_NAME=x86-64-v3 NUMBA_CPU_FEATURES= NUMBA_CACHE_DIR=$(CURDIR)/build/wheel/kernels
+# The committed files with kernels compiled for x86-64 with AVX2: commands begin at once where it is installed, with this Python and the numba
+# and numpy of constraints.txt.
+wheel: PORTABLE = NUMBA_CPU_NAME=x86-64-v3 NUMBA_CPU_FEATURES= NUMBA_CACHE_DIR="$(CURDIR)/build/wheel/kernels"
 wheel: $(READY)
 	rm -rf build/wheel && mkdir -p build/wheel/source dist
 	git archive HEAD | tar -x -C build/wheel/source
-	cd build/wheel && PYTHONPATH=source $(PORTABLE) $(CURDIR)/$(RUN)/python -m mrbokeh.cli doctor --compile
+	cd build/wheel && PYTHONPATH="$(CURDIR)/build/wheel/source" $(PORTABLE) "$(CURDIR)/$(RUN)/python" -m mrbokeh.cli doctor --compile
 	mv build/wheel/kernels/mrbokeh build/wheel/source/mrbokeh/compiled_kernels
 	find build/wheel/source/mrbokeh/compiled_kernels -name "*.lock" -delete
 	$(RUN)/python -m build --wheel build/wheel/source --outdir dist \
-		-C--build-option=--plat-name=$$($(RUN)/python -c "import sysconfig; print(sysconfig.get_platform())") -C--build-option=--python-tag=cp311
+		-C--build-option=--plat-name=$$($(RUN)/python -c "import sysconfig; print(sysconfig.get_platform())") \
+		-C--build-option=--python-tag=$$($(RUN)/python -c "import sys; print('cp%d%d' % sys.version_info[:2])")
 
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)

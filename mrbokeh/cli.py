@@ -129,6 +129,8 @@ def _mistake(error: Exception) -> str:
     if isinstance(error, ModuleNotFoundError):
         extra = EXTRA_OF_MODULE.get((error.name or "").partition(".")[0])
         return str(MissingExtraError(str(error.name), extra)) if extra else ""
+    if isinstance(error, RuntimeError) and "Symlink loop" in str(error):
+        return f"{str(error).partition(' from ')[2]} is a link that leads back to itself: name the file that is meant"
     if isinstance(error, MemoryError):
         return "there is not enough memory for this: use smaller pictures (--max-width where there is one) or fewer at once"
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
@@ -168,6 +170,8 @@ def _refused(error: OSError) -> str:
     """Describe what the system refused to do with a file or folder; for a temporary file, name its folder."""
     path = Path(os.fsdecode(error.filename))
     shown = path.parent if path.name.startswith(".") and ".part" in path.name else path
+    if isinstance(error, FileNotFoundError):
+        return f"{shown}: there is no such file or folder: check the name"
     if isinstance(error, IsADirectoryError):
         return f"{shown} is a folder (it is a directory), but a file was expected there: check the name"
     if isinstance(error, NotADirectoryError | FileExistsError):

@@ -37,7 +37,7 @@ QrOption = Annotated[bool, typer.Option("--qr/--no-qr", help="With --lan: print 
 def viewfinder(
     context: typer.Context,
     source: Annotated[str | None, typer.Option(help=_SOURCE_HELP)] = None,
-    demo: Annotated[bool, typer.Option("--demo", help="The shipped clip, board, lens and cake; other options go before.")] = False,
+    demo: Annotated[bool, typer.Option("--demo", help="The shipped clip, board, lens and cake instead of your own.")] = False,
     scene: Annotated[Path | None, typer.Option(help="SCENE.toml: objects, light, shadow, lens; read again when it changes.")] = None,
     layer: Annotated[
         Path | None, typer.Option(metavar="RGBAZ.exr", help="Instead of a scene: an all-in-focus layer before a camera that stands still.")
@@ -96,12 +96,14 @@ def viewfinder(
     """
     if context.invoked_subcommand is not None:
         return
-    if demo and source is None:
+    if demo and source is not None:
+        raise InputError(f"--demo shows the shipped clip, but --source is {source}: give one of them")
+    if demo:
         source, board, lens = str(_DEMO / "clip.mp4"), board or _DEMO / "board.json", lens or [_DEMO / "lens.json"]
         scene = scene or (_DEMO / "scene.toml" if layer is None else None)
     if source is None:
         typer.echo(context.get_help())
-        raise typer.Exit(2)
+        raise InputError("nothing to show: expected --source (a clip, a webcam's number, a URL, or test), or --demo for the shipped clip")
     from viewfinder.app.running import serve
 
     logging.basicConfig(level=logging.WARNING)

@@ -28,7 +28,7 @@ def dataset_command(
     licence: Annotated[str, typer.Option(metavar="TEXT|FILE", help="under which the pictures may be used (required)")] = "",
     test: Annotated[list[str] | None, typer.Option(metavar="VIEW", help="viewpoints to test on, instead of a share of all")] = None,
     test_share: Annotated[float, typer.Option(help="of the viewpoints, chosen by hash")] = 0.2,
-    seed: Annotated[int, typer.Option(help="of that choice")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="of that choice")] = 0,
     radiance_scale: Annotated[
         str, typer.Option(metavar="maximum|SHARE|'radiance X'", help="radiance at the upper end of the network's range")
     ] = "maximum",

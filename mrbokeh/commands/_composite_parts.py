@@ -14,7 +14,6 @@ from mrbokeh.commands._composite_options import LensOptions, ObjectOptions, Plat
 from mrbokeh.commands._insertion_options import ColourOptions, LookGroup, VirtualOptions
 from mrbokeh.compositing.plate import Inserted, Plate, bundle_plate, open_plate, with_depth, with_matte, with_own_alpha
 from mrbokeh.depth.depth_map import DepthSettings, parse_near_far
-from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.alpha_io import HOLDING_ALPHA, alpha_with
 from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.images.image_io import INTEGER_SUFFIXES, require_suffix
@@ -53,11 +52,10 @@ def plate_by(
     if colour.of_plate is not None:
         plate = _from_space(plate, photo, colour.of_plate)
     near_far_m = None if options.disparity is None else parse_near_far(options.disparity)
-    phone = None if photo.is_dir() else read_phone_photo(photo, None if options.depth else near_far_m)
-    sharp_rgb = read_photograph(options.rgb).rgb if options.rgb else phone.original_rgb if phone else None
-    if sharp_rgb is not None:
+    if options.rgb is not None:
+        sharp_rgb = read_photograph(options.rgb).rgb if colour.of_plate is None else colour.of_plate.to_rec709(read_numbers(options.rgb))
         plate = replace(plate, sharp_rgb=sharp_rgb)
-    source = options.depth or (photo if phone else None)
+    source = options.depth or (photo if near_far_m or options.depth_scale else None)
     if source is not None:
         plate = with_depth(plate, source, DepthSettings(near_far_m, options.depth_scale))
     return plate if options.matte is None else with_matte(plate, options.matte)
@@ -116,9 +114,10 @@ def blur_told(plate: Plate, sharp: Sequence[Layer]) -> str:
     )
     if not len(seen_m):
         return told
-    coc_px = np.abs(lens.coc_px(np.array([seen_m.min(), np.median(seen_m), seen_m.max()]), width_px))
+    nearest_m, farthest_m = seen_m.min(), seen_m.max()
+    coc_px = np.abs(lens.coc_px(np.array([nearest_m, farthest_m, np.clip(lens.focus_distance_m, nearest_m, farthest_m)]), width_px))
     size = f", {_size_px(sharp)} px" if plate.metres_guessed else ""
-    far = f"{seen_m.min():.3g} to {seen_m.max():.3g} {unit} from the lens"
+    far = f"{nearest_m:.3g} to {farthest_m:.3g} {unit} from the lens"
     return f"{told}; put in at {far}{size}, blurred by {coc_px.min():.1f} to {coc_px.max():.1f} px"
 
 
@@ -128,10 +127,10 @@ def _size_px(sharp: Sequence[Layer]) -> str:
     return f"{np.ptp(columns) + 1}x{np.ptp(rows) + 1}"
 
 
-def size_warning(sharp: Sequence[Layer], height: str | None) -> str | None:
-    """Return a warning if what is put in is smaller than a pixel or reaches across the whole picture, which nobody means, else None.
+def placing_warning(sharp: Sequence[Layer], plate: Plate, mode: str, height: str | None) -> str | None:
+    """Return a warning if an object is smaller than a pixel, reaches across the whole picture, or is mostly hidden; None else.
 
-    height: the option --height as typed, which mends it.
+    height: the option --height as typed, which mends the first two.
     """
     alpha = np.maximum.reduce([layer.alpha for layer in sharp])
     rows, columns = np.nonzero(alpha > 0.5)
@@ -140,7 +139,15 @@ def size_warning(sharp: Sequence[Layer], height: str | None) -> str | None:
     if float(alpha.sum()) < 1.0:
         return f"what is put in is smaller than a pixel; {mend}"
     whole = len(rows) and (np.ptp(rows) + 1, np.ptp(columns) + 1) == alpha.shape
-    return f"what is put in reaches across the whole picture; {mend}" if whole else None
+    if whole:
+        return f"what is put in reaches across the whole picture; {mend}"
+    if plate.depth_m is None or mode == "front":
+        return None
+    depth_m = np.minimum.reduce([np.where(layer.alpha > 0.5, layer.depth_m, np.inf) for layer in sharp])
+    hidden = float((plate.depth_m < _NEARER * depth_m)[np.isfinite(depth_m)].mean())
+    if hidden < _MUCH_HIDDEN:
+        return None
+    return f"{hidden:.0%} of it lies behind what the depth says is nearer; --mode front ignores depth"
 
 
 def write_results(
@@ -196,6 +203,7 @@ if TYPE_CHECKING:
     from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples
 
 _COVERED = 0.5
+_HIGHEST, _NEARER, _MUCH_HIDDEN = 20.0, 0.97, 0.4
 _HIGH_SHARE = 0.25
 """Share of the picture's height that an object takes whose size is neither told nor known."""
 
@@ -297,7 +305,13 @@ def _height_m(text: str | None, plate: Plate, depth_m: float) -> float | None:
         number = math.nan
     if not 0.0 < number < math.inf:
         raise InputError(f"--height: expected metres above 0 such as 0.1, or pixels such as 120px, got {text!r}")
-    return plate.length_m(number, depth_m) if text.endswith("px") else number
+    height_px = number if text.endswith("px") else number / plate.length_m(1.0, depth_m)
+    if height_px > _HIGHEST * plate.rgb.shape[0]:
+        raise InputError(
+            f"--height {text} is {height_px / plate.rgb.shape[0]:.0f} times as high as the picture at {depth_m:.3g} m: expected metres, or "
+            f"pixels such as 120px"
+        )
+    return plate.length_m(height_px, depth_m)
 
 
 def _scene_layers(path: Path, camera: Path | None, rendering: RenderingOptions) -> LayersFor:

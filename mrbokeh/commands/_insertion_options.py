@@ -121,12 +121,12 @@ class LensFacts:
 
     PANEL = LENS
 
-    focal_length_mm: Annotated[float | None, typer.Option("--focal-length", metavar="MM", help="Focal length in mm.")] = None
+    focal_length_mm: Annotated[float | None, typer.Option("--focal-length", max=10_000.0, metavar="MM", help="Focal length in mm.")] = None
     f_number: Annotated[float | None, typer.Option(metavar="N", help="f-number.")] = None
-    sensor_width_mm: Annotated[float | None, typer.Option("--sensor-width", metavar="MM", help="Width of the sensor in mm.")] = None
+    sensor_width_mm: Annotated[float | None, typer.Option("--sensor-width", max=500.0, metavar="MM", help="Sensor width in mm.")] = None
 
     @property
-    def told(self) -> dict[str, float]:
+    def given(self) -> dict[str, float]:
         """Facts that were given, by their names in `Lens` and `Photograph`."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
@@ -135,9 +135,11 @@ class LensFacts:
         from mrbokeh.optics.lens import Lens
         from mrbokeh.renderers.onnx_network import OnnxNetwork
 
-        if self.told and isinstance(renderer, OnnxNetwork):
+        if self.given and isinstance(renderer, OnnxNetwork):
             raise InputError("a network blurs as the lens that it learned: leave --focal-length, --f-number and --sensor-width out")
-        return replace(Lens.default() if lens is None else lens, **self.told)  # type: ignore[arg-type]
+        lens = lens or Lens.default()
+        height_mm = lens.sensor_height_mm and self.sensor_width_mm and lens.sensor_height_mm * self.sensor_width_mm / lens.sensor_width_mm
+        return replace(lens, **self.given, sensor_height_mm=height_mm or lens.sensor_height_mm)  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True)
@@ -204,7 +206,7 @@ class LookGroup:
     vignetting: Annotated[str | None, typer.Option(metavar="auto|K1,K2,K3|FLAT.png", help="The lens darkens virtual light too.")] = None
     grain: Annotated[str | None, typer.Option(metavar="auto|FILE", help="Grain as measured in the plate, on virtual light.")] = None
     light_wrap: Annotated[str | None, typer.Option(metavar="STRENGTH[,SIGMA]", help="Light of the plate over virtual edges.")] = None
-    seed: Annotated[int, typer.Option(help="Of the grain.")] = 0
+    seed: Annotated[int, typer.Option(min=0, help="Of the grain.")] = 0
 
     @property
     def wanted(self) -> "LookOptions":

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from mrbokeh.images.layer import Layer, flatten
@@ -18,7 +19,10 @@ class SharpOptions:
     """Pictures, layers or samples to blur."""
 
     rgb: Annotated[Path | None, typer.Option(help="All-in-focus picture, scene-linear: .exr, .hdr or float .tif.")] = None
-    depth: Annotated[Path | None, typer.Option(help="Its depth: EXR channel Z, depth.Z or Y in metres; inf or <= 0: background.")] = None
+    depth: Annotated[
+        Path | None,
+        typer.Option(help="Its depth in metres: EXR channel Z, depth.Z or Y (inf or <= 0: background), or one number."),
+    ] = None
     layer: Annotated[list[Path] | None, typer.Option(help="EXR layer with premultiplied RGBA and Z; repeat it, front first.")] = None
     behind: Annotated[
         list[Path] | None, typer.Option(help="EXR layer behind --rgb: what is known of what it hides (clean plate, other view).")
@@ -116,11 +120,20 @@ def _picture(rgb: Path, depth: Path, srgb: bool) -> Layer:
     from mrbokeh.images.layer import opaque
 
     linear_or = "develop the RAW file to EXR first, or say with --srgb that it is sRGB if that is all there is"
-    colour, depth_m = read_image(rgb) if srgb else read_linear(rgb, linear_or), read_depth(depth)
+    colour = read_image(rgb) if srgb else read_linear(rgb, linear_or)
+    depth_m = read_depth(depth) if depth.exists() or not _is_distance(depth) else np.full(colour.shape[:2], float(str(depth)), np.float32)
     if colour.shape[:2] != depth_m.shape:
         sizes = f"{rgb} is {colour.shape[1]}x{colour.shape[0]} px, {depth} {depth_m.shape[1]}x{depth_m.shape[0]} px"
         raise InputError(f"picture and depth must be of one size, but {sizes}: resize the depth with its nearest pixels, not between them")
     return opaque(colour, depth_m)
+
+
+def _is_distance(depth: Path) -> bool:
+    """Return whether --depth is one distance for all, such as 4, and no file."""
+    try:
+        return float(str(depth)) > 0.0
+    except ValueError:
+        return False
 
 
 def _moving(sharp: dict[str, Layer], sources: SharpOptions) -> dict[str, Layer]:
@@ -138,8 +151,6 @@ def _moving(sharp: dict[str, Layer], sources: SharpOptions) -> dict[str, Layer]:
 
 def _with_all_extras(sharp: dict[str, Layer]) -> dict[str, Layer]:
     """Every layer with the extra channels of all, 0 where a layer has none of that name."""
-    import numpy as np
-
     shapes = {name: values.shape for each in sharp.values() for name, values in each.extra.items()}
     return {
         path: replace(each, extra={name: each.extra.get(name, np.zeros(shapes[name], np.float32)) for name in sorted(shapes)})

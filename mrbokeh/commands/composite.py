@@ -48,9 +48,9 @@ def composite(
         blur_told,
         check_outputs,
         layers_by,
+        placing_warning,
         plate_by,
         require_options_of_stacks,
-        size_warning,
         write_results,
     )
     from mrbokeh.compositing.choose import best_mode, insertion_of
@@ -75,8 +75,8 @@ def composite(
     check_outputs(out, result, read, all_slices=taken.all_slices)
     bundle = read_bundle(photo) if is_bundle(photo) else None
     lens, renderer = lens_and_renderer(optics.lens, optics.renderer or (bundle.renderer if bundle and optics.lens is None else None))
-    lens = lens if lens is None or not facts.told else facts.on(lens, renderer)
-    plate = plate_by(photo, taken, colour, bundle, lens=lens, focus_m=optics.focus, facts={} if lens else facts.told)
+    lens = lens and facts.on(lens, renderer)
+    plate = plate_by(photo, taken, colour, bundle, lens=lens, focus_m=optics.focus, facts={} if lens else facts.given)
     _tell_metres(photo, virtual, standing, lens)
     layers_for = layers_by(virtual, standing, rendering, plate, bundle)
     mode = virtual.mode or best_mode(plate)
@@ -88,9 +88,9 @@ def composite(
     sharp = layers_for(plate)
     if not any((layer.alpha > 0).any() for layer in sharp):
         typer.echo("warning: nothing of what is put in is in the picture: is it behind the camera, or beside the frame?", err=True)
-    elif standing.object_ is not None and (warning := size_warning(sharp, standing.height)):
+    elif standing.object_ is not None and (warning := placing_warning(sharp, plate, mode, standing.height)):
         typer.echo(f"warning: {warning}", err=True)
-    with working("blurring (the first time on a machine it takes a minute to compile)"):
+    with working("blurring"):
         inserted = finished(insertion.insert(plate, sharp, renderer), plate, finishing)
     write_results(out, inserted, plate, sharp, colour, result)
     if lost := alpha_lost(out, plate):

@@ -16,8 +16,8 @@ def demo(
 ) -> None:
     """Run the whole path from RAW photographs to virtual objects with the blur of their lens: capture, train, composite, report.
 
-    Runs the commands of mrbokeh on shipped photographs and writes report.html. Finished stages are skipped when run again, an
-    interrupted one goes on.
+    Runs the commands of mrbokeh on shipped photographs and writes report.html (--quick: quick.html). Finished stages are skipped when
+    run again, an interrupted one goes on.
 
     Example: mrbokeh demo --quick --out demo_out
     """
@@ -31,7 +31,9 @@ def demo(
     out.mkdir(parents=True, exist_ok=True)
     if quick:
         write_quick_story(out, run_stages(quick_stages(out / "quick"), out, console))
-    measurements = [] if quick else write_story(out, run_stages(demo_stages(out, minutes), out, console))
+        console.print(f"\nOpen {(out / 'quick.html').resolve()}", highlight=False, soft_wrap=True)
+        return
+    measurements = write_story(out, run_stages(demo_stages(out, minutes), out, console))
     for each in measurements:
         console.print(f"{'[green]ok    [/]' if each.met else '[red]missed[/]'} {each.what}: {each.text} ({each.wanted})", highlight=False)
-    console.print(f"\nOpen {(out / ('quick.html' if quick else 'report.html')).resolve()}", highlight=False, soft_wrap=True)
+    console.print(f"\nOpen {(out / 'report.html').resolve()}", highlight=False, soft_wrap=True)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from threading import Timer
 from typing import Annotated, NamedTuple
 
 import typer
@@ -19,6 +20,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from mrbokeh import __version__
+from mrbokeh.demo.plan import DATA
 from mrbokeh.system.console import progress_bars
 from mrbokeh.system.errors import InputError, install_command
 
@@ -55,7 +57,6 @@ PROGRAMS = (
     ("exiftool", "metadata of more cameras (49 of 54 files are read without it)", "install exiftool with your system's package manager"),
     ("nvidia-smi", "training and rendering on an NVIDIA GPU", "install the GPU driver; everything works without one, slower"),
 )
-DATA = Path(__file__).resolve().parents[1] / "demo_data"
 _TRUTH, _STACK = DATA / "raw_stack" / "truth" / "view_0", Path("scene") / "pcb_oblique"
 _BLUR = ("--depth", str(_TRUTH / "depth.exr"), "--lens", "lens.json")
 _PUT_IN = ("--object", str(DATA / "objects" / "alien.glb"), "--at-pixel", "100,150", "--height", "60px", "--shadow", "0.5")
@@ -78,7 +79,7 @@ WORK = (
 )
 """Commands that need nearly all kernels: rows that run side by side, the last only where its extra is installed."""
 SHOWN = "the scene is shown"
-_MOST_TOLD = 500
+_MOST_TOLD, _LONGEST_S = 500, 900.0
 OPENCV = "opencv-contrib-python-headless"
 OTHER_OPENCV = ("opencv-python", "opencv-python-headless", "opencv-contrib-python")
 
@@ -133,11 +134,14 @@ def _run(arguments: tuple[str, ...], folder: str) -> None:
     command, environment = [sys.executable, "-m", "mrbokeh.cli", *arguments], os.environ | {"PYTHONSAFEPATH": "1"}
     with subprocess.Popen(command, cwd=folder, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
         assert process.stdout is not None
+        late = Timer(_LONGEST_S, process.kill)
+        late.start()
         told = ""
         for line in process.stdout:
             told = (told + line)[-_MOST_TOLD:]
             if line.startswith(SHOWN):
                 process.send_signal(signal.SIGINT)
+        late.cancel()
     if process.returncode:
         raise InputError(f"`mrbokeh {' '.join(arguments)}` should have worked, but did not: {told.strip()}")
 
@@ -164,7 +168,7 @@ def _version(package: str) -> str | None:
 def _opencv() -> Component:
     """Find other packages of OpenCV beside ours: all write into one folder `cv2`, the last one installed wins."""
     others = [name for name in OTHER_OPENCV if _version(name)]
-    remedy = f"pip uninstall -y {' '.join(others)} {OPENCV} && pip install {OPENCV}" if others else "pip install mrbokeh"
+    remedy = f"pip uninstall -y {' '.join(others)} {OPENCV} && pip install {OPENCV}" if others else install_command()
     return Component(OPENCV, None if others else _version(OPENCV), "picture files, registration, filters", remedy)
 
 

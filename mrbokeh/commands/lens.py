@@ -22,7 +22,7 @@ class BankOptions:
     lens: Annotated[Path | None, typer.Option(help="Lens file whose opening is used (model simple; a disc without).")] = None
     image: Annotated[Path | None, typer.Option(help="The picture of a PSF (model stylized).")] = None
     diameter_px: Annotated[
-        float | None, typer.Option("--diameter", help="Largest circle of confusion in px (simple, combined, stylized).")
+        float | None, typer.Option("--diameter", max=4096.0, help="Largest circle of confusion in px (simple, combined, stylized).")
     ] = None
     motion_px: Annotated[float | None, typer.Option("--motion", help="Longest motion in px per shutter (combined).")] = None
     prescription: Annotated[Path | None, typer.Option(help="A .dat file of lens surfaces (model physical; a bi-convex lens without).")] = (
@@ -73,7 +73,7 @@ class BuildOptions:
     rays: Annotated[int | None, typer.Option(help="Rays per kernel; 0 takes the closed form. (What suits the model where not given.)")] = (
         None
     )
-    seed: Annotated[int, typer.Option(help="Seed of the rays.")] = 0
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the rays.")] = 0
     overwrite: Annotated[bool, typer.Option(help="Replace the bank where it exists.")] = False
 
 
@@ -112,7 +112,7 @@ def spreadlets(
     points_per_px: Annotated[float, typer.Option(help="Points per pixel of a kernel's outline: more are nearer and slower.")] = 1.0,
     lloyd_steps: Annotated[int, typer.Option(help="Steps of Lloyd's relaxation, as in the paper; 10 % nearer than none.")] = 50,
     annealing_steps: Annotated[int, typer.Option(help="Steps of annealing (the paper: 400; fitted values gain nothing by it).")] = 0,
-    seed: Annotated[int, typer.Option(help="Seed of darts and annealing.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of darts and annealing.")] = 0,
     overwrite: Annotated[bool, typer.Option(help="Compute them again where they are.")] = False,
 ) -> None:
     """Compute what `render --psf BANK` splats (sparse points of the kernels' Laplacians) and keep it in BANK/spreadlets.npz.
@@ -289,7 +289,7 @@ def show(
     if out.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise InputError(f"cannot draw {out}: expected .png, .pdf or .svg")
     refuse_existing(out, overwrite)
-    with working("drawing (the first time on a machine it takes a minute to compile)"):
+    with working("drawing"):
         figure = _drawn_bank(lens) if lens.is_dir() else _drawn_lens(lens, width)
     with atomic_path(out) as temporary:
         figure.savefig(temporary, dpi=150)

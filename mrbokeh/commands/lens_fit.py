@@ -118,7 +118,7 @@ class FittingOptions:
     ] = ""
     smoothness: Annotated[float, typer.Option(help="More trusts noisy pictures less, and rounds off shapes.")] = 1.0
     pixels: Annotated[int, typer.Option(help="How many pixels of the stacks to use, at most.")] = 120_000
-    seed: Annotated[int, typer.Option(help="Seed of the choice of pixels.")] = 0
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the choice of pixels.")] = 0
 
     def parsed(self) -> "FitSettings":
         """Return the settings of the fit. Raises InputError if an option is out of range or no number."""

@@ -27,7 +27,7 @@ class BlurOptions:
         None
     )
     slices: Annotated[int, typer.Option(help="How many slices of depth at most.", min=1)] = 16
-    threads: Annotated[int, typer.Option(help="Threads; 0 takes all cores. The result does not depend on it.", min=0)] = 0
+    threads: Annotated[int, typer.Option(help="Threads; 0 takes all cores. The result does not depend on it.", min=0, max=4096)] = 0
     device: Annotated[
         str, typer.Option(help="cuda, cuda:1 or cpu: --method laplacian or lrdm by torch there; without it compiled loops on the CPU.")
     ] = ""
@@ -75,15 +75,17 @@ def render(
     if given.samples is not None and (given.shows_pictures or focus.is_given):
         raise InputError("--samples holds all there is to see, with its focus and its motion: leave out pictures, layers, motion and focus")
     sharp = {} if given.samples is not None else read_sharp(given)
+    if given.samples is not None and facts.given:
+        raise InputError("--samples hold the blur of their own lens: leave --focal-length, --f-number and --sensor-width out")
     used = focused(facts.on(None if lens is None else read_lens(lens)), sharp, focus)
-    with working("rendering (the first time on a machine it takes a minute to compile)"):
+    with working("rendering"):
         renderer = chosen_renderer(blur.method, blur.psf, threads=blur.threads, layering=Layering(slices=blur.slices), device=blur.device)
         if given.samples is None:
             blurred = renderer.render(list(sharp.values()), used)
         else:
             blurred = reconstructed(renderer, blur.method, given.samples, used)
     _write(out, blurred, result.alpha_out)
-    typer.echo(f"wrote {out} ({used.told})")
+    typer.echo(f"wrote {out}" + ("" if given.samples is not None or blur.method.endswith(".onnx") else f" ({used.described})"))
 
 
 def _write(out: Path, blurred: Layer, alpha_out: bool) -> None:

@@ -27,6 +27,7 @@ Rgb = Float32[np.ndarray, "height width 3"]
 Blurred = Callable[[float], Rgb]
 
 FILMS = (".mov", ".mp4", ".mkv")
+_HARDLY_PX = 3.0
 _MADE = "transferred_with_depth"
 
 app = typer.Typer(add_completion=False)
@@ -149,7 +150,13 @@ def transfer(
     if result.save_depth is not None:
         _write_depth(result.save_depth, sharp)
     coc_px = max(float(np.abs(chosen.focused_at(each).coc_px(sharp.depth.depth_m, rgb.shape[1])).max()) for each in distances_m)
-    focus = "" if len(distances_m) > 1 else f"{chosen.focused_at(distances_m[0]).told}; "
+    focus = "" if len(distances_m) > 1 else f"{chosen.focused_at(distances_m[0]).described}; "
+    if coc_px < _HARDLY_PX:
+        typer.echo(
+            f"warning: hardly anything is blurred ({coc_px:.1f} px at most): a smaller --f-number blurs more; where the depth has no unit, "
+            f"--disparity NEAR:FAR gives it one",
+            err=True,
+        )
     typer.echo(f"wrote {out} ({focus}depth: {sharp.depth.note}; largest circle of confusion {coc_px:.1f} px)")
 
 

@@ -9,6 +9,7 @@ Every insertion owes these (tests/compositing/test_compositing.py asks all of th
 - linearity: twice the light in plate and layers gives twice the picture.
 """
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from jaxtyping import Float32
 
 from mrbokeh.depth.depth_map import DepthSettings
 from mrbokeh.depth.open_depth import open_depth
+from mrbokeh.depth.phone_depth import PhoneFocus, PhonePhoto, read_phone_photo
 from mrbokeh.images.alpha_io import is_straight, read_alpha
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
@@ -28,8 +30,10 @@ from mrbokeh.renderers.base import Renderer
 from mrbokeh.stacks.capture_bundle import CaptureBundle
 from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
 from mrbokeh.stacks.guessed_metres import is_lens_guessed
-from mrbokeh.stacks.photograph import lens_for_photograph, read_photograph
-from mrbokeh.system.errors import InputError
+from mrbokeh.stacks.photograph import Photograph, lens_for_photograph, read_photograph
+from mrbokeh.system.errors import InputError, require_file
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -91,21 +95,57 @@ def open_plate(
     """Open a photograph with a lens, or a slice of a merged focal stack, which brings its own lens and depth.
 
     lens: replaces that of the photograph's metadata or of the stack, but keeps the focus of a slice. focus_m replaces all.
+    A phone's photograph with depth inside brings that, its sharp original, and a lens with the blur that the phone put on.
     facts: of a photograph's lens, in place of what its metadata state or lack (`Photograph.stating`).
     """
+    if not photo.exists():
+        require_file(photo, "a photograph or the folder of a focal stack")
     if photo.is_dir() and not (photo / FILE_NAME).is_file():
+        within = ", ".join(str(each.parent) for each in sorted(photo.glob(f"*/{FILE_NAME}")))
         raise InputError(
             f"{photo} is a folder, but neither a merged focal stack ({FILE_NAME}) nor a capture of the viewfinder: "
-            f"give a photograph, or make a stack of its photographs by `mrbokeh capture process`"
+            f"give {within or 'a photograph, or make a stack of its photographs by `mrbokeh capture process`'}"
         )
     if photo.is_dir():
         return _stack_plate(photo, slice_index, lens, focus_m)
     if slice_index is not None:
         raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}: leave it out")
-    photograph = read_photograph(photo).stating(facts or {})
+    photograph, phone = read_photograph(photo).stating(facts or {}), _phone(photo)
+    if lens is None and not facts and phone is not None and phone.focus is not None:
+        photograph = _with_the_phones_blur(photograph, phone.focus, photo)
     lens = photograph.lens(photo, focus_m) if lens is None else lens_for_photograph(lens, photograph, photo)
     focused = lens if focus_m is None else lens.focused_at(focus_m)
-    return with_own_alpha(plate_of(photograph.rgb, focused), photo, read_alpha(photo, photograph.orientation))
+    plate = with_own_alpha(plate_of(photograph.rgb, focused), photo, read_alpha(photo, photograph.orientation))
+    if phone is None:
+        return plate
+    original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
+    return replace(with_depth(plate, photo, DepthSettings()), sharp_rgb=original)
+
+
+def _phone(photo: Path) -> PhonePhoto | None:
+    """Return what a phone put into its photograph; None, with one line, if that is damaged."""
+    try:
+        return read_phone_photo(photo)
+    except InputError as error:
+        _log.warning(f"{error}; the photograph is taken without its depth")
+        return None
+
+
+_PHONE_FOCAL_MM, _LONG_SIDE_MM = 28.0, 36.0
+"""The field of view of most phones, as of full frame."""
+
+
+def _with_the_phones_blur(photograph: Photograph, focus: PhoneFocus, photo: Path) -> Photograph:
+    """State the lens whose blur the phone put on; what its file does not tell is the field of view, which is then guessed."""
+    height_px, width_px = photograph.rgb.shape[:2]
+    facts = {"focal_length_mm": _PHONE_FOCAL_MM, "sensor_width_mm": _LONG_SIDE_MM * width_px / max(height_px, width_px)}
+    if photograph.focal_length_mm is not None and photograph.sensor_width_mm is not None:
+        facts = {"focal_length_mm": photograph.focal_length_mm, "sensor_width_mm": photograph.sensor_width_mm}
+    else:
+        _log.warning(f"{photo} does not tell its field of view: that of {_PHONE_FOCAL_MM:g} mm on full frame is taken")
+    wide_open = Lens(**facts, f_number=1.0, focus_distance_m=photograph.focus_distance_m or focus.focus_distance_m)
+    f_number = wide_open.coc_px_per_dioptre(width_px) / focus.coc_px_per_dioptre(width_px, height_px)
+    return replace(photograph, **facts, f_number=f_number, focus_distance_m=wide_open.focus_distance_m)  # type: ignore[arg-type]
 
 
 def plate_of(rgb: Float32[np.ndarray, "height width 3"], lens: Lens, depth_m: Float32[np.ndarray, "height width"] | None = None) -> Plate:

@@ -112,6 +112,30 @@ class DepthMap:
         return cls.of_dioptres(dioptres.astype(np.float32), valid, f"{note}, {near_m:g} to {far_m:g} m")
 
 
+_TERRACE_PX, _TERRACE_STEPS, _JOINT_SIGMA_PX = 24.0, 8.0, 2.0
+"""How far, and over how many steps, terraces are smoothed, and their joints."""
+
+
+def without_steps(levels: Plane, steps: int) -> Plane:
+    """Return levels in [0, 1] as smooth as they can have been before they were rounded to so many steps; more than 256 stay as they are.
+
+    Smoothing ends at edges (domain transform), each pixel stays within a step of its level (half of it was rounded, JPEG adds as much),
+    and 0 and 1, which mean unknown or beyond the range, stay. In 8 bit a slanted surface falls into terraces, and the background shows
+    through their joints when they are blurred.
+    """
+    import cv2
+
+    if steps > 256:
+        return levels
+    step, guide = np.float32(1.0 / (steps - 1)), levels * np.float32(steps - 1)
+    smooth = cv2.ximgproc.dtFilter(guide, levels, _TERRACE_PX, _TERRACE_STEPS, mode=cv2.ximgproc.DTF_RF, numIters=3)
+    for _ in range(2):
+        # What the filter leaves of each joint.
+        smooth = cv2.GaussianBlur(np.clip(smooth, levels - step, levels + step), (0, 0), _JOINT_SIGMA_PX)
+    smooth = np.clip(smooth, levels - step, levels + step)
+    return np.where((levels > 0.0) & (levels < 1.0), smooth, levels).astype(np.float32)
+
+
 def with_holes_filled(depth: DepthMap) -> DepthMap:
     """Give pixels that were not measured the depth of the nearest measured one."""
     if depth.valid.all() or not depth.valid.any():

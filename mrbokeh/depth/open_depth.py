@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.depth.depth_filters import refined_dioptres
-from mrbokeh.depth.depth_map import DepthMap, DepthSettings, with_holes_filled
+from mrbokeh.depth.depth_map import DepthMap, DepthSettings, with_holes_filled, without_steps
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.images.image_io import read_depth
@@ -194,7 +194,8 @@ def read_number_map(path: Path, settings: DepthSettings) -> DepthMap:
 
 def _levels(numbers: np.ndarray) -> Plane:
     if numbers.dtype.kind in "ui":
-        return (numbers / np.float32(np.iinfo(numbers.dtype).max)).astype(np.float32)
+        most = np.iinfo(numbers.dtype).max
+        return without_steps((numbers / np.float32(most)).astype(np.float32), int(most) + 1)
     low, high = float(np.nanmin(numbers)), float(np.nanmax(np.where(np.isfinite(numbers), numbers, np.nan)))
     return np.clip((np.nan_to_num(numbers, posinf=high, neginf=low, nan=low) - low) / max(high - low, 1e-30), 0, 1).astype(np.float32)
 

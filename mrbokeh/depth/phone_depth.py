@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.depth.depth_map import DepthMap
+from mrbokeh.depth.depth_map import DepthMap, without_steps
 from mrbokeh.images.color import srgb_to_linear
 from mrbokeh.images.exif import stored_orientation, upright
 from mrbokeh.system.errors import InputError
@@ -146,7 +146,7 @@ def _depth(xmp: Mapping[str, str], path: Path, near_far_m: tuple[float, float] |
         raise InputError(f"{path}: GDepth:Near and Far are missing: state them with --disparity NEAR:FAR in metres") from None
     if kind == "RangeLinear" and not np.isfinite(far):
         raise InputError(f"{path}: its depth is linear in metres, so that FAR cannot be infinite: give a distance")
-    level = _decoded(xmp[_DEPTH + "Data"], path)[..., 0]
+    level = without_steps(_decoded(xmp[_DEPTH + "Data"], path)[..., 0], 256)
     units = xmp.get(_DEPTH + "Units", "") or (
         "metres as stated" if near_far_m else "no unit, taken as metres; --disparity NEAR:FAR says better"
     )

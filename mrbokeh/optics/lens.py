@@ -70,7 +70,7 @@ class Lens:
         return not any(self.tilt_rad) and bool(np.isinf(self.petzval_radius_mm))
 
     @property
-    def told(self) -> str:
+    def described(self) -> str:
         """Describe the lens in a few words, such as "50 mm f/1.8 focused at 1.5 m, sensor 36 mm wide"."""
         focus = "infinity" if math.isinf(self.focus_distance_m) else f"{self.focus_distance_m:.3g} m"
         return f"{self.focal_length_mm:.4g} mm f/{self.f_number:.3g} focused at {focus}, sensor {self.sensor_width_mm:.4g} mm wide"

@@ -19,7 +19,7 @@ from mrbokeh.optics.camera import Camera, camera_from_json, camera_to_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import lens_from_json, lens_to_json
 from mrbokeh.system.atomic_files import read_json, write_json
-from mrbokeh.system.errors import InputError
+from mrbokeh.system.errors import InputError, require_file
 
 FORMAT = "mrbokeh-focal-stack"
 VERSION = 2
@@ -225,6 +225,7 @@ def write_focal_stack(stack: FocalStack) -> None:
 def read_focal_stack(folder: Path | str) -> FocalStack:
     """Read the stack in a folder; pictures are not opened. Raises InputError if the folder is not one."""
     folder = Path(folder)
+    require_file(folder / FILE_NAME, "a focal stack", ": make one of photographs by `mrbokeh capture process PHOTOGRAPHS --out SCENE`")
     document = read_json(folder / FILE_NAME, "a focal stack")
     if document.get("format") != FORMAT or document.get("version") != VERSION:
         raise InputError(

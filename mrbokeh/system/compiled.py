@@ -3,8 +3,8 @@
 numba keeps a compiled function beside its file and stamps it with that file alone: a changed callee in another file leaves a stale kernel
 behind, every checkout and installation compiles for itself, and two processes that start together compile everything twice. Here a kernel
 lies in the user's cache folder under the hash of its module and of all modules of ours which that imports, and whoever needs a kernel that
-another process compiles at the moment waits for it. A wheel brings the kernels of its platform (`make wheel`), compiled for all processors
-of the last ten years; what it lacks is compiled once on the machine, and that is said.
+another process compiles at the moment waits for it. A wheel brings the kernels of its platform (`make wheel`), compiled for x86-64 with
+AVX2; what it lacks is compiled once on the machine, and that is said.
 """
 
 import hashlib
@@ -166,8 +166,11 @@ def folder_of(file: Path, module: str) -> Path | None:
 def _begin(folder: Path, shipped: Path | None) -> None:
     """Make a folder of kernels, with those that the wheel brought; another process may do the same at this moment."""
     with tempfile.TemporaryDirectory(dir=folder.parent, prefix=".") as aside, suppress(OSError):
-        (Path(aside) / "new").mkdir() if shipped is None else shutil.copytree(shipped, Path(aside) / "new")
-        (Path(aside) / "new").rename(folder)
+        new = Path(aside) / "new"
+        new.mkdir()
+        for file in shipped.iterdir() if shipped else ():
+            shutil.copyfile(file, new / file.name)  # without its mode and its age, by which old kernels are removed
+        new.rename(folder)
 
 
 _forget_once = cache(forget_unused)
@@ -241,17 +244,20 @@ def _locked(path: Path) -> Iterator[None]:
         yield
 
 
+_now_s = time.monotonic
+
+
 class _Compiling(event.Listener):  # type: ignore[misc]
     """Says on standard error that kernels are being compiled, how many, and that this happens once a machine."""
 
     def __init__(self) -> None:
         self._depth, self._count, self._took_s, self._began_s, self._told_s = 0, 0, 0.0, 0.0, 0.0
 
-    def on_start(self, _event: Any) -> None:
-        self._depth += 1
-        if self._depth > 1:  # what a kernel calls
+    def on_start(self, event: Any) -> None:
+        self._depth += self._depth > 0 or isinstance(event.data["dispatcher"]._cache, _KernelCache)
+        if self._depth != 1:  # what a kernel calls
             return
-        self._count, self._began_s = self._count + 1, time.monotonic()
+        self._count, self._began_s = self._count + 1, _now_s()
         if self._count == 2:
             print("compiling for this machine, which happens once and takes up to a minute ...", file=sys.stderr, flush=True)
             self._told_s = self._began_s
@@ -260,9 +266,9 @@ class _Compiling(event.Listener):  # type: ignore[misc]
             self._told_s = self._began_s
 
     def on_end(self, _event: Any) -> None:
-        self._depth -= 1
-        if self._depth == 0:
-            self._took_s += time.monotonic() - self._began_s
+        self._depth = max(0, self._depth - 1)
+        if self._depth == 0 and self._began_s:
+            self._took_s, self._began_s = self._took_s + _now_s() - self._began_s, 0.0
 
 
 def _path_of(module: str) -> str:
@@ -308,7 +314,10 @@ def _newest_s(file: Path, module: str) -> float:
 
 
 def _as_shipped() -> None:
-    """Let numba compile for the processor of the shipped kernels, where there are any and this one can run them."""
+    """Let numba compile for the processor of the shipped kernels, where there are any and this one can run them.
+
+    This holds for the whole process: kernels of others are compiled for that processor too.
+    """
     if SHIPPED.is_dir() and not _config.CPU_NAME and all(map(llvmlite.binding.get_host_cpu_features().get, PORTABLE_FEATURES)):
         _config.CPU_NAME, _config.CPU_FEATURES = PORTABLE_CPU, ""
 

@@ -45,5 +45,6 @@ def install_command(extra: str = "") -> str:
     source = ""
     with suppress(PackageNotFoundError, ValueError):
         # PEP 610: pip notes there what it was given.
-        source = str(json.loads(distribution("mrbokeh").read_text("direct_url.json") or "{}").get("url", ""))
+        noted = json.loads(distribution("mrbokeh").read_text("direct_url.json") or "{}")
+        source = f"{noted['vcs_info']['vcs']}+{noted['url']}" if "vcs_info" in noted else str(noted.get("url", ""))
     return f"pip install 'mrbokeh{chosen} @ {source}'" if source else f"pip install 'mrbokeh{chosen}'"

@@ -94,9 +94,18 @@ def test_a_sharp_picture_of_the_photograph_gives_what_stands_behind_the_near_edg
 
 def test_a_phones_photograph_brings_its_depth_and_its_sharp_original(shared_data: Path) -> None:
     path = shared_data / "rgbd" / "phone_lens_blur_gdepth.jpg"
-    phone, plate = read_phone_photo(path), plate_by(path, PlateOptions(), ColourOptions(), None, lens=LENS, focus_m=None, facts={})
-    assert phone is not None and plate.sharp_rgb is not None and plate.depth_m is not None and best_mode(plate) == "between"
+    phone, plate = read_phone_photo(path), plate_by(path, PlateOptions(), ColourOptions(), None, lens=None, focus_m=None, facts={})
+    assert (
+        phone is not None
+        and phone.focus is not None
+        and plate.sharp_rgb is not None
+        and plate.depth_m is not None
+        and best_mode(plate) == "between"
+    )
     np.testing.assert_array_equal(plate.sharp_rgb, phone.original_rgb)
+    # The lens is one with the blur that the phone put on: as GFocus states it, whatever the field of view.
+    assert plate.lens.coc_px(np.inf, 768) == pytest.approx(2.0 * phone.focus.blur_at_infinity * 1024, rel=1e-6)
+    assert plate.lens.focus_distance_m == phone.focus.focus_distance_m
     assert 12.42 <= plate.depth_m.min() < plate.depth_m.max() <= 390.6, "within Near and Far of the file"
 
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -96,24 +97,35 @@ def test_kernels_that_a_wheel_brings_are_found_and_copied_to_where_more_can_be_k
     brought = tmp_path / "shipped" / str(compiled.fingerprint(caller, "room.caller_numba"))
     brought.mkdir(parents=True)
     (brought / "scaled.nbc").write_bytes(b"machine code")
+    os.utime(brought, (time.time() - 86400 * 100,) * 2)
     monkeypatch.setattr(compiled, "SHIPPED", brought.parent)
     for base, found in ((tmp_path, tmp_path / brought.name), (None, brought)):
         monkeypatch.setattr(compiled, "_writable_base", lambda base=base: base)
         assert compiled.folder_of.__wrapped__(caller, "room.caller_numba") == found
         assert (found / "scaled.nbc").read_bytes() == b"machine code"
+    assert time.time() - (tmp_path / brought.name).stat().st_mtime < 3600, "a wheel may be old; its copy is not"
+
+
+class _KeptNowhere(compiled._KernelCache):
+    def __init__(self) -> None:
+        """Stand for the cache of a kernel of ours."""
 
 
 def test_compiling_is_said_once_and_counted_now_and_then(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Kernels that another one calls do not count, and a single small one is not worth a word."""
-    compiling, clock = compiled._Compiling(), iter(range(0, 100, 2))
-    monkeypatch.setattr(compiled.time, "monotonic", lambda: float(next(clock)))
+    compiling, clock = compiled._Compiling(), iter(range(1, 100, 2))
+    ours, others = (SimpleNamespace(data={"dispatcher": SimpleNamespace(_cache=each)}) for each in (_KeptNowhere(), None))
+    monkeypatch.setattr(compiled, "_now_s", lambda: float(next(clock)))
     for _ in range(4):
-        compiling.on_start(None)
-        compiling.on_start(None)
-        compiling.on_end(None)
-        compiling.on_end(None)
+        for event in (ours, others):
+            compiling.on_start(event)
+            compiling.on_end(event)
+            compiling.on_start(event)
+            compiling.on_start(others)
+            compiling.on_end(others)
+            compiling.on_end(event)
     first, *later = capsys.readouterr().err.splitlines()
-    assert "happens once" in first and later == ["compiled 3 kernels in 6 s ..."]
+    assert "happens once" in first and later == [f"compiled {n} kernels in {2 * n} s ..." for n in (3, 5, 7)]
 
 
 def test_a_lock_that_another_process_never_gives_back_is_waited_for_only_so_long(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -42,7 +42,7 @@ def ablate_command(
     lpips: Annotated[
         Path | None, typer.Option(help="Weights of LPIPS as .onnx, which are not shipped; without them it is left out.")
     ] = None,
-    threads: Annotated[int, typer.Option(min=0, help="CPU threads, 0 takes all.")] = 0,
+    threads: Annotated[int, typer.Option(min=0, max=4096, help="CPU threads, 0 takes all.")] = 0,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda.")] = "auto",
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print rows, settings and estimated time, and train nothing.")] = False,
 ) -> None:

@@ -38,7 +38,7 @@ def fit_command(
             help="paper: as published; demo: our gated form, learns in minutes on two cores; better: with kernels by place and colour."
         ),
     ] = Preset.paper,
-    minutes: Annotated[float | None, typer.Option(min=0.01, help="Budget in minutes; the learning rate follows it.")] = None,
+    minutes: Annotated[float | None, typer.Option(min=0.01, max=100_000.0, help="Budget in minutes; the learning rate follows it.")] = None,
     epochs: Annotated[int | None, typer.Option(min=1, help="Budget in epochs, instead of minutes.")] = None,
     held_out: Annotated[
         list[str] | None,
@@ -55,7 +55,7 @@ def fit_command(
             help="Any setting of settings.json (repeat for more), as in batch=4 or network.tile_px=96; none for no value.",
         ),
     ] = None,
-    threads: Annotated[int | None, typer.Option(min=0, help="CPU threads, 0 takes all.")] = None,
+    threads: Annotated[int | None, typer.Option(min=0, max=4096, help="CPU threads, 0 takes all.")] = None,
     device: Annotated[str | None, typer.Option(help="auto, cpu or cuda.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="Of weights and batches.")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Start again where a run exists.")] = False,
