@@ -70,9 +70,9 @@ class BankOptions:
 class BuildOptions:
     """Rays and replacement of the bank."""
 
-    rays: Annotated[int | None, typer.Option(help="Rays per kernel; 0 takes the closed form. (What suits the model where not given.)")] = (
-        None
-    )
+    rays: Annotated[
+        int | None, typer.Option(max=100_000_000, help="Rays per kernel; 0 takes the closed form. (What suits the model where not given.)")
+    ] = None
     seed: Annotated[int, typer.Option(min=0, help="Seed of the rays.")] = 0
     overwrite: Annotated[bool, typer.Option(help="Replace the bank where it exists.")] = False
 
@@ -99,10 +99,13 @@ def psf(
     typer.echo(f"wrote {out}: {len(bank.kernels)} kernels of up to {2 * bank.radius_px + 1} px")
 
 
+_MOST_STEPS = 1000
+
+
 def _steps(text: str) -> tuple[int, ...]:
-    expected = "expected --counts as whole numbers from 1 up with commas between them, such as 75,75"
+    expected = f"expected --counts as whole numbers from 1 to {_MOST_STEPS} with commas between them, such as 75,75"
     steps = numbers_in(text, expected, number=int)
-    if min(steps) < 1:
+    if not 1 <= min(steps) <= max(steps) <= _MOST_STEPS:
         raise InputError(f"{expected}, got {text!r}")
     return steps
 
