@@ -89,7 +89,7 @@ class BlurOptions:
     same_view: Annotated[
         bool, typer.Option("--same-view", help="Give the lens PHOTO's field of view (from its Exif), keep its f-number.")
     ] = False
-    highlights: Annotated[float, typer.Option(min=0.0, max=20.0, help="Take what is clipped to be so many stops brighter. 0: as stored.")] = 0.0
+    highlights: Annotated[float, typer.Option(min=0.0, max=20.0, help="What is clipped was so many stops brighter. 0: as stored.")] = 0.0
 
 
 @dataclass(frozen=True)
