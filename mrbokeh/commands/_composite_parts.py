@@ -227,7 +227,7 @@ def layers_by(
     if not still and not rendered and not files.deep:
         raise InputError("nothing to put into the photograph: give --object OBJ.glb, --scene SCENE.toml or --layer RGBAZ.exr")
     if standing.at_pixel and not rendered:
-        x_px, y_px = _pair(standing.at_pixel)
+        x_px, y_px = pair_of(standing.at_pixel)
         standing_there = standing_on_pixel(files.among(still), first, x_px, y_px)
         return lambda _: standing_there
     if standing.at_pixel and standing.object_ is None:
@@ -280,7 +280,7 @@ def _object_layers(glb: Path, options: ObjectOptions, rendering: RenderingOption
 
     if options.at and options.at_pixel:
         raise InputError("--at and --at-pixel both say where the object stands: give one of them")
-    stands_at_m = _triple(options.at) if options.at else first.point_under_pixel_m(*_pair(options.at_pixel))
+    stands_at_m = _triple(options.at) if options.at else first.point_under_pixel_m(*pair_of(options.at_pixel))
     light = Lighting(options.environment, exposure=options.exposure)
     turn, tilt = math.radians(options.turn), math.radians(options.tilt)
     one = OneObject(
@@ -347,7 +347,7 @@ def _triple(text: str) -> tuple[float, float, float]:
     return x_m, y_m, z_m
 
 
-def _pair(at_pixel: str | None) -> tuple[float, float]:
+def pair_of(at_pixel: str | None) -> tuple[float, float]:
     if at_pixel is None:
         raise InputError("where does the object stand? Give --at X,Y,Z in metres, or --at-pixel X,Y on a photograph with depth")
     x_px, y_px = numbers_in(at_pixel, "--at-pixel expects 2 numbers with commas between", (2,))

@@ -48,12 +48,14 @@ def composite(
         blur_told,
         check_outputs,
         layers_by,
+        pair_of,
         placing_warning,
         plate_by,
         require_options_of_stacks,
         write_results,
     )
     from mrbokeh.compositing.choose import best_mode, insertion_of
+    from mrbokeh.compositing.plate import with_ground_behind
     from mrbokeh.compositing.plate_look.finishing import finished, finishing_of
     from mrbokeh.renderers.choose import lens_and_renderer
     from mrbokeh.stacks.capture_bundle import is_bundle, read_bundle
@@ -90,8 +92,9 @@ def composite(
         typer.echo("warning: nothing of what is put in is in the picture: is it behind the camera, or beside the frame?", err=True)
     elif standing.object_ is not None and (warning := placing_warning(sharp, plate, mode, standing.height)):
         typer.echo(f"warning: {warning}", err=True)
+    seen = with_ground_behind(plate, pair_of(standing.at_pixel), sharp) if standing.at_pixel else plate
     with working("blurring"):
-        inserted = finished(insertion.insert(plate, sharp, renderer), plate, finishing)
+        inserted = finished(insertion.insert(seen, sharp, renderer), plate, finishing)
     write_results(out, inserted, plate, sharp, colour, result)
     if lost := alpha_lost(out, plate):
         typer.echo(f"warning: {lost}", err=True)

@@ -174,6 +174,31 @@ def with_depth(plate: Plate, source: Path, settings: DepthSettings) -> Plate:
     return replace(plate, depth_m=depth.depth_m)
 
 
+_SAME_SURFACE = 0.02
+"""Largest share by which depth changes from pixel to pixel of one surface."""
+
+
+def with_ground_behind(plate: Plate, foot_px: tuple[float, float], layers: Sequence[Layer]) -> Plate:
+    """Return the plate with the ground on which something stands no nearer than that, where it is seen above the foot.
+
+    A floor or a table is the farther the higher it is in the picture, so that it never hides what stands on it; depth that says otherwise
+    is wrong. The ground is what goes on from the foot without a jump of depth, but not below the foot, where near things stand.
+    """
+    import cv2
+
+    if plate.depth_m is None:
+        return plate
+    x_px, below = int(foot_px[0]), int(foot_px[1]) + 1
+    dioptres = np.log(np.minimum(plate.depth_m[:below], np.float32(1e6)))
+    found = np.zeros((below + 2, plate.depth_m.shape[1] + 2), np.uint8)
+    cv2.floodFill(dioptres, found, (x_px, below - 1), 0.0, _SAME_SURFACE, _SAME_SURFACE, 4 | (1 << 8) | cv2.FLOODFILL_MASK_ONLY)
+    covered_m = np.minimum.reduce([np.where(layer.alpha > 0.0, layer.depth_m, np.inf) for layer in layers])[:below]
+    depth_m = plate.depth_m.copy()
+    ground = (found[1:-1, 1:-1] > 0) & np.isfinite(covered_m)
+    depth_m[:below][ground] = np.maximum(depth_m[:below], covered_m)[ground]
+    return replace(plate, depth_m=depth_m)
+
+
 def with_matte(plate: Plate, path: Path) -> Plate:
     """The plate with a user's matte of what stands in front, whose numbers are taken as coverage."""
     return replace(plate, near_alpha=np.ascontiguousarray(read_image(path, "linear")[..., 1]))

@@ -13,7 +13,8 @@ from mrbokeh.commands._composite_options import PlateOptions
 from mrbokeh.commands._composite_parts import plate_by
 from mrbokeh.commands._insertion_options import ColourOptions
 from mrbokeh.commands.composite import app
-from mrbokeh.compositing.choose import best_mode
+from mrbokeh.compositing.choose import best_mode, insertion_of
+from mrbokeh.compositing.plate import plate_of, with_ground_behind
 from mrbokeh.demo.plan import DATA
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.exr_io import read_exr
@@ -22,6 +23,7 @@ from mrbokeh.images.layer import Layer, flatten
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.exr_layers.composite_exr import write_deep_exr
 from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
@@ -107,6 +109,24 @@ def test_a_phones_photograph_brings_its_depth_and_its_sharp_original(shared_data
     assert plate.lens.coc_px(np.inf, 768) == pytest.approx(2.0 * phone.focus.blur_at_infinity * 1024, rel=1e-6)
     assert plate.lens.focus_distance_m == phone.focus.focus_distance_m
     assert 12.42 <= plate.depth_m.min() < plate.depth_m.max() <= 390.6, "within Near and Far of the file"
+
+
+def test_the_ground_never_hides_what_stands_on_it_and_a_post_before_it_does() -> None:
+    """A table whose depth grows upwards from 1 to 2 m, wrong by a third in its right half above the foot, where it seems nearer."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    table_m = 1.0 + (HEIGHT - 1 - rows) / HEIGHT
+    wrong_m = table_m * (1.0 - np.clip((columns - WIDTH / 2) / 100, 0, 0.33) * (rows < 70)).astype(np.float32)
+    wrong_m[50:, 20:40] = 0.5
+    alpha = ((rows >= 30) & (rows <= 70) & (columns >= 10) & (columns < 130)).astype(np.float32)
+    foot_m = float(table_m[70, 72])
+    card = Layer(np.repeat(alpha[..., None], 3, axis=2), alpha, np.where(alpha > 0, foot_m, np.inf).astype(np.float32))
+    plate = plate_of(plate_rgb(), replace(LENS, focus_distance_m=foot_m), wrong_m)
+    hidden, whole = (
+        insertion_of("over").insert(each, [card], ScatterReference()).rgb for each in (plate, with_ground_behind(plate, (72, 70), [card]))
+    )
+    assert hidden[40, 120].max() < 0.5 < 0.95 < whole[40, 120].min(), "where depth is wrong"
+    assert whole[60, 30].max() < 0.5, "the post, whose own foot is nearer"
+    np.testing.assert_array_equal(hidden[80:], whole[80:])
 
 
 @pytest.mark.parametrize(
