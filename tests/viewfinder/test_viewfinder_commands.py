@@ -25,6 +25,7 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from mrbokeh.cli import SUB_COMMANDS
+from mrbokeh.commands.doctor import SHOWN
 from mrbokeh.images.image_io import write_layer
 from mrbokeh.images.layer import clear
 from mrbokeh.optics.camera import camera_to_json
@@ -314,3 +315,18 @@ def test_the_guide_names_every_option() -> None:
     options = {option for parameter in group.params for option in parameter.opts if option.startswith("--")}
     missing = {option for option in options - {"--help", "--method"} if option not in text}
     assert not missing, missing
+
+
+def test_the_demo_is_shown_before_anybody_watches_and_ends_with_ctrl_c() -> None:
+    """The shipped clip, board, lens and cake; the terminal says when the scene lies over a frame, which happens without a viewer."""
+    command = [sys.executable, "-m", "mrbokeh.cli", "viewfinder", "--demo", "--port", "0"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as process:
+        assert process.stdout is not None
+        told = []
+        for line in process.stdout:
+            told.append(line.strip())
+            if line.startswith(SHOWN):
+                process.send_signal(signal.SIGINT)
+    assert process.returncode == 0 and SHOWN in told and told[-1] == "viewfinder stopped", told
+    done = subprocess.run([*command, "--source", "test"], capture_output=True, text=True)
+    assert done.returncode == 2 and "give one of them" in done.stderr
