@@ -12,6 +12,7 @@ import numpy as np
 
 from mrbokeh.commands._composite_options import LensOptions, ObjectOptions, PlateOptions, RenderingOptions, ResultOptions
 from mrbokeh.commands._insertion_options import ColourOptions, LookGroup, VirtualOptions
+from mrbokeh.compositing.near_and_far import nearer_than
 from mrbokeh.compositing.plate import Inserted, Plate, bundle_plate, open_plate, with_depth, with_matte, with_own_alpha
 from mrbokeh.depth.depth_map import DepthSettings, parse_near_far
 from mrbokeh.images.alpha_io import HOLDING_ALPHA, alpha_with
@@ -136,6 +137,8 @@ def placing_warning(sharp: Sequence[Layer], plate: Plate, mode: str, height: str
     rows, columns = np.nonzero(alpha > 0.5)
     unit = "its file may count in another unit: say --height METRES, or such as --height 200px"
     mend = f"--height {height} may be wrong" if height else unit
+    if not alpha.any():
+        return None
     if float(alpha.sum()) < 1.0:
         return f"what is put in is smaller than a pixel; {mend}"
     whole = len(rows) and (np.ptp(rows) + 1, np.ptp(columns) + 1) == alpha.shape
@@ -144,7 +147,7 @@ def placing_warning(sharp: Sequence[Layer], plate: Plate, mode: str, height: str
     if plate.depth_m is None or mode == "front":
         return None
     depth_m = np.minimum.reduce([np.where(layer.alpha > 0.5, layer.depth_m, np.inf) for layer in sharp])
-    hidden = float((plate.depth_m < _NEARER * depth_m)[np.isfinite(depth_m)].mean())
+    hidden = float(nearer_than(plate.depth_m, depth_m, _NEARER).sum() / max(1, np.isfinite(depth_m).sum()))
     if hidden < _MUCH_HIDDEN:
         return None
     return f"{hidden:.0%} of it lies behind what the depth says is nearer; --mode front ignores depth"
@@ -203,7 +206,7 @@ if TYPE_CHECKING:
     from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples
 
 _COVERED = 0.5
-_HIGHEST, _NEARER, _MUCH_HIDDEN = 20.0, 0.97, 0.4
+_HIGHEST, _NEARER, _MUCH_HIDDEN = 20.0, 0.03, 0.4
 _HIGH_SHARE = 0.25
 """Share of the picture's height that an object takes whose size is neither told nor known."""
 

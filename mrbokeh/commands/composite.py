@@ -90,11 +90,12 @@ def composite(
     sharp = layers_for(plate)
     if not any((layer.alpha > 0).any() for layer in sharp):
         typer.echo("warning: nothing of what is put in is in the picture: is it behind the camera, or beside the frame?", err=True)
-    elif standing.object_ is not None and (warning := placing_warning(sharp, plate, mode, standing.height)):
+    if standing.at_pixel:
+        plate = with_ground_behind(plate, pair_of(standing.at_pixel), sharp)
+    if standing.object_ is not None and (warning := placing_warning(sharp, plate, mode, standing.height)):
         typer.echo(f"warning: {warning}", err=True)
-    seen = with_ground_behind(plate, pair_of(standing.at_pixel), sharp) if standing.at_pixel else plate
     with working("blurring"):
-        inserted = finished(insertion.insert(seen, sharp, renderer), plate, finishing)
+        inserted = finished(insertion.insert(plate, sharp, renderer), plate, finishing)
     write_results(out, inserted, plate, sharp, colour, result)
     if lost := alpha_lost(out, plate):
         typer.echo(f"warning: {lost}", err=True)

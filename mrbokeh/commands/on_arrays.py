@@ -111,8 +111,9 @@ def composite(
     else:
         layers = [each if isinstance(each, Layer) else read_layer(each) for each in given]
         layers = layers if at_pixel is None else standing_on_pixel(layers, plate, *at_pixel)
-    seen = plate if at_pixel is None else with_ground_behind(plate, at_pixel, layers)
-    return insertion_of(mode or best_mode(plate)).insert(seen, layers, _renderer(renderer)).rgb
+    if at_pixel is not None:
+        plate = with_ground_behind(plate, at_pixel, layers)
+    return insertion_of(mode or best_mode(plate)).insert(plate, layers, _renderer(renderer)).rgb
 
 
 def _rgb(given: np.ndarray | File, name: str) -> Rgb:
