@@ -7,6 +7,8 @@ import typer
 
 from mrbokeh.system.errors import InputError
 
+FEW = 3
+"""Of more failed gates only the names are printed: a wall of text hid that the picture was good. The page and --strict tell all."""
 HELP = "\n\n".join(
     (
         "Judge the stacks of a scene. Of every stack: is the all-in-focus picture as sharp as its slices, without seams and invented "
@@ -35,7 +37,7 @@ def report_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="examine again what was examined already")] = False,
 ) -> None:
     from capture.report import HTML_NAME
-    from capture.report.gates import by_use, tally, verdict_line, verdict_lines
+    from capture.report.gates import PICTURES, by_use, tally, verdict_line, verdict_lines
     from capture.report.scene_report import report_scene, require_gates, unmet
     from capture.report.stack_view import reblur_by
     from mrbokeh.system.console import kept_when_interrupted
@@ -45,13 +47,13 @@ def report_command(
         raise InputError(f"expected a folder with focal stacks, but {scene} is none")
     with kept_when_interrupted(f"what was found of finished stacks is kept in {scene}", overwrite):
         report = report_scene(scene, reblur_by(renderer), width, overwrite=overwrite)
-    for line in verdict_lines(report.gates):
-        typer.echo(line)
     for use, gates in by_use(report.gates).items():
         typer.echo(verdict_line(use, gates))
+        for line in verdict_lines(gates) if strict or use == PICTURES or len(report.failures) <= FEW else []:
+            typer.echo(f"  {line}")
     reused = sum(each.reused for each in report.stacks)
     before = f" ({reused} of {len(report.stacks)} stacks were examined before; --overwrite examines them again)" if reused else ""
-    typer.echo(f"{scene / HTML_NAME}: {tally(report.gates)}{before}")
+    typer.echo(f"{scene / HTML_NAME} shows the worst places and what to do: {tally(report.gates)}{before}")
     if report.failures and not strict:
         count = "1 gate failed" if len(report.failures) == 1 else f"{len(report.failures)} gates failed"
         typer.echo(f"{count}: --strict would make this an error (exit code 1)")

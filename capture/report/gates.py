@@ -322,6 +322,7 @@ STACK_RULES = (
 )
 
 
+PICTURES = "all-in-focus pictures"
 PICTURE_RULES = (SHARP, SEAMS, LIGHT)
 """Rules of the all-in-focus picture: a report that lacks a verdict on one of them is not passed."""
 
@@ -330,7 +331,7 @@ def by_use(gates: Sequence[Gate]) -> dict[str, list[Gate]]:
     """Return the gates of the all-in-focus pictures, and the others: a picture can be flawless though its depth is no good for training."""
     names = [rule.name for rule in (*PICTURE_RULES, PLACES)]
     uses = {
-        "all-in-focus pictures": [each for each in gates if each.name in names],
+        PICTURES: [each for each in gates if each.name in names],
         "depth and blur, for refocusing and training": [each for each in gates if each.name not in names],
     }
     return {use: of_use for use, of_use in uses.items() if of_use}

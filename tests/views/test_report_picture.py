@@ -298,9 +298,9 @@ def test_strict_asks_for_every_gate_and_fails_on_a_fault_whatever_is_allowed(tmp
     allowed = [option for name in GATE_NAMES for option in ("--allow-absent", name)]
     failed = printed_by(report_command, tmp_path, "--strict", *allowed, exit_code=1)
     *lines, last = printed_by(report_command, tmp_path).splitlines()
-    count = sum(each.startswith("failed: ") for each in lines)
-    assert count and last.startswith(f"{count} gate{'s' if count > 1 else ''} failed: --strict would make this an error")
-    line = next(each for each in failed.splitlines() if each.startswith("failed: "))
+    assert last.startswith(f"{len(report_scene(tmp_path).failures)} gate") and " failed: --strict would make this an error" in last
+    assert any(each.startswith(f"  failed: view_0: {SHARP.name}: ") for each in lines), "what spoils the picture is always told"
+    line = next(each for each in failed.splitlines() if each.startswith("  failed: "))
     assert f"view_0: {SHARP.name}: " in line and "Look at the crops." in line, "what failed, and what to do"
 
 
