@@ -1,13 +1,13 @@
 """Focus energies of all slices of a stack, in multiples of the noise, at a size that fits into memory."""
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from capture.stacks.slice_looks import detail_of_blocks
+from capture.stacks.slice_looks import block_means, detail_of_blocks
 
 _LAPLACIAN = np.array([[0, 1, 0], [1, -4, 1], [0, 1, 0]], np.float32)
 # The window of the energy is wide enough that every second pixel holds all of it.
@@ -59,6 +59,14 @@ class FocusVolume:
             before, after = self.energies[max(index - 1, 0)], self.energies[min(index + 1, last)]
             result[index] = energy + share * (before + after - 2.0 * energy)
         return result
+
+    def without(self, spread: Bool[np.ndarray, "slices height width"]) -> "FocusVolume":
+        """Return the volume without the say of some slices at some places, given at the size of the volume."""
+        if not spread.any():
+            return self
+        places = (block_means(self.enlarged(each.astype(np.float32), 0.0)) for each in spread)
+        details = tuple(np.where(place > 0, np.float32(0.0), detail) for place, detail in zip(places, self.details, strict=True))
+        return replace(self, energies=np.where(spread, np.float32(0.0), self.energies), details=details)
 
     def reduced(self, plane: np.ndarray) -> np.ndarray:
         """Return a picture of the stack's size at the size of the volume, every pixel being one of its own."""

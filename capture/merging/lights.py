@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Float32, Int, UInt8
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
+Codes = UInt8[np.ndarray, "slices height width"]
 PerLight = Float[np.ndarray, " lights"]
 PerPixel = Float[np.ndarray, " pixels"]
 
@@ -27,6 +28,16 @@ LEAST_SHARE_OF_LIGHT = 0.1
 # Print, paper and metal, which never fill it or are as large everywhere, do not.
 LEAST_GROWTH = 1.5
 UNSATURATED_SHARE = 0.92
+# Full places whose light grows as they do (`spread_light`): above this code, so many pixels in each slice, at most so wide (a share of the
+# picture), and this many times as large in several slices. Of the light that their growth would bring, this share is seen.
+_FULL_CODE = 245
+_LEAST_FULL_PX = 9
+_WIDEST_FULL = 0.06
+_LEAST_SPREAD = 1.5
+_FEWEST_SPREAD = 3
+_LEAST_NEW_LIGHT = 0.5
+# The rim of what is full has its say this far around it.
+_RIM_PX = 6
 
 
 @dataclass(frozen=True)
@@ -151,6 +162,32 @@ def _grows(areas_px: np.ndarray, peaks: np.ndarray, seen: np.ndarray) -> Bool[np
     holds = seen & (peaks < UNSATURATED_SHARE * peaks.max(axis=0))
     largest, least = np.where(seen, areas_px, 0.0).max(axis=0), np.where(seen, areas_px, np.inf).min(axis=0)
     return holds.any(axis=0) & (largest > LEAST_GROWTH * least)
+
+
+def spread_light(codes: Codes) -> Bool[np.ndarray, "slices height width"]:
+    """Return where slices are full, or beside it, because blur has spread a light there that the sensor could not hold.
+
+    codes: the square root of their light, 255 at white. Blur conserves light: a place that is full in all slices and brings more light
+    where it is larger was clipped where it is small, and is sharpest there. White print brings no more light out of focus.
+    """
+    full, light = codes >= _FULL_CODE, (codes / np.float32(255.0)) ** 2
+    result = np.zeros(codes.shape, bool)
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(full.any(axis=0).astype(np.uint8), connectivity=8)
+    for number, (x, y, width, height, area) in enumerate(boxes[1:], 1):
+        if area <= _LEAST_SPREAD * _LEAST_FULL_PX or max(width, height) > _WIDEST_FULL * codes.shape[2]:
+            continue
+        around = max(width, height) // 2 + _RIM_PX
+        box = (slice(max(y - around, 0), y + height + around), slice(max(x - around, 0), x + width + around))
+        mine, alone = full[:, *box] & (labels[box] == number), (labels[box] == number) | (labels[box] == 0)
+        areas, sums = mine.sum(axis=(1, 2)), (light[:, *box] * alone).sum(axis=(1, 2))
+        least = int(sums.argmin())
+        grown = areas - areas[least]
+        spread = (areas > _LEAST_SPREAD * areas[least]) & (grown > _LEAST_FULL_PX) & (sums - sums[least] > _LEAST_NEW_LIGHT * grown)
+        if areas.min() >= _LEAST_FULL_PX and np.count_nonzero(spread) >= _FEWEST_SPREAD:
+            rim = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _RIM_PX + 1,) * 2)
+            for index in np.flatnonzero(spread):
+                result[index, *box] |= cv2.dilate(mine[index].astype(np.uint8), rim) > 0
+    return result
 
 
 def no_lights(shape: tuple[int, ...]) -> Lights:

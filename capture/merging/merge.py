@@ -14,7 +14,7 @@ from jaxtyping import Float32
 from capture.merging.all_in_focus import NARROW_CROSSOVER, crossover_of, sharp_all_in_focus
 from capture.merging.depth_from_focus import focus_map, vetoed
 from capture.merging.focus_volume import focus_volume
-from capture.merging.lights import Extremes, no_lights
+from capture.merging.lights import Extremes, no_lights, spread_light
 from capture.merging.merged_pictures import depth_m_of, write_readable_pictures
 from capture.merging.metres.relative_stack import as_stated, in_focus_order, with_solved_blur
 from capture.merging.preferred_side import PREFERRED, Side, with_preferred
@@ -73,6 +73,7 @@ def _merged(stack: FocalStack, overwrite: bool, registration: Path | None, prefe
     extremes = Extremes()
     made = extremes.watching(track(slices.resampled(keep=not overwrite), f"{name}: register", len(stack)))
     volume = focus_volume(made, slices.valid, len(stack))
+    volume = volume.without(spread_light(volume.lights))
     merged, focus = _with_registration(stack, slices), focus_map(volume, no_lights(volume.shape), slices.saturated)
     sharp = sharp_all_in_focus(slices.stored, focus.focus_index, volume, _crossover(merged, volume.shape[1]))
     lights, restored = restored_lights(slices.stored, sharp, extremes, opening=known_opening(stack.lens))

@@ -8,7 +8,7 @@ import pytest
 
 from capture.merging.depth_from_focus import focus_map
 from capture.merging.focus_volume import focus_volume
-from capture.merging.lights import Extremes, Lights, find_lights, no_lights
+from capture.merging.lights import Extremes, Lights, find_lights, no_lights, spread_light
 from capture.merging.registration.alignment import register_stack
 from capture.merging.registration.plane_transforms import warp
 from capture.merging.restored_lights import Discs, measured_discs, opening_kernel, restored_lights, with_restored_lights
@@ -108,6 +108,19 @@ def test_a_light_behind_a_mirror_lens_is_drawn_anew_once_its_opening_is_known() 
     )
     np.testing.assert_array_equal(as_discs, merged)
     assert (as_rings - 0.05).sum() == pytest.approx(whole, rel=0.03)
+
+
+@pytest.mark.parametrize(("radiance", "largest_grown"), [(20.0, 1.5), (1.0, np.inf)], ids=["sun glint", "white print"])
+def test_a_glint_full_in_all_slices_has_no_say_where_blur_spreads_it_but_white_print_has(radiance: float, largest_grown: float) -> None:
+    """A disc of radius 8 px blurred by 0 to 6 px: 20 times full it is full to a radius of 8 to 14, just full it loses its rim to blur."""
+    y, x = np.mgrid[:64, :512]
+    kernels = [cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1,) * 2).astype(np.float32) for radius in range(7)]
+    disc = np.where(np.hypot(x - 250, y - 32) < 8.0, np.float32(radiance), np.float32(0.02))
+    blurred = np.minimum([cv2.filter2D(disc, -1, kernel / kernel.sum()) for kernel in kernels], FULL)
+    spread = spread_light((255.0 * np.sqrt(blurred)).astype(np.uint8))
+    for index, each in enumerate(spread):
+        assert each.any() == (((8.0 + index) / 8.0) ** 2 > largest_grown)
+        assert not each[:, :220].any() and each[32, 250] == each.any()
 
 
 @pytest.mark.parametrize("radius_px", [4.3, 17.0])
