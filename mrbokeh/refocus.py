@@ -99,11 +99,15 @@ class Refocusing:
             if abs(1.0 / distance_m - 1.0 / focus_m) < CAPTURED_DIOPTRES:
                 return self.stack.slice_rgb(index)
         rendered = self.rendered(focus_m)
+        result, darkest, brightest = rendered.copy(), rendered.copy(), rendered.copy()
         for index, carry in self._carried(captured, focus_m).items():
             plain, light = self.residuals_of(index)
-            weighted = carry.weight * plain + carry.light_weight * light
-            rendered = rendered + _smoothed(weighted, carry.sigma_px)
-        return rendered
+            result += _smoothed(carry.weight * plain + carry.light_weight * light, carry.sigma_px)
+            beside = self.stack.slice_rgb(index)
+            np.minimum(darkest, beside, out=darkest)
+            np.maximum(brightest, beside, out=brightest)
+        # Beyond what the slices beside it and rendering show, a residual is of something that blurs otherwise: black specks in a dark bag.
+        return np.clip(result, darkest, brightest)
 
     def lens_at(self, focus_m: float) -> Lens:
         return lens_at(self.stack, focus_m, self.lens)
