@@ -10,7 +10,6 @@ from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
-from scipy.interpolate import make_interp_spline
 
 from mrbokeh.distortion.distortion import LensDistortion
 from mrbokeh.images.layer import Layer
@@ -201,4 +200,6 @@ def _nodes(positions: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, " nodes"
 
 def _spline(nodes: Float64[np.ndarray, " nodes"], positions: Float64[np.ndarray, " n"]) -> Float64[np.ndarray, "n nodes"]:
     """Return the matrix that interpolates values at nodes by a cubic spline (not-a-knot)."""
+    from scipy.interpolate import make_interp_spline
+
     return np.asarray(make_interp_spline(nodes, np.eye(len(nodes)), k=3)(positions))

@@ -14,7 +14,6 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64
-from scipy.stats.qmc import Sobol
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene._lighting_numba import add_environment
@@ -119,6 +118,8 @@ def _hidden_sky(
     objects: _Objects, environment: Environment, surfaces: Surfaces, centre_m: Float64[np.ndarray, "3"], samples: int
 ) -> Float32[np.ndarray, "points 3"]:
     """Radiance that white surfaces lose as objects stand before the environment."""
+    from scipy.stats.qmc import Sobol
+
     lost = np.zeros((len(surfaces.alpha), 3), np.float32)
     points_m = surfaces.shadow_origin + centre_m
     sine2 = (objects.radius_m / np.maximum(np.linalg.norm(objects.middle_m - points_m, axis=1), 1e-12)) ** 2
