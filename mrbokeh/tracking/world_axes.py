@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Float, Float64
-from scipy.spatial.transform import Rotation
 
 from mrbokeh.optics.camera import Camera
 
@@ -82,6 +81,8 @@ _STEEP = 1e-9
 
 def stage_rotation(pan_deg: float, tilt_deg: float, roll_deg: float) -> Float[np.ndarray, "3 3"]:
     """Return intrinsic right-handed rotations about Z, X, Y, in this order."""
+    from scipy.spatial.transform import Rotation
+
     return np.asarray(Rotation.from_euler("ZXY", [pan_deg, tilt_deg, roll_deg], degrees=True).as_matrix())
 
 
