@@ -6,21 +6,28 @@ import signal
 import sys
 import tempfile
 import traceback
-from contextlib import suppress
+from contextlib import redirect_stderr, suppress
 from importlib import import_module
 from pathlib import Path
+from threading import Timer
 from types import FrameType
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from rich.console import Console
 from typer.core import TyperGroup
 from typer.main import get_command
 
+from mrbokeh.system.atomic_files import writing_alone
+from mrbokeh.system.channel import channel, object_on_stdout, opened, remove_unfinished, write_object
 from mrbokeh.system.errors import FAULT, INTERRUPTED, InputError, MissingExtraError
 
 # OpenCV's threads otherwise spin while they wait for work: a tenth of the CPU time of a merge. It is read when OpenCV is imported.
 os.environ.setdefault("OPENCV_THREAD_POOL_ACTIVE_WAIT_WORKER", "0")
+
+EVERY = "Every command"
+LATEST_S = 1.5
+"""Time from Ctrl-C to the end of the process at the latest."""
 
 # Where a module can be missing because its extra was not installed.
 EXTRA_OF_MODULE = {
@@ -67,6 +74,62 @@ def _placeholder(name: str, summary: str) -> Any:
     return get_command(app)
 
 
+_every = typer.Typer(add_completion=False)
+
+
+@_every.command()
+def _options_of_every_command(
+    quiet: Annotated[bool, typer.Option("--quiet", help="Say only errors and the result.", rich_help_panel=EVERY)] = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print one JSON object of what was done; words go to standard error.", rich_help_panel=EVERY)
+    ] = False,
+    log: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Append all that is said to FILE, with times.", rich_help_panel=EVERY)
+    ] = None,
+) -> None: ...
+
+
+def command_of(name: str) -> Any:
+    """Load the sub-command of that name; it and what lies in it have the options of every command."""
+    command = get_command(import_module(SUB_COMMANDS[name].module).app)
+    command.name = name
+    _heard(command, name)
+    return command
+
+
+def _heard(command: Any, path: str) -> None:
+    """Give a command and what lies in it the options of every command, and let it speak through the channel."""
+    for name, each in getattr(command, "commands", {}).items():
+        _heard(each, f"{path} {name}")
+    if hasattr(command, "commands") and not command.invoke_without_command:
+        return
+    callback = command.callback
+    command.params = [*command.params, *get_command(_every).params]
+
+    def run(quiet: bool, as_json: bool, log: Path | None, **given: Any) -> None:  # noqa: ARG001
+        speaking = channel()
+        paths: dict[str, Any] = {}
+        for name, value in ((name.rstrip("_"), value) for name, value in given.items()):
+            there = [each for each in (value if isinstance(value, list | tuple) else [value]) if isinstance(each, Path) and each.exists()]
+            paths |= {name: there if isinstance(value, list) else there[0]} if there else {}
+            if log is not None and log.exists() and any(each.exists() and each.samefile(log) for each in there):
+                raise InputError(f"--log {log} would be written into what --{name.replace('_', '-')} names: give it another name")
+        speaking.command, speaking.inputs, speaking.quiet = path, paths, speaking.quiet or quiet
+        if log is not None:
+            speaking.log = log.open("a", encoding="utf-8", errors="backslashreplace")
+            speaking.said(" ".join(["mrbokeh", *sys.argv[1:]]))
+        with writing_alone(_written_to(given)), open(os.devnull, "w") as nobody, redirect_stderr(nobody if quiet else sys.stderr):
+            callback(**given)
+
+    command.callback = run
+
+
+def _written_to(given: dict[str, Any]) -> Path | None:
+    """Return OUT, or the scene whose stacks a command of `capture` works on in place."""
+    out, scene = given.get("out"), given.get("scene")
+    return (out or (scene if scene is not None and scene.is_dir() else None)) if _is_first() else None
+
+
 class LazyGroup(TyperGroup):
     """A group that loads a sub-command's module when the sub-command is called (or completed, or asked for help)."""
 
@@ -76,10 +139,7 @@ class LazyGroup(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         name, command, rest = super().resolve_command(ctx, args)
-        if name in SUB_COMMANDS:
-            command = get_command(import_module(SUB_COMMANDS[name].module).app)
-            command.name = name
-        return name, command, rest
+        return name, command_of(name) if name in SUB_COMMANDS else command, rest
 
 
 app = typer.Typer(
@@ -108,24 +168,58 @@ def _root(
 
 def main() -> None:
     """Run the console script: mistakes of the user end in one sentence and exit code 2, faults of ours in one and exit code 1."""
-    interrupted = _noted_interrupts()
+    interrupted, wants_object = _noted_interrupts(), "--json" in sys.argv[1:]
+    with opened(), object_on_stdout(wants_object) as out:
+        code, error = _run(wants_object, interrupted)
+        interrupted.clear()
+        if error:
+            _complain(error)
+        try:
+            if wants_object:
+                write_object(out, code, error)
+            out.flush()
+        except OSError:  # a pipe that nobody reads any more, or a full disk
+            os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())
+            code = code or FAULT
+    sys.exit(code)
+
+
+def _run(wants_object: bool, interrupted: list[int]) -> tuple[int, str]:
+    """Run the command and return its exit code, and the sentence to end with or ""."""
+    code: Any = 0
     try:
-        app()
+        code = app(standalone_mode=False) if wants_object else app()
+    except SystemExit as left:
+        code = left.code
     except Exception as error:
-        mistake = _mistake(error)
-        if mistake:
-            _fail(mistake)
-        if interrupted:
-            sys.exit(INTERRUPTED)
-        if sys.argv[1:2] == ["--debug"]:
-            raise
-        _fail(_fault(error), FAULT)
+        if mistake := _mistake(error):
+            return 2, mistake
+        if not interrupted:
+            if sys.argv[1:2] == ["--debug"]:
+                raise
+            return FAULT, _fault(error)
+        code = INTERRUPTED
+    code = code if isinstance(code, int) else int(code is not None)
+    return code, _stopped() if code >= INTERRUPTED and _is_first() else ""
+
+
+def _is_first() -> bool:
+    """Return whether this process speaks and writes for all that torchrun has started."""
+    return os.environ.get("RANK", "0") == "0"
+
+
+def _stopped() -> str:
+    """Return what Ctrl-C left of the results."""
+    written = ", ".join(map(str, channel().written()))
+    return channel().kept or ("stopped: " + (f"finished before: {written}" if written else "nothing was written"))
 
 
 def _mistake(error: Exception) -> str:
     """Return the sentence for an error that the user can mend, else ""."""
     if isinstance(error, InputError):
         return str(error)
+    if hasattr(error, "format_message"):  # of the parser, where it does not print itself
+        return str(error.format_message())
     if isinstance(error, ModuleNotFoundError):
         extra = EXTRA_OF_MODULE.get((error.name or "").partition(".")[0])
         return str(MissingExtraError(str(error.name), extra)) if extra else ""
@@ -154,11 +248,24 @@ def _fault(error: Exception) -> str:
 
 
 def _noted_interrupts() -> list[int]:
-    """Return a list that fills with interrupts. Ctrl-C raises KeyboardInterrupt, but compilers may turn that into another error."""
+    """Return a list that fills with interrupts. Ctrl-C raises KeyboardInterrupt, but compilers may turn that into another error.
+
+    A process whose threads still compute LATEST_S after it ends at once.
+    """
     noted: list[int] = []
+
+    def leave_now() -> None:
+        if signal.getsignal(signal.SIGINT) is note:
+            if noted:
+                _complain(_stopped())
+            remove_unfinished()
+            os._exit(INTERRUPTED)
 
     def note(number: int, frame: FrameType | None) -> None:
         noted.append(number)
+        late = Timer(LATEST_S, leave_now)
+        late.daemon = True
+        late.start()
         signal.default_int_handler(number, frame)
 
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -179,11 +286,14 @@ def _refused(error: OSError) -> str:
     return f"{shown}: {(error.strerror or 'the system refused it').lower()}; check the name, the space left and who may write there"
 
 
-def _fail(message: str, code: int = 2) -> None:
-    console = Console(stderr=True, soft_wrap=True)
-    console.print("error:", style="bold red", end=" ")
-    console.print(message, markup=False, highlight=False)
-    sys.exit(code)
+def _complain(message: str) -> None:
+    stopped = message.startswith("stopped")
+    channel().said(message if stopped else f"error: {message}")
+    with suppress(OSError):
+        console = Console(stderr=True, soft_wrap=True)
+        if not stopped:
+            console.print("error:", style="bold red", end=" ")
+        console.print(message, markup=False, highlight=False)
 
 
 if __name__ == "__main__":

@@ -8,6 +8,7 @@ import typer
 
 import mrbokeh
 from mrbokeh.optics.lens import Lens
+from mrbokeh.system.channel import say, tell
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.typed_numbers import numbers_in
 from viewfinder.options import CalibrationOptions, ListeningOptions, PhoneOptions, TrackingOptions, ViewfinderOptions
@@ -102,7 +103,7 @@ def viewfinder(
         source, board, lens = str(_DEMO / "clip.mp4"), board or _DEMO / "board.json", lens or [_DEMO / "lens.json"]
         scene = scene or (_DEMO / "scene.toml" if layer is None else None)
     if source is None:
-        typer.echo(context.get_help())
+        say(context.get_help())
         raise InputError("nothing to show: expected --source (a clip, a webcam's number, a URL, or test), or --demo for the shipped clip")
     from viewfinder.app.running import serve
 
@@ -169,12 +170,12 @@ def board_command(
     # Without a lens that of a phone, to which everything on the table is nearly sharp.
     used = read_lens(lens) if lens is not None else Lens(5.0, 2.0, 2.0 / (1.0 / nearest_m + 1.0 / farthest_m), 6.4)
     plan = plan_board(BoardView(used, nearest_m, farthest_m, width_px), paper)
-    typer.echo(plan.sentence)
+    say(plan.sentence)
     if plan.board is None or plan.paper is None:
         raise InputError("no paper holds a board that this lens can read: take a larger f-number, or stand farther away")
     write_board_pdf(out, plan.board, plan.paper, overwrite=overwrite)
     write_board(out.with_suffix(".json"), plan.board)
-    typer.echo(f"wrote {out} (print it at 100 %) and {out.with_suffix('.json')} (for --board)")
+    tell(f"wrote {out} (print it at 100 %) and {out.with_suffix('.json')} (for --board)")
 
 
 @app.command("calibrate-phone")

@@ -2,6 +2,8 @@
 
 import typer
 
+from mrbokeh.system.channel import show, tell
+
 HELP = "\n\n".join(
     (
         "List the cameras that libgphoto2 finds, and what each can do over the cable: release, drive the focus, live view, RAW.",
@@ -12,7 +14,6 @@ HELP = "\n\n".join(
 
 
 def cameras_command() -> None:
-    from rich.console import Console
     from rich.table import Table
 
     from capture.tether.camera_driver import Ability
@@ -21,10 +22,10 @@ def cameras_command() -> None:
 
     cameras = list_cameras()
     if not cameras:
-        typer.echo(NOTHING_FOUND)
+        tell(NOTHING_FOUND)
         raise typer.Exit(1)
     table = Table("camera", "port", *(str(each) for each in Ability), "")
     for found in cameras:
         abilities = found.description.abilities if found.description else frozenset()
         table.add_row(found.model, found.port, *("yes" if each in abilities else "-" for each in Ability), found.problem)
-    Console().print(table)
+    show(table, cameras=[{"model": each.model, "port": each.port} for each in cameras])

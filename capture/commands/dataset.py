@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mrbokeh.system.channel import guess, tell, warn
 from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
@@ -61,13 +62,16 @@ def dataset_command(
     with kept_when_interrupted(f"finished stacks are kept in {out}", overwrite):
         dataset = write_dataset(scenes, out, plan, overwrite)
     train, held_out = len(dataset.records("train")), len(dataset.records("test"))
-    typer.echo(
+    tell(
         f"{out}: {train} stacks to train on, {held_out} to test on{_slices_held_out(dataset)}; "
         f"largest circle of confusion {dataset.largest_coc_px:.1f} px "
-        f"(N = {dataset.network_blocks}), radiance scale {dataset.radiance_scale:.4g}"
+        f"(N = {dataset.network_blocks}), radiance scale {dataset.radiance_scale:.4g}",
+        stacks_to_train=train,
+        stacks_to_test=held_out,
+        largest_coc_px=dataset.largest_coc_px,
     )
     if note := metres_notes([*dataset.focal_stacks("train"), *dataset.focal_stacks("test")]):
-        typer.echo(note)
+        guess(note)
 
 
 def _slices_held_out(dataset: "FocalStackDataset") -> str:
@@ -94,8 +98,8 @@ def _verify(out: Path) -> None:
     dataset = read_focal_stack_dataset(out)
     troubles = verify(dataset)
     for each in troubles:
-        typer.echo(each, err=True)
+        warn(each)
     files = sum(len(each.files) for each in dataset.stacks)
-    typer.echo(f"{out}: {files} files, {len(troubles)} wrong")
+    tell(f"{out}: {files} files, {len(troubles)} wrong")
     if troubles:
         raise typer.Exit(1)

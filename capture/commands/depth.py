@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from mrbokeh.system.channel import say, tell, warn
+
 HELP = "\n\n".join(
     (
         "Find dense depth in metres for every stack that has a pose, from neighbouring views and focus together, and make its "
@@ -38,11 +40,11 @@ def depth_command(
     with kept_when_interrupted(f"finished stacks are kept in {scene}", overwrite):
         result = deepen_scene(scene, settings)
     for stack in result.stacks:
-        typer.echo(f"{stack.folder}: depth.exr (metres, {stack.depth_valid().mean():.0%} trusted), all_in_focus.exr, {SHEET_NAME}")
+        tell(f"{stack.folder}: depth.exr (metres, {stack.depth_valid().mean():.0%} trusted), all_in_focus.exr, {SHEET_NAME}")
         if stack.folder in retouched and not retouches_text(stack):
-            typer.echo(
-                f"  its retouches ({retouched[stack.folder]}) stay at most where depth is not trusted: look at the picture, and give "
-                "--from-slice and --mask to `capture merge` again where they are gone"
+            warn(
+                f"{stack.folder}: its retouches ({retouched[stack.folder]}) stay at most where depth is not trusted: "
+                "look at the picture, and give --from-slice and --mask to `capture merge` again where they are gone"
             )
     if result.left_out:
-        typer.echo(f"without a pose or with guessed metres, depth from focus only: {', '.join(result.left_out)}")
+        say(f"without a pose or with guessed metres, depth from focus only: {', '.join(result.left_out)}")

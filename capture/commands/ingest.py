@@ -40,8 +40,6 @@ def ingest_command(
     max_width: Annotated[int | None, typer.Option(min=16, metavar="N", help="reduce wider pictures to N pixels (area averages)")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="make all slices again")] = False,
 ) -> None:
-    from rich.console import Console
-
     from capture.stacks.grouping import Grouping
     from capture.stacks.ingest import IngestSettings, ingest, print_report
     from capture.stacks.stack_ingest import Development
@@ -54,7 +52,7 @@ def ingest_command(
     development = Development(parse_white_balance(white_balance), half_size, max_width)
     with kept_when_interrupted(f"finished slices are kept in {out}", overwrite):
         report = ingest(photographs, out, IngestSettings(Grouping(group), development, sidecar, overwrite))
-    print_report(report, Console())
+    print_report(report)
 
 
 def parse_white_balance(text: str) -> tuple[float, float, float] | None:

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from mrbokeh.system.atomic_files import require_safe_outputs
+from mrbokeh.system.channel import tell, warn
 from mrbokeh.system.errors import InputError
 
 HELP = "\n\n".join(
@@ -64,13 +65,14 @@ def matchmove_command(
     told_by = next((name for name, told in (("board", board), ("ruler", ruler), ("distance", distance)) if told), None)
     scale = "scale arbitrary" if told_by is None else f"in metres, by the {told_by}"
     lost = f", {len(made.lost)} lost ({', '.join(map(str, made.lost[:8]))}{', ...' if len(made.lost) > 8 else ''})" if made.lost else ""
-    typer.echo(
+    tell(
         f"{out}: {len(made.track.frames)} of {made.frame_count} frames from {len(made.model.views)} keyframes{lost}; {scale}; "
-        f"residual {made.residual_px:.2f} px RMS, median parallax {made.parallax_deg:.1f} degrees"
+        f"residual {made.residual_px:.2f} px RMS, median parallax {made.parallax_deg:.1f} degrees",
+        frames=len(made.track.frames),
+        residual_px=made.residual_px,
+        parallax_deg=made.parallax_deg,
     )
     if made.warnings:
-        typer.echo(
-            f"warning: this track may be wrong: {'; '.join(made.warnings)}; lay a grid on the ground and look before you trust it", err=True
-        )
+        warn(f"this track may be wrong: {'; '.join(made.warnings)}; lay a grid on the ground and look before you trust it")
     if missing:
-        typer.echo(f"{out} cannot hold and lacks: {', '.join(missing)}", err=True)
+        warn(f"{out} cannot hold and lacks: {', '.join(missing)}")

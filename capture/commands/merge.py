@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from mrbokeh.system.channel import say, tell
 from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
@@ -73,15 +74,15 @@ def merge_command(
         _tell(stack)
         for told in (stack.metadata.get(ORDER), metres_note(stack) or metres_facts(stack).get("why")):
             if told:
-                typer.echo(f"  {told}")
+                say(f"  {told}")
         for line in preferred_lines(stack):
-            typer.echo(f"  {line}")
+            say(f"  {line}")
         if prefer is not None and preferred_side(stack) != prefer:
-            typer.echo(f"  merged before, without --prefer {prefer}: --overwrite merges it again")
+            say(f"  merged before, without --prefer {prefer}: --overwrite merges it again")
         if stack.folder in retouched:
-            typer.echo(f"  merged anew without its retouches ({retouched[stack.folder]}): give --from-slice and --mask again")
+            say(f"  merged anew without its retouches ({retouched[stack.folder]}): give --from-slice and --mask again")
         if told := scaled.get(stack.folder):
-            typer.echo(f"  merged anew without what was told of it: tell it again by `mrbokeh capture scale {stack.folder} {told}`")
+            say(f"  merged anew without what was told of it: tell it again by `mrbokeh capture scale {stack.folder} {told}`")
     _tell_of_report(stacks)
 
 
@@ -91,7 +92,7 @@ def _tell(stack: "FocalStack") -> None:
 
     depth = "depth in metres" if stack.metres_known else "depth in guessed metres"
     files = ", ".join([*readable_names(stack), SHEET_NAME])
-    typer.echo(f"{stack.folder}: all_in_focus.exr, depth.exr ({depth}), {files}")
+    tell(f"{stack.folder}: all_in_focus.exr, depth.exr ({depth}), {files}")
 
 
 def _tell_of_report(stacks: "list[FocalStack]") -> None:
@@ -100,7 +101,7 @@ def _tell_of_report(stacks: "list[FocalStack]") -> None:
 
     for report in {folder / HTML_NAME for stack in stacks for folder in (stack.folder, stack.folder.parent)}:
         if report.is_file() and any(report.stat().st_mtime < stack.all_in_focus_path.stat().st_mtime for stack in stacks):
-            typer.echo(f"{report} is of pictures from before: run `mrbokeh capture report {report.parent}` again")
+            say(f"{report} is of pictures from before: run `mrbokeh capture report {report.parent}` again")
 
 
 def _retouch(scene: Path, slices: list[int], masks: list[Path]) -> "FocalStack":
@@ -108,5 +109,5 @@ def _retouch(scene: Path, slices: list[int], masks: list[Path]) -> "FocalStack":
 
     stack = retouch_scene(scene, slices, masks)
     _tell(stack)
-    typer.echo(f"  retouched: {retouches_text(stack)}")
+    say(f"  retouched: {retouches_text(stack)}")
     return stack

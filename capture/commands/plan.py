@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mrbokeh.system.channel import tell
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.typed_numbers import numbers_in
 
@@ -45,8 +46,6 @@ def plan_command(
     csv: Annotated[Path | None, typer.Option(metavar="plan.csv", help="the table, for shooting by hand")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace files that exist")] = False,
 ) -> None:
-    from rich.console import Console
-
     from capture.tether.focus_plan import plan_focus, plan_for_motor, print_plan, write_plan, write_plan_table
     from mrbokeh.images.image_io import require_suffix
     from mrbokeh.system.atomic_files import require_safe_outputs
@@ -64,13 +63,13 @@ def plan_command(
     else:
         plan = plan_focus(planned_lens, focus_range, image_width, residual)
     plan = plan if scale is None else rounded_to(plan, scale)
-    print_plan(plan, Console())
+    print_plan(plan)
     if out is not None:
         write_plan(out, plan)
-        typer.echo(f"wrote {out}")
+        tell(f"wrote {out}")
     if csv is not None:
         write_plan_table(csv, plan)
-        typer.echo(f"wrote {csv}")
+        tell(f"wrote {csv}")
 
 
 def planned_for(

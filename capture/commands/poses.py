@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from mrbokeh.system.channel import tell, warn
 from mrbokeh.system.errors import InputError
 
 HELP = "\n\n".join(
@@ -56,9 +57,12 @@ def poses_command(
     with kept_when_interrupted(f"COLMAP's finished stages are kept in {where}", overwrite):
         model = find(settings)
     placed, total = len(model.views), len(model.views) + len(model.left_out)
-    typer.echo(
+    tell(
         f"{where}: {placed} of {total} viewpoints placed, {len(model.points)} points, reprojection error "
-        f"{model.errors_px.mean():.2f} px, median parallax {median_parallax_deg(model):.1f} degrees"
+        f"{model.errors_px.mean():.2f} px, median parallax {median_parallax_deg(model):.1f} degrees",
+        viewpoints_placed=placed,
+        viewpoints=total,
+        error_px=float(model.errors_px.mean()),
     )
     if model.left_out:
-        typer.echo(f"left out, for they do not connect to the others: {', '.join(model.left_out)}")
+        warn(f"left out, for they do not connect to the others: {', '.join(model.left_out)}")

@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+from mrbokeh.system.channel import say
+
 if TYPE_CHECKING:
     from mrbokeh.stacks.focal_stack import FocalStack
 
@@ -59,18 +61,18 @@ def process_command(
     if board is not None:
         board_from_options(board, square_mm, marker_mm, "DICT_4X4_50")
     if (out / SESSION_NAME).exists() and not overwrite:
-        typer.echo(f"{out} is there already: what is finished is kept, the rest goes on (--overwrite makes all of it again)")
+        say(f"{out} is there already: what is finished is kept, the rest goes on (--overwrite makes all of it again)")
     with undone_when_refused(out, _is_of_use):
         ingest_command(photographs, out, sidecar=sidecar, max_width=max_width, overwrite=overwrite)
         merge_command(out, prefer=prefer, overwrite=overwrite)
     if len(find_focal_stacks(out)) < 2:
-        typer.echo("one viewpoint: depth comes from focus alone (photograph five or more for depth from several views)")
+        say("one viewpoint: depth comes from focus alone (photograph five or more for depth from several views)")
     else:
         try:
             poses_command(out, overwrite=overwrite)
         except InputError as error:
             unused = " (--board and --distance are not used)" if board or distance else ""
-            typer.echo(f"no camera poses, so depth comes from focus alone{unused}: {error}")
+            say(f"no camera poses, so depth comes from focus alone{unused}: {error}")
         else:
             scale_command(out, board=board, square_mm=square_mm, marker_mm=marker_mm, distance=distance, overwrite=overwrite)
             depth_command(out, overwrite=overwrite)

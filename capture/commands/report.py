@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from mrbokeh.system.channel import say
 from mrbokeh.system.errors import InputError
 
 FEW = 3
@@ -48,17 +49,17 @@ def report_command(
     with kept_when_interrupted(f"what was found of finished stacks is kept in {scene}", overwrite):
         report = report_scene(scene, reblur_by(renderer), width, overwrite=overwrite)
     for use, gates in by_use(report.gates).items():
-        typer.echo(verdict_line(use, gates))
+        say(verdict_line(use, gates))
         for line in verdict_lines(gates) if strict or use == PICTURES or len(report.failures) <= FEW else []:
-            typer.echo(f"  {line}")
+            say(f"  {line}")
     reused = sum(each.reused for each in report.stacks)
     before = f" ({reused} of {len(report.stacks)} stacks were examined before; --overwrite examines them again)" if reused else ""
-    typer.echo(f"{scene / HTML_NAME} shows the worst places and what to do: {tally(report.gates)}{before}")
+    say(f"{scene / HTML_NAME} shows the worst places and what to do: {tally(report.gates)}{before}")
     if report.failures and not strict:
         count = "1 gate failed" if len(report.failures) == 1 else f"{len(report.failures)} gates failed"
-        typer.echo(f"{count}: --strict would make this an error (exit code 1)")
+        say(f"{count}: --strict would make this an error (exit code 1)")
     short_of = unmet(report, allowed) if strict else []
     if any(not each.failed for each in short_of):
-        typer.echo('--strict: gates that may stay unjudged are named one by one, as in --allow-absent "scales agree"')
+        say('--strict: gates that may stay unjudged are named one by one, as in --allow-absent "scales agree"')
     if short_of:
         raise typer.Exit(1)

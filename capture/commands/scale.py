@@ -5,6 +5,7 @@ from typing import Annotated, Literal
 
 import typer
 
+from mrbokeh.system.channel import guess, tell
 from mrbokeh.system.errors import InputError
 
 _DICTIONARY = "DICT_4X4_50"
@@ -90,7 +91,7 @@ def scale_command(
     wanted_board = None if board is None else board_from_options(board, square_mm, marker_mm, dictionary)
     wanted_distance = None if distance is None else parse_distance(distance)
     for line in scale_lines(scale_scene(scene, ScaleRequest(wanted_board, wanted_distance, calibrate, overwrite))):
-        typer.echo(line)
+        tell(line)
 
 
 def _tell(folder: Path, rulers: list[str], distances: list[str], nearest: str | None, overwrite: bool) -> None:
@@ -108,15 +109,15 @@ def _tell(folder: Path, rulers: list[str], distances: list[str], nearest: str | 
     stack = stacks[0]
     if nearest is not None:
         stack = apply_known_nearest(stack, nearest == "first")
-        typer.echo(f"{stack.folder}: the {nearest} slice is the nearest")
+        tell(f"{stack.folder}: the {nearest} slice is the nearest")
     if facts:
-        typer.echo("\n".join(lines_of(apply_known_metres(stack, facts, overwrite))))
+        tell("\n".join(lines_of(apply_known_metres(stack, facts, overwrite))))
     elif note := metres_note(stack):
-        typer.echo(note)
+        guess(note)
 
 
 def _apply(scene: Path, path: Path) -> None:
     from capture.poses.lens_calibration import calibrate_scene, read_lens_calibration
 
     for stack in calibrate_scene(scene, read_lens_calibration(path)):
-        typer.echo(f"{stack.folder}: focus distances calibrated by {path}")
+        tell(f"{stack.folder}: focus distances calibrated by {path}")

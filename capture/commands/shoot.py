@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mrbokeh.system.channel import say, tell
 from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
@@ -93,8 +94,8 @@ def shoot_command(
             planned_distances=planned_distances,
             overwrite=overwrite,
         )
-        log = shoot(planned, driver, out, options, Surroundings(say=typer.echo))
-    typer.echo(f"{len(log.slices)} slices in {out}. Next: mrbokeh capture ingest {out} --out SCENE")
+        log = shoot(planned, driver, out, options, Surroundings(say=say))
+    tell(f"{len(log.slices)} slices in {out}. Next: mrbokeh capture ingest {out} --out SCENE")
 
 
 def watch(driver: "CameraDriver", spot: "Spot | None") -> None:
@@ -122,5 +123,5 @@ def measured(
     with working("measuring what the steps of the motor mean"):
         steps = measure_focus_steps(axis, driver, targets, step=step)
     write_focus_steps(path, steps)
-    typer.echo(f"{steps.dioptres_per_step:.3g} dioptres per step, kept in {path}")
+    say(f"{steps.dioptres_per_step:.3g} dioptres per step, kept in {path}")
     return steps

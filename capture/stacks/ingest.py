@@ -12,7 +12,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
 from capture.photos.developing import is_raw
@@ -26,6 +25,7 @@ from capture.stacks.slice_files import reporting_full_disk
 from capture.stacks.stack_description import FEWEST_TO_MERGE, StackReport, finish_stack, finished_before, ingest_digest, lens_text
 from capture.stacks.stack_ingest import Development, StackWork, stack_work
 from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.channel import say, show, warn
 from mrbokeh.system.console import progress_bars
 from mrbokeh.system.errors import InputError
 
@@ -156,21 +156,21 @@ def _nothing_usable(given: Sequence[Path], skipped: Sequence[SkippedFile]) -> st
 _MOST_NAMED = 5
 
 
-def print_report(report: IngestReport, console: Console) -> None:
+def print_report(report: IngestReport) -> None:
     """Print one line for each stack, then remarks and skipped files with their reasons."""
     table = Table("stack", "slices", "size", "focus (from the lens)", "lens", "skipped")
     for each in report.stacks:
         table.add_row(*_cells(each))
-    console.print(table)
+    show(table, stacks=[{"stack": each.name, "problem": each.problem, "remarks": list(each.remarks)} for each in report.stacks])
     for each in report.stacks:
         for remark in each.remarks:
-            console.print(f"{each.name}: {remark}", highlight=False, markup=False, soft_wrap=True)
+            say(f"{each.name}: {remark}")
         if each.problem:
-            console.print(f"no stack {each.name}: {each.problem}", style="yellow", highlight=False, markup=False, soft_wrap=True)
+            warn(f"no stack {each.name}: {each.problem}")
     for skipped in (*report.skipped, *(one for each in report.stacks for one in each.skipped)):
-        console.print(f"skipped {skipped.path.name}: {skipped.reason}", style="yellow", highlight=False, markup=False, soft_wrap=True)
+        warn(f"skipped {skipped.path.name}: {skipped.reason}")
     if report.no_photographs:
-        console.print(f"not photographs, left out: {_some_names(report.no_photographs)}", highlight=False, markup=False, soft_wrap=True)
+        say(f"not photographs, left out: {_some_names(report.no_photographs)}")
 
 
 def _some_names(paths: Sequence[Path]) -> str:

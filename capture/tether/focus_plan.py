@@ -26,12 +26,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from mrbokeh.optics.lens import MM_PER_M, Lens, film_plane_m, lens_distance_m
 from mrbokeh.optics.lens_file import lens_from_json, lens_to_json
 from mrbokeh.system.atomic_files import atomic_path, read_json, write_json
+from mrbokeh.system.channel import show, tell, warn
 from mrbokeh.system.errors import InputError
 
 MOST_SLICES = 999
@@ -253,17 +253,15 @@ def _finite(value: float) -> float | None:
     return None if math.isinf(value) else value
 
 
-def print_plan(plan: FocusPlan, console: Console) -> None:
+def print_plan(plan: FocusPlan) -> None:
     """Print the focus distances from the lens and from the film plane, and the blur that the plan leaves."""
     table = Table("slice", "from lens (m)", "from film plane (m)", "dioptres", "breathing")
     for index, lens in enumerate(plan.lenses):
         numbers = lens.focus_distance_m, film_plane_m(lens), plan.dioptres[index], plan.breathing[index]
         table.add_row(str(index), *(f"{each:.4f}" for each in numbers))
-    console.print(table)
+    show(table, slices=[_slice_row(plan, index) for index in range(len(plan))], residual_px=plan.residual_px)
     count = "1 slice" if len(plan) == 1 else f"{len(plan)} slices"
-    console.print(f"{count} of {plan.image_width_px} px, largest residual circle of confusion {plan.residual_px:.2f} px")
-    console.print(f"largest circle of confusion within the range: {plan.largest_coc_px:.1f} px (what a network has to reach)")
+    tell(f"{count} of {plan.image_width_px} px, largest residual circle of confusion {plan.residual_px:.2f} px")
+    tell(f"largest circle of confusion within the range: {plan.largest_coc_px:.1f} px (what a network has to reach)")
     if plan.residual_px > plan.wanted_residual_px + _ROUNDING_PX:
-        console.print(
-            f"[yellow]the residual is above the {plan.wanted_residual_px:g} px that were asked for: the steps are too coarse[/yellow]"
-        )
+        warn(f"the residual is above the {plan.wanted_residual_px:g} px that were asked for: the steps are too coarse")

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -104,8 +104,8 @@ def check_outputs(out: Path, result: ResultOptions, read: Sequence[Path | None],
     require_safe_outputs((out, result.save_layer, result.deep_out), read, result.overwrite)
 
 
-def blur_told(plate: Plate, sharp: Sequence[Layer]) -> str:
-    """Describe the lens and its blur; if metres are guessed, give the measured pixels."""
+def blur_told(plate: Plate, sharp: Sequence[Layer]) -> tuple[str, dict[str, Any], dict[str, Any]]:
+    """Describe the lens and its blur, with what is known of the lens, and figures; if metres are guessed, give the measured pixels."""
     lens, width_px = plate.lens, plate.rgb.shape[1]
     unit = GUESSED if plate.metres_guessed else "m"
     told = "blur as measured in the slices," if plate.lens_guessed else f"{lens.focal_length_mm:.4g} mm f/{lens.f_number:.3g}"
@@ -113,13 +113,15 @@ def blur_told(plate: Plate, sharp: Sequence[Layer]) -> str:
     seen_m = np.concatenate(
         [np.empty(0, np.float32), *(layer.depth_m[(layer.alpha > 0.5) & np.isfinite(layer.depth_m)] for layer in sharp)]
     )
+    known = {} if plate.lens_guessed or plate.metres_guessed else lens.facts
     if not len(seen_m):
-        return told
+        return told, known, {}
     nearest_m, farthest_m = seen_m.min(), seen_m.max()
     coc_px = np.abs(lens.coc_px(np.array([nearest_m, farthest_m, np.clip(lens.focus_distance_m, nearest_m, farthest_m)]), width_px))
     size = f", {_size_px(sharp)} px" if plate.metres_guessed else ""
     far = f"{nearest_m:.3g} to {farthest_m:.3g} {unit} from the lens"
-    return f"{told}; put in at {far}{size}, blurred by {coc_px.min():.1f} to {coc_px.max():.1f} px"
+    told = f"{told}; put in at {far}{size}, blurred by {coc_px.min():.1f} to {coc_px.max():.1f} px"
+    return told, known, {"depths_m": (nearest_m, farthest_m), "coc_px": (coc_px.min(), coc_px.max())}
 
 
 def _size_px(sharp: Sequence[Layer]) -> str:

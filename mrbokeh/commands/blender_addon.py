@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from mrbokeh.system.channel import tell
+
 app = typer.Typer(add_completion=False)
 
 
@@ -30,4 +32,4 @@ def blender_addon(
     refuse_existing(target, overwrite)
     with atomic_path(target) as temporary:
         temporary.write_bytes(source.read_bytes())
-    typer.echo(f"wrote {target}: in Blender, Edit > Preferences > Add-ons > Install from Disk")
+    tell(f"wrote {target}: in Blender, Edit > Preferences > Add-ons > Install from Disk")

@@ -10,6 +10,7 @@ from mrbokeh.checks.check_shot import CheckSettings, check_shot
 from mrbokeh.checks.checked_picture import open_shot
 from mrbokeh.checks.picture_checks import CheckReport
 from mrbokeh.commands._option_groups import grouped
+from mrbokeh.system.channel import show, tell
 from mrbokeh.system.errors import InputError
 
 app = typer.Typer(add_completion=False)
@@ -60,9 +61,8 @@ class LimitOptions:
 
 @dataclass(frozen=True)
 class ReportOptions:
-    """Files of the report."""
+    """Files beside the report."""
 
-    json_out: Annotated[Path | None, typer.Option("--json", help="Also write all that was found as JSON.")] = None
     map_out: Annotated[
         Path | None, typer.Option("--map", help="Where leaked pixels are shown (.png), written only where there are some.")
     ] = None
@@ -71,33 +71,30 @@ class ReportOptions:
 @app.command()
 @grouped
 def check(
-    out: Annotated[Path, typer.Argument(help="A picture, a folder of numbered pictures, a focal stack or a film.")],
+    picture: Annotated[Path, typer.Argument(metavar="OUT", help="A picture, a folder of numbered pictures, a focal stack or a film.")],
     made: SourceOptions,
     limits: LimitOptions,
     result: ReportOptions,
 ) -> None:
     """Look for NaN, alpha outside 0 to 1, negative light, light made or lost, leaks, flicker, and missing frames.
 
-    Exit code 0: nothing found; 1: findings; 2: cannot be read. JSON and map are replaced where they exist.
+    Exit code 0: nothing found; 1: findings; 2: cannot be read. The map is replaced where it exists; --json prints all that was found.
 
-    Example: mrbokeh check out.exr --against plate.exr --virtual blurred_layer.exr --json check.json --map leaks.png
+    Example: mrbokeh check out.exr --against plate.exr --virtual blurred_layer.exr --map leaks.png --json > check.json
     """
     from mrbokeh.images.image_io import require_suffix
-    from mrbokeh.system.atomic_files import require_safe_outputs, write_json
+    from mrbokeh.system.atomic_files import require_safe_outputs
 
-    for name, path, suffix in (("--map", result.map_out, ".png"), ("--json", result.json_out, ".json")):
-        if path is not None:
-            require_suffix(path, (suffix,), name)
-    require_safe_outputs((result.json_out, result.map_out), (out, *made.files), overwrite=True)
+    if result.map_out is not None:
+        require_suffix(result.map_out, (".png",), "--map")
+    require_safe_outputs((result.map_out,), (picture, *made.files), overwrite=True)
     if made.lens is not None and made.sharp is None:
         raise InputError("--lens tells how far light of the sharp layer reaches: give --sharp LAYER.exr too")
     plate = None if made.against is None else open_shot(made.against)
-    report, leaks = check_shot(open_shot(out), plate, _settings(made, limits))
+    report, leaks = check_shot(open_shot(picture), plate, _settings(made, limits))
     _print(report)
-    if result.json_out is not None:
-        write_json(result.json_out, report.to_json())
     if result.map_out is not None and leaks.write(result.map_out):
-        typer.echo(f"wrote {result.map_out}")
+        tell(f"wrote {result.map_out}")
     raise typer.Exit(0 if report.is_clean else 1)
 
 
@@ -116,21 +113,19 @@ def _settings(made: SourceOptions, limits: LimitOptions) -> CheckSettings:
 
 
 def _print(report: CheckReport) -> None:
-    from rich.console import Console
     from rich.table import Table
 
-    console = Console(highlight=False, soft_wrap=True)
     if report.findings:
         table = Table("check", "where", "what", box=None)
         for each in report.findings[:_SHOWN]:
             table.add_row(each.check, each.where, each.text)
-        console.print(table)
+        show(table)
     if len(report.findings) > _SHOWN:
-        console.print(f"and {len(report.findings) - _SHOWN} more: see --json")
+        tell(f"and {len(report.findings) - _SHOWN} more: see --json")
     for name, value in sorted(report.measures.items()):
-        console.print(f"{name}: {value:.6g}")
+        tell(f"{name}: {value:.6g}")
     for name, needs in sorted(report.skipped.items()):
-        console.print(f"not checked: {name}: {needs}")
+        tell(f"not checked: {name}: {needs}")
     pictures, findings = report.pictures, len(report.findings)
     told = f"{findings or 'no'} finding{'' if findings == 1 else 's'}"
-    console.print(f"{pictures} picture{'' if pictures == 1 else 's'} checked, {told}")
+    tell(f"{pictures} picture{'' if pictures == 1 else 's'} checked, {told}", **report.to_json())

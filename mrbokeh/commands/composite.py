@@ -8,6 +8,7 @@ import typer
 from mrbokeh.commands import _composite_options as options
 from mrbokeh.commands._insertion_options import ColourOptions, LensFacts, LookGroup, VirtualOptions
 from mrbokeh.commands._option_groups import grouped
+from mrbokeh.system.channel import guess, say, tell, warn
 
 if TYPE_CHECKING:
     from mrbokeh.commands._composite_parts import LayersFor
@@ -89,17 +90,18 @@ def composite(
     finishing = finishing_of(look.wanted, plate.rgb, None if photo.is_dir() else photo)
     sharp = layers_for(plate)
     if not any((layer.alpha > 0).any() for layer in sharp):
-        typer.echo("warning: nothing of what is put in is in the picture: is it behind the camera, or beside the frame?", err=True)
+        warn("nothing of what is put in is in the picture: is it behind the camera, or beside the frame?")
     if standing.at_pixel:
         plate = with_ground_behind(plate, pair_of(standing.at_pixel), sharp)
     if standing.object_ is not None and (warning := placing_warning(sharp, plate, mode, standing.height)):
-        typer.echo(f"warning: {warning}", err=True)
+        warn(warning)
     with working("blurring"):
         inserted = finished(insertion.insert(plate, sharp, renderer), plate, finishing)
     write_results(out, inserted, plate, sharp, colour, result)
     if lost := alpha_lost(out, plate):
-        typer.echo(f"warning: {lost}", err=True)
-    typer.echo(f"wrote {out} ({mode}; {blur_told(plate, sharp)})")
+        warn(lost)
+    told, known, figures = blur_told(plate, sharp)
+    tell(f"wrote {out} ({mode}; {told})", known, mode=mode, **figures)
 
 
 def _tell_metres(photo: Path, virtual: VirtualOptions, standing: options.ObjectOptions, lens: "Lens | None") -> None:
@@ -111,9 +113,9 @@ def _tell_metres(photo: Path, virtual: VirtualOptions, standing: options.ObjectO
         return
     stack = read_focal_stack(photo)
     for note in filter(None, (metres_note(stack), growth_note(stack, lens))):
-        typer.echo(note)
+        guess(note)
     if not stack.metres_known and virtual.layer and not standing.at_pixel:
-        typer.echo("the layers' depth is taken for guessed metres: --at-pixel X,Y puts them onto the surface at a pixel")
+        say("the layers' depth is taken for guessed metres: --at-pixel X,Y puts them onto the surface at a pixel")
 
 
 def _into_all_slices(
@@ -123,4 +125,4 @@ def _into_all_slices(
     from mrbokeh.stacks.focal_stack import read_focal_stack
 
     composite_stack(read_focal_stack(stack), layers_for, insertion, renderer, out, lens)
-    typer.echo(f"wrote the focal stack {out}")
+    tell(f"wrote the focal stack {out}")

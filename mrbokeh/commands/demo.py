@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from mrbokeh.system.channel import tell
+
 app = typer.Typer(add_completion=False)
 
 
@@ -21,19 +23,16 @@ def demo(
 
     Example: mrbokeh demo --quick --out demo_out
     """
-    from rich.console import Console
-
     from mrbokeh.demo.plan import demo_stages, quick_stages
     from mrbokeh.demo.report import write_quick_story, write_story
     from mrbokeh.demo.stages import run_stages
 
-    console = Console()
     out.mkdir(parents=True, exist_ok=True)
     if quick:
-        write_quick_story(out, run_stages(quick_stages(out / "quick"), out, console))
-        console.print(f"\nOpen {(out / 'quick.html').resolve()}", highlight=False, soft_wrap=True)
+        write_quick_story(out, run_stages(quick_stages(out / "quick"), out))
+        tell(f"\nOpen {(out / 'quick.html').resolve()}")
         return
-    measurements = write_story(out, run_stages(demo_stages(out, minutes), out, console))
+    measurements = write_story(out, run_stages(demo_stages(out, minutes), out))
     for each in measurements:
-        console.print(f"{'[green]ok    [/]' if each.met else '[red]missed[/]'} {each.what}: {each.text} ({each.wanted})", highlight=False)
-    console.print(f"\nOpen {(out / 'report.html').resolve()}", highlight=False, soft_wrap=True)
+        tell(f"{'ok    ' if each.met else 'missed'} {each.what}: {each.text} ({each.wanted})")
+    tell(f"\nOpen {(out / 'report.html').resolve()}", measurements=[vars(each) for each in measurements])

@@ -15,12 +15,12 @@ from threading import Timer
 from typing import Annotated, NamedTuple
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from mrbokeh import __version__
 from mrbokeh.demo.plan import DATA
+from mrbokeh.system.channel import show, tell
 from mrbokeh.system.console import progress_bars
 from mrbokeh.system.errors import InputError, install_command
 
@@ -101,10 +101,10 @@ def doctor(
     components = findings()
     for component in components:
         table.add_row(component.name, escape(component.found or "") or "[yellow]missing[/]", component.enables)
-    Console().print(table)
+    show(table, components=[component._asdict() for component in components])
     for component in components:
         if not component.found:
-            Console().print(f"{component.name}: {component.remedy}", markup=False, highlight=False, soft_wrap=True)
+            tell(f"{component.name}: {component.remedy}")
 
 
 def findings() -> list[Component]:

@@ -8,6 +8,7 @@ import typer
 
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.commands.lens_fit import fit, match
+from mrbokeh.system.channel import tell
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.typed_numbers import numbers_in
 
@@ -96,7 +97,7 @@ def psf(
 
     with kept_when_interrupted(f"finished kernels are kept in {out}", work.overwrite):
         bank = build_bank(choose_model(model, made.parsed()), out, work.rays, work.seed, overwrite=work.overwrite)
-    typer.echo(f"wrote {out}: {len(bank.kernels)} kernels of up to {2 * bank.radius_px + 1} px")
+    tell(f"wrote {out}: {len(bank.kernels)} kernels of up to {2 * bank.radius_px + 1} px", kernels=len(bank.kernels))
 
 
 _MOST_STEPS = 1000
@@ -135,7 +136,7 @@ def spreadlets(
     with kept_when_interrupted(f"finished kernels are kept in {bank}", overwrite):
         made = build_spreadlets(bank, settings, overwrite)
     most = int(np.diff(made.starts).max())
-    typer.echo(f"wrote {bank / SPREADLETS}: {len(made.points)} points of {len(made)} kernels, up to {most} each")
+    tell(f"wrote {bank / SPREADLETS}: {len(made.points)} points of {len(made)} kernels, up to {most} each", points=len(made.points))
 
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help="Make, inspect and draw lens files and banks of PSFs.")
@@ -250,7 +251,7 @@ def new(
         },
     }
     write_lens(out, lens_from_json(document, "the new lens"))
-    typer.echo(f"wrote {out}")
+    tell(f"wrote {out}")
 
 
 @app.command()
@@ -269,7 +270,7 @@ def coc(
         raise InputError(f"expected depths above 0 in metres, got {depths}")
     read = read_lens(lens)
     for depth_m in depths:
-        typer.echo(f"{depth_m:g} m: {float(read.coc_px(depth_m, width)):+.2f} px")
+        tell(f"{depth_m:g} m: {float(read.coc_px(depth_m, width)):+.2f} px", coc_px=[float(read.coc_px(each, width)) for each in depths])
 
 
 def show(
@@ -296,7 +297,7 @@ def show(
         figure = _drawn_bank(lens) if lens.is_dir() else _drawn_lens(lens, width)
     with atomic_path(out) as temporary:
         figure.savefig(temporary, dpi=150)
-    typer.echo(f"wrote {out}")
+    tell(f"wrote {out}")
 
 
 def _drawn_lens(path: Path, width_px: int) -> Any:
@@ -329,7 +330,7 @@ def export(
     if format_ not in ("exr", "png"):
         raise InputError(f"kernels are exported as exr or png, got --format {format_}")
     written = export_bank(read_bank(bank), out, "png" if format_ == "png" else "exr", overwrite)
-    typer.echo(f"wrote {written} kernels and {out / 'index.csv'}")
+    tell(f"wrote {written} kernels and {out / 'index.csv'}", kernels=written)
 
 
 app.command()(psf)

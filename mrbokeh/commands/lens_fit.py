@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mrbokeh.commands._option_groups import grouped
+from mrbokeh.system.channel import guess, tell
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.typed_numbers import numbers_in
 
@@ -79,11 +80,11 @@ def match(
     largest = 1.0 if photo.suffix.lower() in ENCODED_SUFFIXES else float("inf")
     found = match_lens(rgb, facts, side=_SIDES[lights.side], depth_m=lights.depth_m, largest_value=largest)
     write_lens(out, found.lens)
-    typer.echo(as_text(table_of(found)))
+    tell(as_text(table_of(found)))
     if result.evidence:
         with atomic_path(result.evidence) as temporary:
             draw_match(rgb, found).savefig(temporary, dpi=110)
-    typer.echo(f"wrote {out}" + (f" and {result.evidence}" if result.evidence else ""))
+    tell(f"wrote {out}" + (f" and {result.evidence}" if result.evidence else ""), lens=found.lens.facts)
 
 
 def _check_match(lights: LightOptions, result: MatchResultOptions) -> None:
@@ -161,12 +162,12 @@ def fit(
     found, frame = _lights(evidence)
     given = _stacks(stacks or [])
     if note := metres_notes(given):
-        typer.echo(f"{note} (kernels are measured over blur in pixels, which needs no metres)")
+        guess(f"{note} (kernels are measured over blur in pixels, which needs no metres)")
     fitted = fit_lens(given, found, settings, frame)
     bank = bank_of(fitted)
     write_bank(out, bank, overwrite)
     _draw(out, fitted, bank)
-    typer.echo(f"wrote {out}: {len(bank.kernels)} kernels of up to {2 * bank.radius_px + 1} px, {_proof(fitted)}")
+    tell(f"wrote {out}: {len(bank.kernels)} kernels of up to {2 * bank.radius_px + 1} px, {_proof(fitted)}", kernels=len(bank.kernels))
 
 
 def _stacks(folders: list[Path]) -> list:  # type: ignore[type-arg]

@@ -9,6 +9,7 @@ import typer
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.refocus import Refocusing
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
+from mrbokeh.system.channel import guess, tell
 from mrbokeh.system.errors import InputError
 
 app = typer.Typer(add_completion=False)
@@ -82,7 +83,7 @@ def refocus(
     distances_m = parse_focus(focus, FocusLookup.of(source))
     way = _refocusing(source, blur)
     for note in filter(None, (metres_note(source), growth_note(source, way.lens))):
-        typer.echo(note)
+        guess(note)
     _make_room(out, result.overwrite)
     settings = {"stack": str(stack.resolve()), **vars(blur), "lens": str(blur.lens)}
     with kept_when_interrupted(f"finished slices are kept in {out}", result.overwrite):
@@ -93,7 +94,8 @@ def refocus(
     write_focal_stack(made)
     if result.sheet is not None:
         _write_sheet(result.sheet, made)
-    typer.echo(f"wrote {out} ({len(slices)} slices, in focus at {', '.join(f'{each:.3g}' for each in distances_m)} {unit_of(source)})")
+    told = f"wrote {out} ({len(slices)} slices, in focus at {', '.join(f'{each:.3g}' for each in distances_m)} {unit_of(source)})"
+    tell(told, known=way.lens_at(distances_m[0]).facts if source.metres_known else {}, slices=len(slices), focus_distances_m=distances_m)
 
 
 def _write_sharp(source: FocalStack, made: FocalStack, distances_m: tuple[float, ...]) -> None:

@@ -11,6 +11,7 @@ from mrbokeh.commands._option_groups import grouped
 from mrbokeh.commands._render_inputs import FocusOptions, SharpOptions
 from mrbokeh.images.layer import Layer
 from mrbokeh.renderers.choose import DEFAULT
+from mrbokeh.system.channel import tell
 from mrbokeh.system.errors import InputError
 
 app = typer.Typer(add_completion=False)
@@ -85,7 +86,8 @@ def render(
         else:
             blurred = reconstructed(renderer, blur.method, given.samples, used)
     _write(out, blurred, result.alpha_out)
-    typer.echo(f"wrote {out}" + ("" if given.samples is not None or blur.method.endswith(".onnx") else f" ({used.described})"))
+    own_lens = given.samples is not None or blur.method.endswith(".onnx")
+    tell(f"wrote {out}" + ("" if own_lens else f" ({used.described})"), known={} if own_lens else used.facts, method=blur.method)
 
 
 def _write(out: Path, blurred: Layer, alpha_out: bool) -> None:

@@ -8,6 +8,7 @@ import typer
 
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.system.atomic_files import refuse_existing, require_safe_outputs
+from mrbokeh.system.channel import say, tell, warn
 from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
@@ -83,14 +84,22 @@ def track(
     else:
         found = calibrate_clip(clip, printed)
         intrinsics, distortion = found.camera, found.distortion
-        typer.echo(
+        say(
             f"calibrated from {found.views} frames: focal length {intrinsics.focal_px[0]:.1f} px +- {100 * found.focal_sigma:.1f} %, "
             f"{_named(found.distortion)}; corners as first read scatter by {found.residual_px:.2f} px"
         )
     settings = TrackSettings(smoothing.longest_gap, smoothing.smooth, smoothing.steadier)
     tracked = track_board(clip, printed, intrinsics, distortion, settings)
     _write(out, tracked.track, None, result.format_)
-    typer.echo(_told(tracked, out))
+    tell(
+        _told(tracked, out),
+        frames=tracked.frame_count,
+        frames_seen=tracked.seen,
+        frames_lost=tracked.lost,
+        frames_unsure=tracked.unsure,
+        frames_bridged=tracked.bridged,
+        residual_px=tracked.residual_px,
+    )
 
 
 @dataclass(frozen=True)
@@ -156,7 +165,8 @@ def convert(
     read = read.timed(frames.frame_rate) if frames.frame_rate is not None else read
     _write(out, read, TrackOptions(result.out_up, None, facts.rotation_order, facts.sensor_width), result.format_)
     unit = "" if read.metric else ", the scale of its lengths is arbitrary"
-    typer.echo(f"{out}: {len(read.frames)} frames, {read.numbers[0]} to {read.numbers[-1]}, {read.size_px[0]}x{read.size_px[1]} px{unit}")
+    told = f"{out}: {len(read.frames)} frames, {read.numbers[0]} to {read.numbers[-1]}, {read.size_px[0]}x{read.size_px[1]} px{unit}"
+    tell(told, frames=len(read.frames), size_px=read.size_px, metric=read.metric)
 
 
 def _intrinsics(path: Path) -> "tuple[Camera, Distortion | None]":
@@ -172,7 +182,7 @@ def _write(out: Path, made: "CameraTrack", options: "TrackOptions | None", forma
 
     missing = write_track(out, made, options, format_)
     if missing:
-        typer.echo(f"{out} cannot hold and lacks: {', '.join(missing)}", err=True)
+        warn(f"{out} cannot hold and lacks: {', '.join(missing)}")
 
 
 def _told(tracked: "BoardTrack", out: Path) -> str:

@@ -20,6 +20,7 @@ from mrbokeh.depth.depth_map import DepthSettings, parse_known, parse_near_far, 
 from mrbokeh.optics.lens import Lens
 from mrbokeh.refocus import SharpPhotograph
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
+from mrbokeh.system.channel import guess, tell, warn
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 
@@ -132,7 +133,7 @@ def transfer(
     given, blurs = lens_and_renderer(lens, blur.renderer)
     sharp = open_sharp(photo, depth.depth, settings)
     for note in dict.fromkeys(filter(None, (metres_note(sharp.stack) if sharp.stack else "", note_of_file(depth.depth)))):
-        typer.echo(note)
+        guess(note)
     held = lens_for_photograph(facts.on(given, blurs), sharp.photograph, photo)
     chosen = seen_like(held, sharp.photograph, photo) if blur.same_view else held
     distances_m = _distances(chosen, sharp, focusing)
@@ -152,12 +153,15 @@ def transfer(
     coc_px = max(float(np.abs(chosen.focused_at(each).coc_px(sharp.depth.depth_m, rgb.shape[1])).max()) for each in distances_m)
     focus = "" if len(distances_m) > 1 else f"{chosen.focused_at(distances_m[0]).described}; "
     if coc_px < _HARDLY_PX:
-        typer.echo(
-            f"warning: hardly anything is blurred ({coc_px:.1f} px at most): a smaller --f-number blurs more; where the depth has no unit, "
-            f"--disparity NEAR:FAR gives it one",
-            err=True,
+        warn(
+            f"hardly anything is blurred ({coc_px:.1f} px at most): a smaller --f-number blurs more; where the depth has no unit, "
+            f"--disparity NEAR:FAR gives it one"
         )
-    typer.echo(f"wrote {out} ({focus}depth: {sharp.depth.note}; largest circle of confusion {coc_px:.1f} px)")
+    tell(
+        f"wrote {out} ({focus}depth: {sharp.depth.note}; largest circle of confusion {coc_px:.1f} px)",
+        known=chosen.facts | {"depth": sharp.depth.note, "focus_distance_m": distances_m},
+        largest_coc_px=coc_px,
+    )
 
 
 def _require_outputs(out: Path, result: ResultOptions, inputs: tuple[Path | None, ...]) -> None:

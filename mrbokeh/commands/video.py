@@ -24,6 +24,7 @@ from mrbokeh.shots.render_shot import SequenceTarget, VideoTarget, render_shot
 from mrbokeh.shots.shot import SEGMENT_S, Shot, Target
 from mrbokeh.stacks.photograph import SensorOrientation, lens_for_orientation
 from mrbokeh.system.atomic_files import require_safe_outputs
+from mrbokeh.system.channel import tell, warn
 from mrbokeh.system.console import kept_when_interrupted, progress_bars
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import cores
@@ -289,10 +290,11 @@ def video(
     target.require_new(shot, result.overwrite or shot.was_begun)
     _try_first_frame(shot)
     if not result.virtual_only and (lost := _alpha_lost(clip, source, target)):
-        typer.echo(f"warning: {clip} {lost}", err=True)
+        warn(f"{clip} {lost}")
     note = _made(shot, _executor(work, len(shot.segments)), result.overwrite)
     frames = shot.stop - shot.start
-    typer.echo(f"wrote {out} ({source.info.width_px}x{source.info.height_px} px, {frames} frame{'' if frames == 1 else 's'}, {note})")
+    told = f"wrote {out} ({source.info.width_px}x{source.info.height_px} px, {frames} frame{'' if frames == 1 else 's'}, {note})"
+    tell(told, frames=frames, size_px=(source.info.width_px, source.info.height_px))
 
 
 def _alpha_lost(clip: Path, source: PictureSource, target: Target) -> str | None:

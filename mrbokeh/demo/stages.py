@@ -10,9 +10,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from uuid import uuid4
 
-from rich.console import Console
-
 from mrbokeh.system.atomic_files import read_json, write_json
+from mrbokeh.system.channel import say
 from mrbokeh.system.errors import InputError
 
 
@@ -98,37 +97,37 @@ class Done:
     run: str = ""
 
 
-def run_stages(stages: list[Stage], out: Path, console: Console) -> list[Done]:
+def run_stages(stages: list[Stage], out: Path) -> list[Done]:
     """Run what is not done; a stage whose predecessor ran is run again, so that no result is older than its input.
 
     Raises InputError where a stage fails that is not optional.
     """
     results: list[Done] = []
     for number, stage in enumerate(stages, 1):
-        console.print(f"[bold]{number}/{len(stages)} {stage.purpose}[/]")
-        results.append(_done(stage, results, out, console))
+        say(f"{number}/{len(stages)} {stage.purpose}")
+        results.append(_done(stage, results, out))
     return results
 
 
-def _done(stage: Stage, before: Sequence[Done], out: Path, console: Console) -> Done:
+def _done(stage: Stage, before: Sequence[Done], out: Path) -> Done:
     feeding = [done for done in before if done.stage.feeds(stage)]
     if stage.optional and any(done.failed for done in feeding):
-        console.print("  left out, for it needs what failed")
+        say("  left out, for it needs what failed")
         return Done(stage, 0.0, skipped=True, failed=True)
     inputs = {done.stage.name: done.run for done in feeding if not done.failed}
     record = read_record(_record_path(stage, out))
     if record is not None and record.seconds is not None and record.still_holds(stage.arguments, inputs) and not stage.missing():
-        console.print("  done already")
+        say("  done already")
         return Done(stage, record.seconds, skipped=True, run=record.run)
-    console.print(f"  {stage.command_line}", highlight=False, markup=False, soft_wrap=True)
-    return _run(stage, Record(uuid4().hex, stage.arguments, inputs, must_be_anew(record, stage.arguments, inputs)), out, console)
+    say(f"  {stage.command_line}")
+    return _run(stage, Record(uuid4().hex, stage.arguments, inputs, must_be_anew(record, stage.arguments, inputs)), out)
 
 
 def _record_path(stage: Stage, out: Path) -> Path:
     return out / ".stages" / f"{stage.name}.json"
 
 
-def _run(stage: Stage, record: Record, out: Path, console: Console) -> Done:
+def _run(stage: Stage, record: Record, out: Path) -> Done:
     write_record(_record_path(stage, out), record)
     start = time.perf_counter()
     code = _exit_code([sys.executable, "-m", "mrbokeh.cli", *stage.arguments, *(stage.when_stale if record.anew else ())])
@@ -142,7 +141,7 @@ def _run(stage: Stage, record: Record, out: Path, console: Console) -> Done:
             f"the stage {stage.name!r} failed (exit code {code}, missing {missing or 'nothing'}); see its message above. "
             f"Its command was: {stage.command_line}"
         )
-    console.print("  failed; the demo goes on without it")
+    say("  failed; the demo goes on without it")
     return Done(stage, seconds, skipped=False, failed=True)
 
 

@@ -11,6 +11,8 @@ from mrbokeh.system.errors import InputError
 
 MM_PER_M = 1000.0
 _STEEPEST_TILT_RAD = np.pi / 4
+_NEAR_IMAGE_DISTANCES = 20.0
+"""Nearer than so many times the distance from lens to sensor, it shows whether a focus distance counts from the one or the other."""
 
 
 @dataclass(frozen=True)
@@ -72,8 +74,22 @@ class Lens:
     @property
     def described(self) -> str:
         """Describe the lens in a few words, such as "50 mm f/1.8 focused at 1.5 m, sensor 36 mm wide"."""
-        focus = "infinity" if math.isinf(self.focus_distance_m) else f"{self.focus_distance_m:.3g} m"
-        return f"{self.focal_length_mm:.4g} mm f/{self.f_number:.3g} focused at {focus}, sensor {self.sensor_width_mm:.4g} mm wide"
+        blur = f"{self.focal_length_mm:.4g} mm f/{self.f_number:.3g}"
+        return f"{blur} focused at {self.focus_described}, sensor {self.sensor_width_mm:.4g} mm wide"
+
+    @property
+    def focus_described(self) -> str:
+        """Say where it is focused, and from where that counts if it makes a difference: "0.36 m from the lens (0.45 m from the sensor)"."""
+        if math.isinf(self.focus_distance_m):
+            return "infinity"
+        near = self.focus_distance_m < _NEAR_IMAGE_DISTANCES * self.image_distance_mm / MM_PER_M
+        told = f" from the lens ({film_plane_m(self):.3g} m from the sensor)" if near else ""
+        return f"{self.focus_distance_m:.3g} m{told}"
+
+    @property
+    def facts(self) -> dict[str, float]:
+        """Return focal length, f-number, focus distance and width of the sensor by their names."""
+        return {name: getattr(self, name) for name in ("focal_length_mm", "f_number", "focus_distance_m", "sensor_width_mm")}
 
     @property
     def aperture_diameter_mm(self) -> float:

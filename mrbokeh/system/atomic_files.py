@@ -3,12 +3,14 @@
 import json
 import os
 import shutil
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
 
+from mrbokeh.system.channel import finished, unfinished
 from mrbokeh.system.errors import InputError, require_file
 
 
@@ -17,12 +19,8 @@ def atomic_path(path: Path | str) -> Iterator[Path]:
     """Open a temporary path beside `path` with its suffix; rename it to `path` if the block ends well, else remove it."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
-    try:
+    with _staged(path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}"), path) as temporary:
         yield temporary
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -32,13 +30,78 @@ def atomic_folder(folder: Path | str) -> Iterator[Path]:
     refuse_existing(folder, overwrite=False)
     folder.parent.mkdir(parents=True, exist_ok=True)
     temporary = folder.with_name(f".{folder.name}.{os.getpid()}.part")
-    shutil.rmtree(temporary, ignore_errors=True)
+    _remove(temporary)
     temporary.mkdir()
+    with _staged(temporary, folder):
+        yield temporary
+
+
+@contextmanager
+def _staged(temporary: Path, path: Path) -> Iterator[Path]:
+    made = None
+    unfinished(temporary)
     try:
         yield temporary
-        os.rename(temporary, folder)
+        os.replace(temporary, path)
+        made = path
     finally:
+        _remove(temporary)
+        finished(temporary, made)
+
+
+def _remove(temporary: Path) -> None:
+    if temporary.is_dir():
         shutil.rmtree(temporary, ignore_errors=True)
+    else:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def writing_alone(path: Path | None) -> Iterator[None]:
+    """Hold a lock beside a result, which goes with the process. Raises InputError if another process holds it.
+
+    None, and a place where nothing can be written, are not locked.
+    """
+    with ExitStack() as held:
+        if path is not None and (name := Path(os.path.realpath(path)).name):
+            lock = Path(os.path.realpath(path)).with_name(f".{name}.lock")
+            with suppress(OSError):
+                for folder in reversed([each for each in lock.parents if not each.exists()]):
+                    held.callback(_tried, folder.rmdir)  # where nothing was written
+                lock.parent.mkdir(parents=True, exist_ok=True)
+                file = held.enter_context(lock.open("a+"))
+                if not _lock(file):
+                    file.seek(0)
+                    raise InputError(f"another run (process {file.read()}) is writing {path}: wait for it, or give this one another name")
+                held.callback(_tried, lock.unlink)
+                held.callback(finished, lock, None)
+                unfinished(lock)
+                file.truncate(0)
+                file.write(str(os.getpid()))
+                file.flush()
+        yield
+
+
+def _lock(file: Any) -> bool:
+    """Lock an open file against other processes; return whether that succeeded."""
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            file.seek(1000)  # beyond what is written, so that others can read it
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return False
+    return os.name == "nt" or os.fstat(file.fileno()).st_nlink > 0
+
+
+def _tried(action: Callable[[], None]) -> None:
+    with suppress(OSError):
+        action()
 
 
 def write_json(path: Path | str, document: Any) -> None:

@@ -8,11 +8,10 @@ from contextlib import AbstractContextManager, contextmanager
 from datetime import timedelta
 from typing import Any, TypeVar
 
-import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from mrbokeh.system.errors import INTERRUPTED
+from mrbokeh.system.channel import channel
 
 Item = TypeVar("Item")
 
@@ -64,7 +63,9 @@ class PlainLines(Progress):
                 return
             self._told[task_id] = now, task.completed
             self._ended |= {task_id} if ended else set()
-        self.console.print(_line(task, now - began, self._begun_with[task_id]), markup=False, highlight=False, soft_wrap=True)
+        line = _line(task, now - began, self._begun_with[task_id])
+        channel().said(line)
+        self.console.print(line, markup=False, highlight=False, soft_wrap=True)
 
 
 def _line(task: Task, took_s: float, begun_with: float = 0.0) -> str:
@@ -109,7 +110,7 @@ def working(description: str) -> AbstractContextManager[object]:
 
 @contextmanager
 def kept_when_interrupted(kept: str, overwrite: bool = False) -> Iterator[None]:
-    """Turn Ctrl-C into one line that says what was kept and how to continue, and exit with 130.
+    """Let Ctrl-C end in one line that says what was kept and how to continue.
 
     kept: such as "finished slices are kept in scene/". overwrite: the command would start again instead of continuing.
     """
@@ -117,8 +118,8 @@ def kept_when_interrupted(kept: str, overwrite: bool = False) -> Iterator[None]:
         yield
     except KeyboardInterrupt:
         again = "with --overwrite it begins again" if overwrite else "the same command goes on from there"
-        typer.echo(f"stopped: {kept}; {again}", err=True)
-        raise typer.Exit(INTERRUPTED) from None
+        channel().kept = channel().kept or f"stopped: {kept}; {again}"
+        raise
 
 
 FLAGS = {

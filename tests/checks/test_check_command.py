@@ -25,6 +25,7 @@ from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.writer import VideoWriter
+from tests.support.command_line import mrbokeh
 from tests.support.refusals import refused
 
 LENS = Lens(50.0, 2.0, 1.0, 2.2)
@@ -58,7 +59,7 @@ def files(tmp_path: Path) -> dict[str, Path]:
     write_layer(paths["sharp"], ball(), half=False)
     write_image(paths["out"], composite(photo()), half=False)
     write_lens(tmp_path / "lens.json", LENS)
-    return {**paths, "lens": tmp_path / "lens.json", "json": tmp_path / "check.json", "map": tmp_path / "leaks.png"}
+    return {**paths, "lens": tmp_path / "lens.json", "map": tmp_path / "leaks.png"}
 
 
 def run(*arguments: object, expected: int) -> str:
@@ -67,11 +68,17 @@ def run(*arguments: object, expected: int) -> str:
     return result.output
 
 
+def found_by(*arguments: object, expected: int) -> dict:
+    """The figures of `mrbokeh check ... --json`."""
+    done = mrbokeh("check", *arguments, "--json")
+    assert done.returncode == expected, done.stderr
+    return json.loads(done.stdout)["figures"]
+
+
 def checked(files: dict[str, Path], expected: int, *more: object) -> dict:
     """The JSON of a check of out.exr against everything that is known."""
-    layers = ("--virtual", files["virtual"], "--sharp", files["sharp"], "--json", files["json"], "--map", files["map"])
-    run(files["out"], "--against", files["plate"], *layers, *more, expected=expected)
-    document = json.loads(files["json"].read_text())
+    layers = ("--virtual", files["virtual"], "--sharp", files["sharp"], "--map", files["map"])
+    document = found_by(files["out"], "--against", files["plate"], *layers, *more, expected=expected)
     assert document["clean"] is (expected == 0)
     return document
 
@@ -170,13 +177,12 @@ def test_pixels_changed_out_of_reach_are_counted_and_mapped(files: dict[str, Pat
 
 
 def test_the_lens_tells_the_reach_where_the_blurred_layer_is_not_kept(files: dict[str, Path]) -> None:
-    settings = ("--against", files["plate"], "--sharp", files["sharp"], "--lens", files["lens"], "--json", files["json"])
+    settings = ("--against", files["plate"], "--sharp", files["sharp"], "--lens", files["lens"])
     run(files["out"], *settings, expected=0)
     picture = composite(photo())
     picture[24, 60] = 0.5
     write_image(files["out"], picture, half=False)
-    run(files["out"], *settings, expected=1)
-    assert kinds(json.loads(files["json"].read_text())) == {"leak"}
+    assert kinds(found_by(files["out"], *settings, expected=1)) == {"leak"}
     refused("--sharp", run, files["out"], "--lens", files["lens"], expected=2)
 
 
@@ -186,12 +192,10 @@ def test_layered_exr_brings_its_layers(files: dict[str, Path]) -> None:
     for name, layer in layers.items():
         channels |= {f"{name}.{c}": layer.rgb[..., i] for i, c in enumerate("RGB")} | {f"{name}.A": layer.alpha}
     write_exr(files["out"], ExrPart(channels))
-    run(files["out"], "--against", files["plate"], "--json", files["json"], expected=0)
-    assert json.loads(files["json"].read_text())["skipped"] == {}
+    assert found_by(files["out"], "--against", files["plate"], expected=0)["skipped"] == {}
     channels["virtual.A"] = channels["virtual.A"] * 1.5
     write_exr(files["out"], ExrPart(channels))
-    run(files["out"], "--against", files["plate"], "--json", files["json"], expected=1)
-    assert kinds(json.loads(files["json"].read_text())) == {"alpha", "energy"}
+    assert kinds(found_by(files["out"], "--against", files["plate"], expected=1)) == {"alpha", "energy"}
 
 
 def test_what_cannot_be_read_is_one_sentence(files: dict[str, Path], tmp_path: Path) -> None:
@@ -226,9 +230,8 @@ def noisy_plates(count: int = 8) -> list[np.ndarray]:
     return [(photo() + rng.normal(0, 0.002, (*SIZE, 3))).astype(np.float32) for _ in range(count)]
 
 
-def report_of(out: Path, plate: Path, report: Path, expected: int, *more: object) -> dict:
-    run(out, "--against", plate, "--json", report, *more, expected=expected)
-    return json.loads(report.read_text())
+def report_of(out: Path, plate: Path, expected: int, *more: object) -> dict:
+    return found_by(out, "--against", plate, *more, expected=expected)
 
 
 def test_a_steady_sequence_passes_and_a_flickering_one_does_not(tmp_path: Path) -> None:
@@ -236,13 +239,13 @@ def test_a_steady_sequence_passes_and_a_flickering_one_does_not(tmp_path: Path) 
     layer = blurred()
     light = [(1 - layer.alpha[..., None]) * each for each in plates]
     plate = sequence(tmp_path / "plate", plates)
-    steady = report_of(sequence(tmp_path / "steady", [each + layer.rgb for each in light]), plate, tmp_path / "a.json", 0)
+    steady = report_of(sequence(tmp_path / "steady", [each + layer.rgb for each in light]), plate, 0)
     # Grain of standard deviation s changes by 2 s / sqrt(pi) on average from frame to frame.
     assert steady["measures"]["flicker of the plate"] == pytest.approx(2 * 0.002 / np.sqrt(np.pi), rel=0.05)
     shaken = [each + layer.rgb * np.float32(1 + 0.2 * (index % 2)) for index, each in enumerate(light)]
-    found = report_of(sequence(tmp_path / "shaken", shaken), plate, tmp_path / "b.json", 1)
+    found = report_of(sequence(tmp_path / "shaken", shaken), plate, 1)
     assert kinds(found) == {"flicker"}
-    report_of(tmp_path / "shaken", plate, tmp_path / "c.json", 0, "--flicker-limit", 0.5)
+    report_of(tmp_path / "shaken", plate, 0, "--flicker-limit", 0.5)
 
 
 def test_layers_may_come_one_for_each_picture(tmp_path: Path) -> None:
@@ -251,13 +254,13 @@ def test_layers_may_come_one_for_each_picture(tmp_path: Path) -> None:
     plate, out = sequence(tmp_path / "plate", plates), sequence(tmp_path / "out", made)
     for index in range(3):
         write_layer(tmp_path / "virtual" / f"v.{index}.exr", layer, half=False)
-    report_of(out, plate, tmp_path / "a.json", 0, "--virtual", tmp_path / "virtual")
+    report_of(out, plate, 0, "--virtual", tmp_path / "virtual")
     nothing = replace(layer, rgb=0 * layer.rgb, alpha=0 * layer.alpha)
     write_layer(tmp_path / "virtual" / "v.1.exr", nothing, half=False)
-    found = report_of(out, plate, tmp_path / "b.json", 1, "--virtual", tmp_path / "virtual")
+    found = report_of(out, plate, 1, "--virtual", tmp_path / "virtual")
     assert [(each["check"], each["where"]) for each in found["findings"]] == [("leak", "shot.0002.exr")]
     (tmp_path / "virtual" / "v.2.exr").unlink()
-    refused("one for each", report_of, out, plate, tmp_path / "c.json", 2, "--virtual", tmp_path / "virtual")
+    refused("one for each", run, out, "--against", plate, "--virtual", tmp_path / "virtual", expected=2)
 
 
 def test_one_jump_a_frozen_frame_missing_and_damaged_ones_are_found(tmp_path: Path) -> None:
@@ -266,16 +269,16 @@ def test_one_jump_a_frozen_frame_missing_and_damaged_ones_are_found(tmp_path: Pa
     jumped = [each.copy() for each in plates]
     for each in jumped[6:]:
         each[20:40, 20:50] *= np.float32(0.9)
-    found = report_of(sequence(tmp_path / "jumped", jumped), plate, tmp_path / "a.json", 1, "--flicker-limit", 0.003)
+    found = report_of(sequence(tmp_path / "jumped", jumped), plate, 1, "--flicker-limit", 0.003)
     assert [(each["check"], each["where"]) for each in found["findings"]] == [("pop", "shot.0007.exr")]
-    found = report_of(sequence(tmp_path / "frozen", [*plates[:5], plates[4], *plates[6:]]), plate, tmp_path / "b.json", 1)
+    found = report_of(sequence(tmp_path / "frozen", [*plates[:5], plates[4], *plates[6:]]), plate, 1)
     assert [(each["check"], each["where"]) for each in found["findings"]] == [("frozen", "shot.0006.exr")]
     plate, out = (sequence(tmp_path / name, noisy_plates(6), first=101) for name in ("numbered", "out"))
     (out / "shot.0103.exr").unlink()
     (out / "shot.0106.exr").unlink()
     whole = (out / "shot.0105.exr").read_bytes()
     (out / "shot.0105.exr").write_bytes(whole[: len(whole) // 2])
-    found = report_of(out, plate, tmp_path / "c.json", 1)
+    found = report_of(out, plate, 1)
     assert kinds(found) == {"missing", "damaged"} and found["pictures"] == 3
     assert any("103, 106" in each["text"] for each in found["findings"])
 
@@ -294,13 +297,13 @@ def test_films_are_paired_by_time(tmp_path: Path) -> None:
     write_layer(tmp_path / "virtual.exr", layer, half=False)
     plate = film(tmp_path / "plate.mkv", plates, times)
     known = ("--virtual", tmp_path / "virtual.exr")
-    report_of(film(tmp_path / "whole.mkv", made, times), plate, tmp_path / "a.json", 0, *known)
+    report_of(film(tmp_path / "whole.mkv", made, times), plate, 0, *known)
     holed = film(tmp_path / "holed.mkv", made[:4] + made[5:], times[:4] + times[5:])
-    found = report_of(holed, plate, tmp_path / "b.json", 1, *known)
+    found = report_of(holed, plate, 1, *known)
     assert [each["check"] for each in found["findings"]] == ["missing"] and "the plate's frame 4" in found["findings"][0]["text"]
     part = film(tmp_path / "part.mkv", made[3:7], [time_s - times[3] for time_s in times[3:7]])
-    report_of(part, plate, tmp_path / "c.json", 0, "--frames", "3:7", *known)
-    report_of(part, plate, tmp_path / "d.json", 1, *known)
+    report_of(part, plate, 0, "--frames", "3:7", *known)
+    report_of(part, plate, 1, *known)
 
 
 def test_slices_of_a_stack_are_checked_against_those_of_the_other(tmp_path: Path) -> None:
@@ -310,6 +313,6 @@ def test_slices_of_a_stack_are_checked_against_those_of_the_other(tmp_path: Path
         for index, each in enumerate(slices):
             write_image(folder / each.path, photo(index), half=False)
         write_focal_stack(FocalStack(folder, slices))
-    assert report_of(tmp_path / "out", tmp_path / "plate", tmp_path / "a.json", 0)["pictures"] == 3
+    assert report_of(tmp_path / "out", tmp_path / "plate", 0)["pictures"] == 3
     (tmp_path / "out" / "slice_1.exr").unlink()
-    assert kinds(report_of(tmp_path / "out", tmp_path / "plate", tmp_path / "b.json", 1)) == {"missing"}
+    assert kinds(report_of(tmp_path / "out", tmp_path / "plate", 1)) == {"missing"}

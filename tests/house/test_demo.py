@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from mrbokeh.demo import stages
 from mrbokeh.demo.plan import VIEWS, demo_stages
@@ -51,24 +50,24 @@ def draw_stage(lens: Path, picture: Path) -> Stage:
 
 
 def test_finished_stages_are_skipped_and_stale_ones_are_not(tmp_path: Path) -> None:
-    lens, picture, console = tmp_path / "lens.json", tmp_path / "lens.png", Console(quiet=True)
-    first, again = (run_stages([lens_stage(lens), draw_stage(lens, picture)], tmp_path, console) for _ in range(2))
+    lens, picture = tmp_path / "lens.json", tmp_path / "lens.png"
+    first, again = (run_stages([lens_stage(lens), draw_stage(lens, picture)], tmp_path) for _ in range(2))
     assert [done.skipped for done in first] == [False, False] and [done.skipped for done in again] == [True, True]
     assert again[0].seconds == pytest.approx(first[0].seconds), "the report keeps the time of the run that did the work"
     drawn = picture.stat().st_mtime_ns
-    changed = run_stages([lens_stage(lens, focus_m=2.0), draw_stage(lens, picture)], tmp_path, console)
+    changed = run_stages([lens_stage(lens, focus_m=2.0), draw_stage(lens, picture)], tmp_path)
     assert [done.skipped for done in changed] == [False, False] and picture.stat().st_mtime_ns > drawn
     # A result is stale where its input was made anew by a run that got no further.
-    run_stages([lens_stage(lens)], tmp_path, console)
-    later = run_stages([lens_stage(lens), draw_stage(lens, picture)], tmp_path, console)
+    run_stages([lens_stage(lens)], tmp_path)
+    later = run_stages([lens_stage(lens), draw_stage(lens, picture)], tmp_path)
     assert [done.skipped for done in later] == [True, False]
     # A lost output is made again.
     lens.unlink()
-    assert not run_stages([lens_stage(lens)], tmp_path, console)[0].skipped and lens.exists()
+    assert not run_stages([lens_stage(lens)], tmp_path)[0].skipped and lens.exists()
 
 
 def test_a_failing_stage_names_its_command(tmp_path: Path) -> None:
-    refused("mrbokeh lens show", run_stages, [draw_stage(tmp_path / "none.json", tmp_path / "a.png")], tmp_path, Console(quiet=True))
+    refused("mrbokeh lens show", run_stages, [draw_stage(tmp_path / "none.json", tmp_path / "a.png")], tmp_path)
 
 
 def test_what_was_interrupted_goes_on_and_what_replaced_something_starts_over(tmp_path: Path) -> None:
@@ -91,18 +90,18 @@ def test_records_of_earlier_versions_hold_for_nothing(tmp_path: Path) -> None:
 
 
 def test_the_demo_goes_on_without_an_optional_stage_and_finds_it_later(tmp_path: Path) -> None:
-    lens, console = tmp_path / "found" / "lens.json", Console(quiet=True)
+    lens = tmp_path / "found" / "lens.json"
     picture, sheet = tmp_path / "found" / "lens.png", tmp_path / "sheet.png"
     poses = replace(draw_stage(lens, picture), name="poses", when_stale=(), optional=True)
     arguments = ("lens", "show", str(lens), "--out", str(sheet), str(picture.parent))
     depth = Stage("depth", "Needs the poses", arguments, (sheet,), optional=True)
     report = lens_stage(tmp_path / "own.json")
-    first, again = (run_stages([poses, depth, report], tmp_path, console) for _ in range(2))
+    first, again = (run_stages([poses, depth, report], tmp_path) for _ in range(2))
     assert [done.failed for done in first] == [True, True, False]
     assert [(done.failed, done.skipped) for done in again] == [(True, False), (True, True), (False, True)], "tried again, report stays"
     lens.parent.mkdir()
-    run_stages([lens_stage(lens)], tmp_path, console)
-    assert [done.failed for done in run_stages([poses, report], tmp_path, console)] == [False, False]
+    run_stages([lens_stage(lens)], tmp_path)
+    assert [done.failed for done in run_stages([poses, report], tmp_path)] == [False, False]
 
 
 def test_every_stage_of_the_plan_names_its_outputs(tmp_path: Path) -> None:

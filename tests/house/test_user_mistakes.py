@@ -81,8 +81,8 @@ def test_what_is_read_is_never_written_over(card: Path) -> None:
     renders = (("render", "--layer", card, "--lens", lens, "--out", out, "--overwrite") for out in (card, link))
     for words in (*renders, ("check", plate, "--against", plate, "--map", plate), plan):
         assert "is read and would be written over" in refusal(*words)
-    told = refusal("check", card, "--against", card, "--map", card.with_suffix(".png"), "--json", card)
-    assert "--json: expected a name that ends in .json" in told
+    assert "--map: expected a name that ends in .png" in refusal("check", card, "--against", card, "--map", card)
+    assert "--log" in refusal("lens", "coc", lens, 1, "--log", lens)
     assert {path: path.read_bytes() for path in before} == before
 
 

@@ -14,7 +14,7 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
-from tests.support.command_line import printed_by
+from tests.support.command_line import mrbokeh, printed_by
 from tests.support.refusals import refused
 from training.cli import app
 from training.data.batches import draw_batch
@@ -175,7 +175,8 @@ def test_interrupting_keeps_the_checkpoint_and_the_command_goes_on(scene: Path, 
 
     arguments = ["fit", scene, *DEMO_WORDS, "--epochs", 4, "--out", tmp_path / "run"]
     monkeypatch.setattr(Run, "_step", interrupted)
-    assert "go on" in printed_by(app, *arguments, exit_code=130)
+    done = mrbokeh("train", *arguments)
+    assert done.returncode == 130 and "go on" in done.stderr
     assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["progress"]["step"] == 3
     monkeypatch.setattr(Run, "_step", step)
     printed_by(app, *arguments)

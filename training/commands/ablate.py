@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mrbokeh.system.channel import say, tell
 from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
@@ -91,13 +92,13 @@ def _run(planned: "Sequence[PlannedRun]", out: Path, tables: "tuple[TableName, .
     with kept_when_interrupted(f"finished runs are kept in {out}"):
         for number, each in enumerate(planned, 1):
             result = result_of(each, lpips)  # type: ignore[arg-type]
-            typer.echo(
+            say(
                 f"{number}/{len(planned)} {each.folder.relative_to(out)}: {result.measures['psnr_db']:.2f} dB, SSIM "
                 f"{result.measures['ssim']:.4f}, {result.steps} steps in {result.seconds:.0f} s"
             )
             report.write()
     report.write_sheets(shared.device)
-    typer.echo(f"written to {out}: results.html, results.md, {', '.join(report.table_files())}")
+    tell(f"written to {out}: results.html, results.md, {', '.join(report.table_files())}")
 
 
 def _tables(table: list[Table] | None) -> "tuple[TableName, ...]":
@@ -129,8 +130,8 @@ def _print_plan(planned: "Sequence[PlannedRun]") -> None:
     estimated = estimated_minutes(planned)
     for each, minutes in zip(planned, estimated, strict=True):
         when = "finished" if is_finished(each) else f"{minutes:.1f} min"
-        typer.echo(f"{each.row.name:15s} {each.data_set.name} seed {each.seed}  {when:>10s}  {' '.join(changed_settings(each.settings))}")
-    typer.echo(f"{len(planned)} runs, about {sum(estimated):.0f} min of training; measuring comes on top")
+        tell(f"{each.row.name:15s} {each.data_set.name} seed {each.seed}  {when:>10s}  {' '.join(changed_settings(each.settings))}")
+    tell(f"{len(planned)} runs, about {sum(estimated):.0f} min of training; measuring comes on top")
 
 
 def _command_line() -> str:

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from mrbokeh.system.atomic_files import refuse_existing
+from mrbokeh.system.channel import guess, tell
 from mrbokeh.system.errors import InputError
 
 
@@ -65,7 +66,7 @@ def evaluate_command(
     of_networks, seen = network_methods(networks, device)
     stacks = training_data(scenes).stacks
     if note := metres_notes(stacks):
-        typer.echo(note)
+        guess(note)
     unseen = unseen_of(stacks, seen)
     chosen = _renderers(renderer, reference)
     measured = [] if psf is None else bank_methods(chosen, psf)
@@ -73,12 +74,12 @@ def evaluate_command(
     methods = [*of_networks, *plain, *renderer_methods(chosen), *measured]
     extras = Extras(None if lpips is None else OnnxPerceptualDistance(lpips), pull)
     result = compare(methods, unseen, folder, extras)
-    typer.echo(f"{result.slices} {unseen.words}")
+    tell(f"{result.slices} {unseen.words}", psnr_db={name: decibel for name, decibel, *_ in table_rows(result)})
     for name, decibel, similarity, *_ in table_rows(result):
-        typer.echo(f"{name:22s} {decibel:>7s} dB   SSIM {similarity}")
+        tell(f"{name:22s} {decibel:>7s} dB   SSIM {similarity}")
     for line in gain_lines(result):
-        typer.echo(line)
-    typer.echo(f"written to {folder}: evaluation.md, evaluation.csv, evaluation.png, evaluation_crops.png")
+        tell(line)
+    tell(f"written to {folder}: evaluation.md, evaluation.csv, evaluation.png, evaluation_crops.png")
 
 
 def _networks_and_data(paths: list[Path], data: list[Path]) -> tuple[list[Path], list[Path]]:

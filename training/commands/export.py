@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from mrbokeh.system.channel import tell
+
 if TYPE_CHECKING:
     from mrbokeh.renderers.onnx_network import NetworkFacts
 
@@ -43,7 +45,10 @@ def export_command(
     from training.export.onnx_export import export_run
 
     exported = export_run(run, out)
-    typer.echo(f"{out}: ONNX Runtime differs from PyTorch by {exported.difference:.1e}; takes {_sizes(exported.facts)}")
+    tell(
+        f"{out}: ONNX Runtime differs from PyTorch by {exported.difference:.1e}; takes {_sizes(exported.facts)}",
+        difference=exported.difference,
+    )
 
 
 def _export_fast(run: Path, out: Path, max_psnr_loss_db: float, data: list[Path]) -> None:
@@ -51,9 +56,14 @@ def _export_fast(run: Path, out: Path, max_psnr_loss_db: float, data: list[Path]
 
     done = export_fast_run(run, out, max_psnr_loss_db, data)
     against = "the truth" if data else "the trained network, on a made-up picture"
-    typer.echo(f"{out}: {done.naive_ms:.0f} ms plain, {done.fast_ms:.0f} ms fast, {done.naive_ms / done.fast_ms:.1f} times faster")
-    typer.echo(f"loses {done.loss_db:.3f} dB of at most {max_psnr_loss_db:g} dB, measured against {against}; takes {_sizes(done.facts)}")
-    typer.echo(done.plan.words())
+    tell(
+        f"{out}: {done.naive_ms:.0f} ms plain, {done.fast_ms:.0f} ms fast, {done.naive_ms / done.fast_ms:.1f} times faster",
+        plain_ms=done.naive_ms,
+        fast_ms=done.fast_ms,
+        loss_db=done.loss_db,
+    )
+    tell(f"loses {done.loss_db:.3f} dB of at most {max_psnr_loss_db:g} dB, measured against {against}; takes {_sizes(done.facts)}")
+    tell(done.plan.words())
 
 
 def _sizes(facts: "NetworkFacts") -> str:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from mrbokeh.system.channel import channel, guess, say, tell
 from mrbokeh.system.errors import InputError
 from training.fitting.settings import with_overrides
 
@@ -87,7 +88,7 @@ def fit_command(
         settings = replace(settings, **budget | {name: value for name, value in given.items() if value is not None})
         if _number("RANK") == 0:
             _require_run(out)
-            typer.echo(f"reading {', '.join(str(scene) for scene in scenes)}", err=True)  # loading PyTorch takes seconds
+            say(f"reading {', '.join(str(scene) for scene in scenes)}", err=True)  # loading PyTorch takes seconds
         _fit(scenes, out, settings, held_out or [], overwrite)
     except InputError:
         if _number("LOCAL_RANK"):  # one sentence for each machine
@@ -101,20 +102,20 @@ def _fit(scenes: list[Path], out: Path, settings: "TrainSettings", held_out: lis
     from training.fitting.run import StoppedError
     from training.fitting.train import fit
 
-    code, said = 0, ""
+    code = 0
     try:
         data = training_data(scenes)
         if _number("RANK") == 0:
-            typer.echo(data.split(held_out, settings.test_fraction, settings.seed).words(), err=True)
+            say(data.split(held_out, settings.test_fraction, settings.seed).words(), err=True)
             if note := metres_notes(data.stacks):
-                typer.echo(note, err=True)
+                guess(note)
         said = f"{out}: {_summary(fit(data, out, settings, held_out, overwrite))}"
     except StoppedError as stop:
-        code, said = stop.exit_code, str(stop)
+        code, channel().kept = stop.exit_code, str(stop)
     except KeyboardInterrupt:
-        code, said = 130, "stopped at once; the same command goes on from the last checkpoint, if there is one"
-    if _number("RANK") == 0:
-        typer.echo(said, err=code != 0)
+        code, channel().kept = 130, "stopped at once; the same command goes on from the last checkpoint, if there is one"
+    if _number("RANK") == 0 and code == 0:
+        tell(said)
     raise typer.Exit(code)
 
 

@@ -6,12 +6,12 @@ from contextlib import AsyncExitStack, ExitStack, contextmanager
 from functools import partial
 from threading import Event
 
-import typer
 from aiohttp import web
 
 from mrbokeh.optics.camera import Camera, camera_of_lens
 from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.system.atomic_files import refuse_existing
+from mrbokeh.system.channel import say, tell
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.charuco.board import read_board
 from viewfinder.app.opening import browser_cameras, open_phone
@@ -41,10 +41,13 @@ def calibrate(options: CalibrationOptions) -> None:
     except KeyboardInterrupt:
         rig = None
     if rig is None:
-        typer.echo("calibration stopped; nothing was written")
+        say("calibration stopped; nothing was written")
         return
     write_phone_rig(out, rig)
-    typer.echo(f"wrote {out} (for --rig): {rig.pairs} views agree within {rig.residual_deg:.2f} degrees and {rig.residual_mm:.1f} mm")
+    tell(
+        f"wrote {out} (for --rig): {rig.pairs} views agree within {rig.residual_deg:.2f} degrees and {rig.residual_mm:.1f} mm",
+        pairs=rig.pairs,
+    )
 
 
 @contextmanager
@@ -65,7 +68,7 @@ def opened(options: CalibrationOptions) -> Iterator[tuple[Calibration, dict[str,
             tracker=tracker,
             intrinsics=intrinsics,
             phone=phone,
-            say=typer.echo,
+            say=say,
             pairs=options.pairs,
             longest_s=options.seconds,
         )
@@ -101,7 +104,7 @@ async def _calibrated(calibration: Calibration, endpoint: Endpoint, cameras: dic
                 serving_site(CameraSite(endpoint.access, cameras), endpoint.host, endpoint.options.port, endpoint.tls)
             )
             endpoint.announce_camera(url)
-        typer.echo("show the board to the camera and the phone, and hold still at each view (Ctrl-C stops it)")
+        say("show the board to the camera and the phone, and hold still at each view (Ctrl-C stops it)")
         try:
             rig = await asyncio.to_thread(calibration.run, stopping)
         except InputError:

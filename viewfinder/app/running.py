@@ -13,12 +13,12 @@ from threading import Event, Lock, Thread
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-import typer
 from jaxtyping import UInt8
 
 from mrbokeh.compositing.overlay import Overlay
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
+from mrbokeh.system.channel import say
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import keep_few_arenas
 from viewfinder.app.live_compositor import CompositedFrame, LiveCompositor
@@ -178,7 +178,7 @@ def serve(options: ViewfinderOptions) -> None:
     except KeyboardInterrupt:
         # While it was starting; everything that was open is closed.
         pass
-    typer.echo("viewfinder stopped")
+    say("viewfinder stopped")
 
 
 async def _served(viewfinder: Viewfinder, endpoint: Endpoint) -> None:
@@ -187,7 +187,7 @@ async def _served(viewfinder: Viewfinder, endpoint: Endpoint) -> None:
     async with serving_site(viewfinder.site, endpoint.host, endpoint.options.port, endpoint.tls) as url:
         endpoint.announce(f"viewfinder of {viewfinder.pipeline.source.name}", url)
         if viewfinder.webcam is not None:
-            typer.echo(f"also a webcam for other programs: {viewfinder.webcam.name}")
+            say(f"also a webcam for other programs: {viewfinder.webcam.name}")
         if "whip" in viewfinder.site.parts:
             endpoint.announce_camera(url)
         telling = asyncio.create_task(_tell_when_shown(viewfinder.compositor))
@@ -199,7 +199,7 @@ async def _tell_when_shown(compositor: LiveCompositor) -> None:
     """The page says what keeps it; the terminal says when there is something to see."""
     while not is_shown(compositor):
         await asyncio.sleep(_REPEAT_S)
-    typer.echo("the scene is shown")
+    say("the scene is shown")
 
 
 @contextmanager

@@ -13,9 +13,9 @@ from ipaddress import IPv4Address
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import typer
 from aiohttp import web
 
+from mrbokeh.system.channel import tell
 from mrbokeh.system.errors import InputError, MissingExtraError
 from viewfinder.options import ListeningOptions
 from viewfinder.server.access import LOOPBACK_NAMES, Access, is_loopback
@@ -62,32 +62,32 @@ class Endpoint:
     def announce(self, what: str, url: str) -> None:
         """Print where `what` is shown. An address with a token is good for one device; the next one is printed when it was used."""
         if self.sessions is None:
-            typer.echo(f"{what}: {url} (Ctrl-C stops it)")
+            tell(f"{what}: {url} (Ctrl-C stops it)")
             return
         sessions = self.sessions
-        typer.echo(f"{what} (Ctrl-C stops it)")
+        tell(f"{what} (Ctrl-C stops it)")
         for role in (Role.VIEW, Role.CONTROL):
             self._invite(url, sessions, role)
-        typer.echo(f"for OBS, as a browser source: {url}obs#token={sessions.standing_token(Role.VIEW)}")
+        tell(f"for OBS, as a browser source: {url}obs#token={sessions.standing_token(Role.VIEW)}")
         sessions.renewed = lambda role: self._invite(url, sessions, role)
 
     def announce_camera(self, url: str) -> None:
         """Print the page with which a browser sends its camera. Its token is never used up: a phone comes back without asking."""
         if self.sessions is None:
-            typer.echo(f"to send a camera from a browser: {url}{_CAMERA_PAGE}")
+            tell(f"to send a camera from a browser: {url}{_CAMERA_PAGE}")
             return
         token = self.sessions.standing_token(Role.CONTROL)
         address = f"{url}{_CAMERA_PAGE}#token={token}"
         if self.options.qr:
-            typer.echo(qr_text(address))
-        typer.echo(f"to send a camera from a browser: {address}")
-        typer.echo(f"to send one from OBS (WHIP): {url}whip with the bearer token {token}")
+            tell(qr_text(address))
+        tell(f"to send a camera from a browser: {address}")
+        tell(f"to send one from OBS (WHIP): {url}whip with the bearer token {token}")
 
     def _invite(self, url: str, sessions: Sessions, role: Role) -> None:
         address = f"{url}#token={sessions.invitation(role)}"
         if role is Role.CONTROL and self.options.qr:
-            typer.echo(qr_text(address))
-        typer.echo(f"to {role.word}, for one device: {address}")
+            tell(qr_text(address))
+        tell(f"to {role.word}, for one device: {address}")
 
 
 def open_endpoint(options: ListeningOptions) -> Endpoint:
