@@ -132,9 +132,11 @@ def gather(
     width = near_alpha.shape[1]
     free, past, mean = np.empty(len(pupil), np.float32), np.empty(len(pupil), np.float32), np.empty(16, np.float32)
     rays = np.ascontiguousarray(pupil.T)
+    total = rays[2].sum()
     for i in which:
         row, column = places[i] // width, places[i] % width
-        free[:] = rays[2]
+        for ray in range(len(pupil)):
+            free[ray] = rays[2, ray]
         if near_in_reach[row, column]:
             _past_near(free, near_alpha, coc_px[0], row, column, rays)
         mean[0] = free.sum()
@@ -143,7 +145,8 @@ def gather(
             _still_far(mean, far_rgb, row, column)
         else:
             _far_means(mean, past, free, far_rgb, coc_px[2], row, column, rays)
-        sums[i] = mean / rays[2].sum()
+        for channel in range(16):
+            sums[i, channel] = mean[channel] / total
 
 
 @njit(cache=True, nogil=True, fastmath=True)

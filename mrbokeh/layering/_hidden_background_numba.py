@@ -41,7 +41,8 @@ def snap(snapped: np.ndarray, coc_px: np.ndarray, lit: np.ndarray, step_px: floa
     lowest, highest, even_px = np.empty(width + 2, np.float32), np.empty(width + 2, np.float32), np.float32(0.5 * step_px)
     uneven = np.empty(width, np.bool_)
     for y in range(top, bottom):
-        snapped[y] = coc_px[y]
+        for x in range(width):
+            snapped[y, x] = coc_px[y, x]
         if y < 3 or y >= height - 3:
             continue
         _extremes_of_columns(lowest, highest, coc_px, y)
@@ -205,38 +206,40 @@ def nearest_behind(front: Front, coc_px: np.ndarray, rims: np.ndarray, pure: np.
     that it lies behind, so that a nearer one can be missed by a pixel or two where several depths meet.
     """
     width = coc_px.shape[1]
-    first, end = 0, 0
+    # Of one type wherever it is called from, `_pass_on` is compiled once.
+    first, end = np.int64(0), np.int64(0)
     for i in range(len(rims)):
         if pure[i] >= 0:
-            y, x = rims[i] // width, rims[i] % width
-            nearer_px = coc_px[y, x] - step_px
-            end = _pass_on(front, end, coc_px, y, x, pure[i], nearer_px, step_px)
+            place = np.int64(rims[i])
+            nearer_px = np.float64(coc_px[place // width, place % width] - step_px)
+            end = _pass_on(front, end, coc_px, place, np.int64(pure[i]), nearer_px, step_px)
     while first != end:
-        place = front.queue[first]
+        place = np.int64(front.queue[first])
         first = (first + 1) % front.queue.size
         front.queued[place] = False
-        end = _pass_on(front, end, coc_px, place // width, place % width, front.seeds[place] - 1, np.inf, step_px)
+        end = _pass_on(front, end, coc_px, place, np.int64(front.seeds[place] - 1), np.inf, step_px)
 
 
 @njit(cache=True, nogil=True)
-def _pass_on(front: Front, end: int, coc_px: np.ndarray, y: int, x: int, seed: int, nearer_px: float, step_px: float) -> int:
-    """Offer a seed to the pixels around (y, x) whose circle of confusion is below `nearer_px`, and return the new end of the queue. A
+def _pass_on(front: Front, end: int, coc_px: np.ndarray, place: int, seed: int, nearer_px: float, step_px: float) -> int:
+    """Offer a seed to the pixels around a place whose circle of confusion is below `nearer_px`, and return the new end of the queue. A
     pixel takes the seed and is queued if the seed lies behind it, within sight, and nearer than the seed that it has.
     """
     seeds, squares, queue, queued = front
     height, width = coc_px.shape
-    sy, sx, seed_px = seed // width, seed % width, coc_px[seed // width, seed % width]
+    y, x, sy, sx = place // width, place % width, seed // width, seed % width
+    seed_px = coc_px[sy, sx]
     for ny in range(max(0, y - 1), min(height, y + 2)):
         for nx in range(max(0, x - 1), min(width, x + 2)):
-            behind_px, place = seed_px - coc_px[ny, nx], ny * width + nx
+            behind_px, there = seed_px - coc_px[ny, nx], ny * width + nx
             if coc_px[ny, nx] >= nearer_px or behind_px <= step_px:
                 continue
             square = (sy - ny) ** 2 + (sx - nx) ** 2
-            if (squares[place] > 0 and square >= squares[place]) or square > (0.5 * behind_px + 3.5) ** 2:
+            if (squares[there] > 0 and square >= squares[there]) or square > (0.5 * behind_px + 3.5) ** 2:
                 continue
-            seeds[place], squares[place] = seed + 1, square
-            if not queued[place]:
-                queue[end], queued[place] = place, True
+            seeds[there], squares[there] = seed + 1, square
+            if not queued[there]:
+                queue[end], queued[there] = there, True
                 end = (end + 1) % queue.size
     return end
 

@@ -174,7 +174,8 @@ def place_light(
             continue
         to, coc_px_there, source = light[y, max(0, x) :], light_coc_px[y, max(0, x) :], values[first:end]
         if channels == 4 and _is_free(to[: len(source)].reshape(-1), source.reshape(-1)):
-            coc_px_there[: len(source)] = coc_px[first:end]
+            for i in range(len(source)):
+                coc_px_there[i] = coc_px[first + i]
             _put_all(to[: len(source)].reshape(-1), source.reshape(-1), shares[first:end])
             continue
         for i in range(len(source)):

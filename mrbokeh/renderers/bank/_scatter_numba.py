@@ -32,7 +32,7 @@ def scatter_rows(
             radius_px = max(0, int(math.ceil(abs(diameter_px) * 0.5 * unit_radius - 0.5)))
             size = 2 * radius_px + 1
             kernel, steps = np.zeros((size, size)), np.zeros((size, size))
-            fill_psf(kernel, steps, vertices, starts, weights, diameter_px)
+            fill_psf(kernel, steps, vertices, starts, weights, float(diameter_px))
             top, left = y + margin_px - radius_px, x + margin_px - radius_px
             for j in range(size):
                 for i in range(size):

@@ -47,7 +47,7 @@ def cheapest_turn(period: int, origins: np.ndarray, starts: np.ndarray, targets:
     best, found = np.inf, np.empty(0, np.int64)
     least = _still_to_pay(period, origins, starts, targets, areas, most)
     cost, source = np.empty((most + 1, 2 * period)), np.empty((most + 1, 2 * period), np.int64)
-    for origin in origins[np.argsort(least[most][origins])]:
+    for origin in origins[_in_order(least[most][origins])]:
         if least[most, origin] >= best - ALIKE:
             break
         cost[:] = np.inf
@@ -81,7 +81,8 @@ def cheapest_sector(
     """
     total = first.shape[0]
     cost, source = np.full((most + 2, total), np.inf), np.full((most + 2, total), -1, np.int64)
-    cost[1], cost[2] = first[:, 1], first[:, 0]
+    for line in range(total):
+        cost[1, line], cost[2, line] = first[line, 1], first[line, 0]
     best, found = np.inf, np.empty(0, np.int64)
     for line in range(total):
         for n in range(1, most):
@@ -240,17 +241,31 @@ def touching_lines(outline: np.ndarray, first: int, last: int, directions: np.nd
             dx, dy = directions[k]
             angle = math.atan2(cross(inwards[0], inwards[1], dx, dy), inwards[0] * dx + inwards[1] * dy)
             order[k] = angle + (100.0 if _kind(inwards, outwards, dx, dy) == LEAVING else 0.0)
-        for k in np.argsort(order):
+        for k in _in_order(order):
             dx, dy = directions[k]
             kind = _kind(inwards, outwards, dx, dy)
             if kind < 0:
                 continue
             ahead = 0.0 if kind == ARRIVING else _reach(outline, vertex, dx, dy, 1.0)
             back = 0.0 if kind == LEAVING else _reach(outline, vertex, dx, dy, -1.0)
-            lines[size] = np.array([outline[vertex, 0], outline[vertex, 1], dx, dy, ahead, back])
+            line = lines[size]
+            line[0], line[1], line[2], line[3], line[4], line[5] = outline[vertex, 0], outline[vertex, 1], dx, dy, ahead, back
             places[size, 0], places[size, 1] = place, kind
             size += 1
     return lines[:size].copy(), places[:size].copy()
+
+
+@njit(cache=True)
+def _in_order(values: np.ndarray) -> np.ndarray:
+    """Return the places of few values in rising order, by insertion: `np.argsort` takes longer to compile than all this file's loops."""
+    order = np.empty(values.size, np.int64)
+    for new in range(values.size):
+        place = new
+        while place > 0 and values[order[place - 1]] > values[new]:
+            order[place] = order[place - 1]
+            place -= 1
+        order[place] = new
+    return order
 
 
 @njit(cache=True)
@@ -350,5 +365,6 @@ def axis_corners(a: np.ndarray, a_places: np.ndarray, b: np.ndarray, b_places: n
 @njit(cache=True)
 def _longer(values: np.ndarray, room: int) -> np.ndarray:
     grown = np.empty(room, values.dtype)
-    grown[: values.size] = values
+    for i in range(values.size):
+        grown[i] = values[i]
     return grown

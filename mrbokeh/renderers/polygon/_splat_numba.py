@@ -314,7 +314,7 @@ def splat_exactly(
     radius = max(0, int(math.ceil(abs(diameter_px) * 0.5 * exact.unit_radius - 0.5)))
     size = 2 * radius + 1
     kernel, steps = scratch.kernel[0, : size * size].reshape((size, size)), scratch.kernel[1, : size * size].reshape((size, size))
-    fill_psf(kernel, steps, exact.vertices, exact.starts, exact.weights, diameter_px)
+    fill_psf(kernel, steps, exact.vertices, exact.starts, exact.weights, float(diameter_px))
     element = ring.planes.dtype.type
     value = (element(values[y, x, 0]), element(values[y, x, 1]), element(values[y, x, 2]), element(values[y, x, 3]))
     plane = ring.light_plane * ring.plane_elements
