@@ -150,9 +150,9 @@ async def test_places_are_limited_and_given_back() -> None:
             await second.peer.setLocalDescription()
             async with session.post(f"{url}/whep", data=second.peer.localDescription.sdp, headers=SDP) as answer:
                 assert answer.status == 503 and "at most 1 viewers" in (await answer.json())["error"]
-            for status in (200, 404):
+            for _time in range(2):
                 async with session.delete(url + viewer.location) as answer:
-                    assert answer.status == status
+                    assert answer.status == 200, "once more is no error: its connection may close before the page can say so"
                 assert (whep.viewers, stream.viewers) == (0, ())
             await second.connect(url, session)
             await second.next()

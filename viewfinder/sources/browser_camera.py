@@ -329,9 +329,9 @@ class BrowserCameraSource:
         return web.Response(status=201, text=answer, content_type=_SDP, headers=headers)
 
     async def _deleted(self, request: web.Request) -> web.Response:
-        if self._token is None or not secrets.compare_digest(request.match_info["token"], self._token):
-            return web.Response(status=404, text="there is no such camera")
-        await self.close()
+        """End the camera; one that another has replaced, or whose connection was closed first, has gone already."""
+        if self._token is not None and secrets.compare_digest(request.match_info["token"], self._token):
+            await self.close()
         return web.Response()
 
     def _came(self, session: WhipSession, frame: Any) -> None:

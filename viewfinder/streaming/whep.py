@@ -313,10 +313,10 @@ class Whep:
         return web.Response(status=204)
 
     async def _leave(self, request: web.Request) -> web.Response:
+        """End a viewer; one whose connection was closed before it could say so has left as well, and is no error on its page."""
         viewer = self._viewers.get(request.match_info["viewer"])
-        if viewer is None:
-            return _refusal(404, "there is no such viewer (any more)")
-        await viewer.close()
+        if viewer is not None:
+            await viewer.close()
         return web.Response()
 
     async def _options(self, _request: web.Request) -> web.Response:
