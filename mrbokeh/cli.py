@@ -18,6 +18,7 @@ from rich.console import Console
 from typer.core import TyperGroup
 from typer.main import get_command
 
+from mrbokeh.commands._option_words import with_words
 from mrbokeh.system.atomic_files import writing_alone
 from mrbokeh.system.channel import channel, object_on_stdout, opened, remove_unfinished, write_object
 from mrbokeh.system.errors import FAULT, INTERRUPTED, InputError, MissingExtraError
@@ -104,6 +105,7 @@ def _heard(command: Any, path: str) -> None:
     if hasattr(command, "commands") and not command.invoke_without_command:
         return
     callback = command.callback
+    with_words(command, path)
     command.params = [*command.params, *get_command(_every).params]
 
     def run(quiet: bool, as_json: bool, log: Path | None, **given: Any) -> None:  # noqa: ARG001

@@ -1,6 +1,5 @@
 """`mrbokeh viewfinder`: a camera with virtual objects in it, blurred by the lens, in a browser."""
 
-import logging
 from pathlib import Path
 from typing import Annotated
 
@@ -10,7 +9,6 @@ import mrbokeh
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.channel import say, tell
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.typed_numbers import numbers_in
 from viewfinder.options import CalibrationOptions, ListeningOptions, PhoneOptions, TrackingOptions, ViewfinderOptions
 
 app = typer.Typer(add_completion=False)
@@ -25,7 +23,7 @@ PhoneOption = Annotated[
     str | None, typer.Option(metavar="SOURCE", help="Camera of a phone on the hot shoe, which sees --board: whip, or as --source.")
 ]
 PhoneCameraOption = Annotated[Path | None, typer.Option(help="CAMERA.json with the intrinsics of --phone.")]
-WidthOption = Annotated[int | None, typer.Option(min=16, metavar="PX", help="Wider pictures are made smaller.")]
+MaxWidthOption = Annotated[int | None, typer.Option(min=16, metavar="PX", help="Wider pictures are made smaller.")]
 PortOption = Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 takes a free one.")]
 LanOption = Annotated[bool, typer.Option(help="Let this network in, with a one-time token; else only this machine.")]
 InterfaceOption = Annotated[str | None, typer.Option(help="With --lan: name or address of the one interface to listen on.")]
@@ -48,9 +46,11 @@ def viewfinder(
     ] = None,
     renderer: Annotated[
         list[str] | None,
-        typer.Option("--renderer", "--method", help="polygon, low-rank, scatter, laplacian (repeat to switch on the page)."),
+        typer.Option("--renderer", help="polygon, low-rank, scatter, laplacian (repeat to switch on the page)."),
     ] = None,
-    backend: Annotated[str, typer.Option(help="What draws the scene: wgpu (a graphics card), embree (the processor), or auto.")] = "auto",
+    scene_renderer: Annotated[
+        str, typer.Option(help="What draws the scene: wgpu (a graphics card), embree (the processor), or auto.")
+    ] = "auto",
     psf: Annotated[
         Path | None, typer.Option(help="A measured bank of kernels (of `mrbokeh lens fit`) in place of the lens's opening.")
     ] = None,
@@ -66,15 +66,15 @@ def viewfinder(
     phone: PhoneOption = None,
     phone_camera: PhoneCameraOption = None,
     rig: Annotated[Path | None, typer.Option(help="RIG.json of `mrbokeh viewfinder calibrate-phone`: where --phone sits.")] = None,
-    delay_ms: Annotated[float, typer.Option(help="How much later the picture comes than a pose from --phone or a tracking system.")] = 0.0,
+    delay: Annotated[float, typer.Option(help="How much later the picture comes than a pose from --phone or a tracking system.")] = 0.0,
     camera: CameraOption = None,
     focus_from: Annotated[
         list[str] | None,
         typer.Option(help="Who is asked first for the focus: hand (the page), tracking, source, board (its blur); repeat for an order."),
     ] = None,
-    smoothing: Annotated[bool, typer.Option(help="Smooth the track (One-Euro); the page can switch it.")] = False,
-    width: WidthOption = 640,
-    fps: Annotated[float | None, typer.Option(help="At most so many frames per second.")] = None,
+    smooth: Annotated[bool, typer.Option(help="Smooth the track (One-Euro); the page can switch it.")] = False,
+    max_width: MaxWidthOption = 640,
+    max_rate: Annotated[float | None, typer.Option(help="At most so many frames per second.")] = None,
     captures: Annotated[Path, typer.Option(help="Folder for captured bundles and recordings.")] = Path("captures"),
     webcam: Annotated[
         str | None,
@@ -107,7 +107,6 @@ def viewfinder(
         raise InputError("nothing to show: expected --source (a clip, a webcam's number, a URL, or test), or --demo for the shipped clip")
     from viewfinder.app.running import serve
 
-    logging.basicConfig(level=logging.WARNING)
     serve(
         ViewfinderOptions(
             source=source,
@@ -116,7 +115,7 @@ def viewfinder(
             lenses=tuple(lens or ()),
             renderers=tuple(renderer or ()),
             psf=psf,
-            backend=backend,
+            backend=scene_renderer,
             tracking=TrackingOptions(
                 board=board,
                 pose=pose,
@@ -126,13 +125,13 @@ def viewfinder(
                 freed=freed,
                 lens_table=lens_table,
                 phone=PhoneOptions.of(phone, phone_camera, rig),
-                delay_ms=delay_ms,
+                delay_ms=delay,
             ),
             camera=camera,
             focus_from=tuple(focus_from or ()),
-            smoothing=smoothing,
-            width_px=width,
-            fps=fps,
+            smoothing=smooth,
+            width_px=max_width,
+            fps=max_rate,
             captures=captures,
             webcam=webcam,
             listening=ListeningOptions(port=port, lan=lan, interface=interface, tls=tls, tls_key=tls_key, qr=qr),
@@ -144,18 +143,17 @@ def viewfinder(
 def board_command(
     out: Annotated[Path, typer.Option(help="Where the page goes: BOARD.pdf; beside it BOARD.json, for --board.")],
     lens: Annotated[Path | None, typer.Option(help="The lens that will see it; chooses the size of the markers by its blur.")] = None,
-    distance_m: Annotated[
-        str, typer.Option(help="NEAREST,FARTHEST: how far the camera will be, in metres.", metavar="NEAREST,FARTHEST")
-    ] = "0.4,1.0",
-    width_px: Annotated[int, typer.Option(min=64, help="Width of the camera's picture.")] = 1280,
+    near: Annotated[float, typer.Option(min=0.01, help="How near the camera will come.")] = 0.4,
+    far: Annotated[float, typer.Option(help="How far away it will be.")] = 1.0,
+    image_width: Annotated[int, typer.Option(min=64, help="Width of the camera's picture.")] = 1280,
     paper: Annotated[str, typer.Option(help="a4, a3, letter, or board: a page of the board's own size.")] = "a4",
-    overwrite: Annotated[bool, typer.Option(help="Replace files that exist.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,
 ) -> None:
     """Print a tracking board at true size: markers large enough to be read through the lens's blur, on one paper.
 
     Print without scaling, and check the ruler at its foot.
 
-    Example: mrbokeh viewfinder board --lens lens.json --distance-m 0.5,1.2 --paper a4 --out board.pdf
+    Example: mrbokeh viewfinder board --lens lens.json --near 0.5 --far 1.2 --paper a4 --out board.pdf
     """
     from mrbokeh.optics.lens_file import read_lens
     from mrbokeh.system.atomic_files import refuse_existing
@@ -166,10 +164,9 @@ def board_command(
         raise InputError(f"--out: expected a name that ends in .pdf, got {out}")
     for path in (out, out.with_suffix(".json")):
         refuse_existing(path, overwrite)
-    nearest_m, farthest_m = numbers_in(distance_m, "--distance-m: expected NEAREST,FARTHEST in metres", (2,))
     # Without a lens that of a phone, to which everything on the table is nearly sharp.
-    used = read_lens(lens) if lens is not None else Lens(5.0, 2.0, 2.0 / (1.0 / nearest_m + 1.0 / farthest_m), 6.4)
-    plan = plan_board(BoardView(used, nearest_m, farthest_m, width_px), paper)
+    used = read_lens(lens) if lens is not None else Lens(5.0, 2.0, 2.0 / (1.0 / near + 1.0 / far), 6.4)
+    plan = plan_board(BoardView(used, near, far, image_width), paper)
     say(plan.sentence)
     if plan.board is None or plan.paper is None:
         raise InputError("no paper holds a board that this lens can read: take a larger f-number, or stand farther away")
@@ -189,14 +186,14 @@ def calibrate_phone_command(
     lens: Annotated[Path | None, typer.Option(help="LENS.json, for the intrinsics where there is no --camera.")] = None,
     pairs: Annotated[int, typer.Option(min=5, help="How many views to take.")] = 12,
     seconds: Annotated[float, typer.Option(min=1.0, help="After so long it ends with the views that there are.")] = 300.0,
-    width: WidthOption = 1280,
+    max_width: MaxWidthOption = 1280,
     port: PortOption = 8080,
     lan: LanOption = False,
     interface: InterfaceOption = None,
     tls: TlsOption = None,
     tls_key: TlsKeyOption = None,
     qr: QrOption = True,
-    overwrite: Annotated[bool, typer.Option(help="Replace RIG.json if it exists.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace RIG.json if it exists.")] = False,
 ) -> None:
     """Find out where a phone sits on the camera's hot shoe; show both the board from many sides, and hold still each time.
 
@@ -218,7 +215,7 @@ def calibrate_phone_command(
             lens=lens,
             pairs=pairs,
             seconds=seconds,
-            width_px=width,
+            width_px=max_width,
             listening=ListeningOptions(port=port, lan=lan, interface=interface, tls=tls, tls_key=tls_key, qr=qr),
             overwrite=overwrite,
         )

@@ -111,11 +111,11 @@ class ViewfinderOptions:
         if (self.scene is None) == (self.layer is None):
             yield "expected either --scene SCENE.toml or --layer RGBAZ.exr: give one of them"
         if self.backend not in BACKENDS:
-            yield f"--backend: expected one of {', '.join(BACKENDS)}, got {self.backend!r}"
+            yield f"--scene-renderer: expected one of {', '.join(BACKENDS)}, got {self.backend!r}"
         if self.backend != "auto" and self.layer is not None:
-            yield "--backend draws a --scene, but a --layer is drawn already: leave --backend out"
+            yield "--scene-renderer draws a --scene, but a --layer is drawn already: leave --scene-renderer out"
         if self.fps is not None and not self.fps > 0.0:
-            yield f"--fps: expected a positive number of frames per second, got {self.fps:g}"
+            yield f"--max-rate: expected a positive number of frames per second, got {self.fps:g}"
 
     def _wrong_in_tracking(self) -> Iterator[str]:
         tracking = self.tracking
@@ -133,9 +133,9 @@ class ViewfinderOptions:
         if tracking.metres_per_unit is not None and not tracking.metres_per_unit > 0.0:
             yield f"--metres-per-unit: expected a number above 0, got {tracking.metres_per_unit:g}"
         if tracking.delay_ms and not {"phone", "opentrackio", "freed"} & set(ways):
-            yield "--delay-ms is for poses that come from elsewhere (--phone, --opentrackio, --freed): leave it out"
+            yield "--delay is for poses that come from elsewhere (--phone, --opentrackio, --freed): leave it out"
         if self.smoothing and not set(ways) - {"pose"}:
-            yield "--smoothing needs a track: give --board, --map, --phone, --opentrackio or --freed, or leave it out"
+            yield "--smooth needs a track: give --board, --map, --phone, --opentrackio or --freed, or leave it out"
 
     def _wrong_in_focus(self) -> Iterator[str]:
         for name in self.focus_from:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from mrbokeh.system.channel import say, tell
+from mrbokeh.system.channel import guess, say, tell
 from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
@@ -72,7 +72,8 @@ def merge_command(
         stacks = merge_scene(scene, overwrite, registration, prefer)
     for stack in stacks:
         _tell(stack)
-        for told in (stack.metadata.get(ORDER), metres_note(stack) or metres_facts(stack).get("why")):
+        guess(metres_note(stack))
+        for told in (stack.metadata.get(ORDER), metres_facts(stack).get("why") if not metres_note(stack) else None):
             if told:
                 say(f"  {told}")
         for line in preferred_lines(stack):

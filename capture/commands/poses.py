@@ -32,7 +32,7 @@ def poses_command(
     cameras: Annotated[str, typer.Option(help="auto, shared (one for all pictures) or separate (one each)")] = "auto",
     max_image_size: Annotated[int, typer.Option(min=200, metavar="PX", help="features are sought in pictures no wider or higher")] = 1600,
     seed: Annotated[int, typer.Option(min=0, help="of COLMAP's random draws")] = 0,
-    threads: Annotated[int, typer.Option(help="for features and matches; -1 takes all cores")] = -1,
+    threads: Annotated[int, typer.Option(min=0, max=4096, help="for features and matches; 0 takes all cores")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="find poses again from the start")] = False,
 ) -> None:
     from capture.poses.colmap import PoseSettings, find_picture_poses, find_scene_poses
@@ -45,7 +45,7 @@ def poses_command(
         cameras=cameras,
         max_image_size_px=max_image_size,
         seed=seed,
-        threads=threads,
+        threads=threads or -1,
         overwrite=overwrite,
     )
     if scene is not None and images is None and out is None:

@@ -18,7 +18,7 @@ HELP = "\n\n".join(
         "A new scene is taken away again where no stack of it can be merged. "
         "With one viewpoint, or where camera poses cannot be found, depth comes from focus alone, and the report says so.",
         "Example:  mrbokeh capture process shoot/ --out scene/",
-        "Example:  mrbokeh capture process shoot/ --out scene/ --board 8x6 --square-mm 30 --marker-mm 22 --strict",
+        "Example:  mrbokeh capture process shoot/ --out scene/ --board 8x6 --square 30 --marker 22 --strict",
     )
 )
 
@@ -29,8 +29,8 @@ def process_command(
     sidecar: Annotated[Path | None, typer.Option(metavar="lens.toml", help="for all photographs, instead of those beside them")] = None,
     max_width: Annotated[int | None, typer.Option(min=16, metavar="N", help="reduce wider pictures to N pixels (area averages)")] = None,
     board: Annotated[str | None, typer.Option(metavar="COLUMNSxROWS|board.toml", help="squares of a ChArUco board in the scene")] = None,
-    square_mm: Annotated[float | None, typer.Option(metavar="MM", help="side of a square as measured on the print")] = None,
-    marker_mm: Annotated[float | None, typer.Option(metavar="MM", help="side of a marker")] = None,
+    square_mm: Annotated[float | None, typer.Option("--square", metavar="MM", help="side of a square as measured on the print")] = None,
+    marker_mm: Annotated[float | None, typer.Option("--marker", metavar="MM", help="side of a marker")] = None,
     distance: Annotated[str | None, typer.Option(metavar="VIEW_A,VIEW_B,METRES", help="between two camera centres")] = None,
     prefer: Annotated[
         Literal["near", "far"] | None, typer.Option(help="of two things that are both seen sharp in one place, for `capture merge`")

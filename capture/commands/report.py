@@ -18,7 +18,7 @@ HELP = "\n\n".join(
         "Writes SCENE/report.html (one file, pictures and 3D view inside), SCENE/report.json with the same numbers, and each stack's "
         "exclusion.exr. What is not there yet (poses, scale, depth in metres) is named as absent: such gates are not judged. --strict "
         "exits with 1 where a gate failed or was not judged; --allow-absent NAME, once for each gate, says which may stay unjudged.",
-        "What was found of a stack is kept in STACK/report and used again while the stack, --width and --renderer stay the same: an "
+        "What was found of a stack is kept in STACK/report and used again while the stack, --max-width and --renderer stay the same: an "
         "interrupted report goes on where it stopped. The pages are written anew each time; --overwrite examines everything again.",
         "Example:  mrbokeh capture report scene/",
         "Example:  mrbokeh capture report scene/ --strict && mrbokeh train fit scene/",
@@ -34,7 +34,7 @@ def report_command(
         list[str] | None, typer.Option("--allow-absent", metavar="NAME", help="a gate that --strict may leave unjudged (repeatable)")
     ] = None,
     renderer: Annotated[str, typer.Option(help="that re-blurs: polygon, scatter (exact, slow) or another of mrbokeh's")] = "polygon",
-    width: Annotated[int, typer.Option(min=64, help="wider pictures are re-blurred at this width, in pixels")] = 960,
+    max_width: Annotated[int, typer.Option(min=64, help="wider pictures are re-blurred at this width, in pixels")] = 960,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="examine again what was examined already")] = False,
 ) -> None:
     from capture.report import HTML_NAME
@@ -47,7 +47,7 @@ def report_command(
     if not scene.is_dir():
         raise InputError(f"expected a folder with focal stacks, but {scene} is none")
     with kept_when_interrupted(f"what was found of finished stacks is kept in {scene}", overwrite):
-        report = report_scene(scene, reblur_by(renderer), width, overwrite=overwrite)
+        report = report_scene(scene, reblur_by(renderer), max_width, overwrite=overwrite)
     for use, gates in by_use(report.gates).items():
         say(verdict_line(use, gates))
         for line in verdict_lines(gates) if strict or use == PICTURES or len(report.failures) <= FEW else []:

@@ -21,7 +21,7 @@ HELP = "\n\n".join(
         "still guessed is said: two things at different depths tell how deep the scene is.",
         "Example:  mrbokeh capture scale STACK --ruler 310,220,480,224,0.05",
         "Example:  mrbokeh capture scale STACK --nearest last",
-        "Example:  mrbokeh capture scale scene/ --board 8x6 --square-mm 30 --marker-mm 22",
+        "Example:  mrbokeh capture scale scene/ --board 8x6 --square 30 --marker 22",
         "Example:  mrbokeh capture scale scene/ --distance view_0,view_3,0.25",
         "Example:  mrbokeh capture scale other_scene/ --lens-calibration scene/lens_calibration.json",
     )
@@ -39,8 +39,8 @@ def scale_command(
             help="squares of a ChArUco board in the scene, or its file, as `mrbokeh viewfinder board` writes one",
         ),
     ] = None,
-    square_mm: Annotated[float | None, typer.Option(metavar="MM", help="side of a square as measured on the print")] = None,
-    marker_mm: Annotated[float | None, typer.Option(metavar="MM", help="side of a marker")] = None,
+    square_mm: Annotated[float | None, typer.Option("--square", metavar="MM", help="side of a square as measured on the print")] = None,
+    marker_mm: Annotated[float | None, typer.Option("--marker", metavar="MM", help="side of a marker")] = None,
     dictionary: Annotated[str, typer.Option(help="of cv2.aruco")] = _DICTIONARY,
     distance: Annotated[str | None, typer.Option(metavar="VIEW_A,VIEW_B,METRES", help="between two camera centres")] = None,
     lens_calibration: Annotated[
@@ -58,7 +58,7 @@ def scale_command(
         Literal["first", "last"] | None,
         typer.Option(help="which slice of a stack is focused nearest; turns its depth where near and far were taken for one another"),
     ] = None,
-    calibrate: Annotated[bool, typer.Option("--calibrate/--no-calibrate", help="calibrate the focus of the stacks")] = True,
+    no_calibrate: Annotated[bool, typer.Option("--no-calibrate", help="leave the focus of the stacks as it is")] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="find the scale again")] = False,
 ) -> None:
     from capture.scale.answer import parse_distance
@@ -68,12 +68,12 @@ def scale_command(
     if ruler or distance_at or nearest:
         of_scenes = {
             "--board": board,
-            "--square-mm": square_mm,
-            "--marker-mm": marker_mm,
+            "--square": square_mm,
+            "--marker": marker_mm,
             "--dictionary": dictionary != _DICTIONARY,
             "--distance": distance,
             "--lens-calibration": lens_calibration,
-            "--no-calibrate": not calibrate,
+            "--no-calibrate": no_calibrate,
         }
         if given := [name for name, value in of_scenes.items() if value is not None and value is not False]:
             raise InputError(
@@ -90,7 +90,7 @@ def scale_command(
         return
     wanted_board = None if board is None else board_from_options(board, square_mm, marker_mm, dictionary)
     wanted_distance = None if distance is None else parse_distance(distance)
-    for line in scale_lines(scale_scene(scene, ScaleRequest(wanted_board, wanted_distance, calibrate, overwrite))):
+    for line in scale_lines(scale_scene(scene, ScaleRequest(wanted_board, wanted_distance, not no_calibrate, overwrite))):
         tell(line)
 
 

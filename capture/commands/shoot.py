@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 HELP = "\n\n".join(
     (
         "Shoot a planned focus bracket: each slice is on the disk and in shoot.json before the next is taken.",
-        "--camera gphoto2 is a camera on USB (gphoto2:PORT if there are several), folder:DIR a folder into which the camera's own "
+        "--source gphoto2 is a camera on USB (gphoto2:PORT if there are several), folder:DIR a folder into which the camera's own "
         "software or a card stores while you focus and release, simulated a thin lens in memory that shows how all this works.",
         "Exposure must be manual; RAW, a fixed white balance and autofocus off are set where the camera allows. "
         "Interrupted (Ctrl-C, cable, battery), the same command goes on at the first missing slice.",
@@ -29,8 +29,8 @@ HELP = "\n\n".join(
         "the scale. It holds for this lens and body.",
         "At the end slice 0 is shot again and compared: whether focus, frame and light came back.",
         "OUT goes to `mrbokeh capture ingest` as it is; a lens.toml is written with what the photographs do not state.",
-        "Example:  mrbokeh capture shoot --plan plan.json --camera simulated --out session/view_0",
-        "Example:  mrbokeh capture shoot --plan plan.json --camera gphoto2 --out session/view_0 --target 0.3,0.5=0.6 "
+        "Example:  mrbokeh capture shoot --plan plan.json --source simulated --out session/view_0",
+        "Example:  mrbokeh capture shoot --plan plan.json --source gphoto2 --out session/view_0 --target 0.3,0.5=0.6 "
         "--target 0.7,0.5=2.5 --exposure-time 1/60 --iso 100",
     )
 )
@@ -38,7 +38,7 @@ HELP = "\n\n".join(
 
 def shoot_command(
     plan: Annotated[Path, typer.Option(metavar="plan.json", help="what `mrbokeh capture plan --out` wrote")],
-    camera: Annotated[str, typer.Option(metavar="CAMERA", help="gphoto2, gphoto2:PORT, folder:DIR or simulated")],
+    source: Annotated[str, typer.Option(metavar="CAMERA", help="gphoto2, gphoto2:PORT, folder:DIR or simulated")],
     out: Annotated[Path, typer.Option(metavar="OUT", help="folder of this bracket; one for each viewpoint")],
     exposure_time: Annotated[str | None, typer.Option(metavar="S", help="seconds, such as 1/60; else what the camera has")] = None,
     iso: Annotated[float | None, typer.Option(min=1, max=1e7, help="ISO; else what the camera has")] = None,
@@ -77,7 +77,7 @@ def shoot_command(
     if given is not None and targets:
         raise InputError("what the steps mean is both given and to be measured: leave --target out, or the others")
     settings = CameraSettings(parse_seconds(exposure_time), iso, f_number, white_balance)
-    driver = open_named(camera, planned, timeout_s=timeout, focus_level=focus_level, reverse_focus=reverse_focus)
+    driver = open_named(source, planned, timeout_s=timeout, focus_level=focus_level, reverse_focus=reverse_focus)
     with kept_when_interrupted(f"what was shot is kept in {out}", overwrite), closing(driver):
         if live:
             watch(driver, parse_spot(spot))

@@ -191,7 +191,7 @@ def board_from_options(board: str, square_mm: float | None, marker_mm: float | N
     except ValueError:
         raise InputError(f"--board must be COLUMNSxROWS such as 8x6, a board.toml or a board.json, got {board!r}") from None
     if square_mm is None or marker_mm is None:
-        raise InputError("--board COLUMNSxROWS needs --square-mm and --marker-mm as measured on the print")
+        raise InputError("--board COLUMNSxROWS needs --square and --marker as measured on the print")
     return CharucoBoard((CharucoGrid((columns, rows), square_mm, marker_mm),), dictionary)
 
 

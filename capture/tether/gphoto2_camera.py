@@ -264,7 +264,7 @@ def list_cameras() -> list[FoundCamera]:
 def open_camera(port: str | None = None, *, focus_level: int = 1, reverse_focus: bool = False) -> Gphoto2Camera:
     """Open the only camera, or the one at a port such as usb:001,005. Raises CameraError without one, InputError for several."""
     try:
-        model, at = chosen_of(detected(), port, "--camera")
+        model, at = chosen_of(detected(), port, "--source")
     except NoCameraError as error:
         raise CameraError(str(error)) from None
     with explained(f"opening {model} at {at}"):

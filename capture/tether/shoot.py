@@ -303,4 +303,4 @@ def open_named(name: str, plan: FocusPlan, *, timeout_s: float, focus_level: int
         from capture.tether.simulated_camera import SimulatedCamera
 
         return SimulatedCamera.for_plan(plan)
-    raise InputError(f"--camera must be gphoto2, gphoto2:PORT, folder:DIR or simulated, got {name!r}")
+    raise InputError(f"--source must be gphoto2, gphoto2:PORT, folder:DIR or simulated, got {name!r}")

@@ -1,15 +1,12 @@
 """Options of `mrbokeh composite` alone, in groups."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from mrbokeh.commands import _insertion_options as shared
-from mrbokeh.commands._insertion_options import LENS, PLATE, RESULT, VIRTUAL
-
-LIGHT = "Its light"
 
 PhotoArgument = Annotated[
     Path,
@@ -20,17 +17,13 @@ PhotoArgument = Annotated[
 ]
 OutOption = Annotated[
     Path,
-    typer.Option(
-        help="The picture: .exr stays linear and holds all layers, .png and .tif are 16-bit sRGB, .jpg is 8-bit.", rich_help_panel=RESULT
-    ),
+    typer.Option(help="The picture: .exr stays linear and holds all layers, .png and .tif are 16-bit sRGB, .jpg is 8-bit."),
 ]
 
 
 @dataclass(frozen=True)
 class PlateOptions(shared.NearOptions):
     """Options of the photograph and its depth. disparity: NEAR:FAR as typed."""
-
-    PANEL = PLATE
 
     slice_: Annotated[int | None, typer.Option("--slice", help="Which slice of the focal stack to put it into.")] = None
     all_slices: Annotated[bool, typer.Option("--all-slices", help="Put it into every slice of the stack; OUT is a new stack.")] = False
@@ -47,9 +40,7 @@ class PlateOptions(shared.NearOptions):
             metavar="SHARP", help="The photograph all in focus, as of another program: what blurred near things hide is taken from it."
         ),
     ] = None
-    disparity: Annotated[
-        str | None, typer.Option(metavar="NEAR:FAR", help="--depth is even in 1/distance, largest number at NEAR, 0 at FAR metres.")
-    ] = None
+    disparity: shared.DisparityOption = None
     depth_scale: Annotated[float | None, typer.Option(help="--depth holds distance: metres for each step; 0 is unknown.")] = None
     exact_depth: Annotated[
         bool,
@@ -64,8 +55,6 @@ class PlateOptions(shared.NearOptions):
 @dataclass(frozen=True)
 class ObjectOptions:
     """Options of how the --object stands: at or at_pixel, and its height, as typed; angles in degrees."""
-
-    PANEL = VIRTUAL
 
     object_: Annotated[Path | None, typer.Option("--object", help="GLB file to render and put in.")] = None
     at: Annotated[str | None, typer.Option(help="X,Y,Z in metres where the object stands: right, down, forward of the lens.")] = None
@@ -85,37 +74,36 @@ class ObjectOptions:
         ),
     ] = None
     turn: Annotated[float, typer.Option(help="Turn of the object about the vertical in degrees.")] = 0.0
-    tilt: Annotated[float, typer.Option(help="How far the camera looks down, in degrees.")] = 0.0
-    environment: Annotated[Path | None, typer.Option(help="Panorama (.hdr, .exr) that lights the --object.", rich_help_panel=LIGHT)] = None
-    exposure: Annotated[float, typer.Option(min=0.0, help="Factor on the object's light.", rich_help_panel=LIGHT)] = 1.0
-    shadow: Annotated[float, typer.Option(min=0.0, max=1.0, help="Darkness of the object's shadow.", rich_help_panel=LIGHT)] = 0.0
+    pitch: Annotated[float, typer.Option(help="How far the camera looks down, in degrees.")] = 0.0
+    environment: Annotated[Path | None, typer.Option(help="Panorama (.hdr, .exr) that lights the --object.")] = None
+    exposure: Annotated[float, typer.Option(min=0.0, help="Factor on the object's light.")] = 1.0
+    shadow: Annotated[float, typer.Option(min=0.0, max=1.0, help="Darkness of the object's shadow.")] = 0.0
 
 
 @dataclass(frozen=True)
 class RenderingOptions(shared.RenderingOptions):
     """Options of rendering in a photograph. time: of the animations, in seconds."""
 
-    PANEL = VIRTUAL
-
-    scene_renderer: shared.BackendOption = "embree"
     time: Annotated[float, typer.Option(help="Second of the animations that is shown.")] = 0.0
+
+    @property
+    def of_photograph(self) -> "RenderingOptions":
+        """Return these options for one picture, whose objects the exact renderer draws unless another is named."""
+        return replace(self, scene_renderer="embree") if self.scene_renderer == "auto" else self
 
 
 @dataclass(frozen=True)
 class LensOptions:
     """Options of the lens. focus: distance of the photograph in metres."""
 
-    PANEL = LENS
-
     lens: Annotated[
         Path | None, typer.Option(help="LENS.json, or LENS.onnx to blur with a trained network. Default: what the photograph tells.")
     ] = None
     focus: Annotated[float | None, typer.Option(help="Focus distance of the photograph in metres.")] = None
+    focus_at: shared.FocusAtOption = None
     renderer: Annotated[
         str | None,
-        typer.Option(
-            "--renderer", "--method", help="polygon, low-rank, scatter or NETWORK.onnx. Default: --lens if a network, else polygon."
-        ),
+        typer.Option("--renderer", help="polygon, low-rank, scatter or NETWORK.onnx. Default: --lens if a network, else polygon."),
     ] = None
 
 
@@ -123,10 +111,8 @@ class LensOptions:
 class ResultOptions:
     """Files beside OUT."""
 
-    PANEL = RESULT
-
     save_layer: Annotated[Path | None, typer.Option(help="Also write the blurred virtual layer (EXR with alpha).")] = None
-    deep_out: Annotated[
+    save_deep: Annotated[
         Path | None, typer.Option(metavar="FILE.exr", help="Also write the sharp virtual layers as a deep EXR, one sample per layer.")
     ] = None
     overwrite: shared.OverwriteOption = False

@@ -26,6 +26,7 @@ from mrbokeh.stacks.capture_bundle import CaptureBundle
 from mrbokeh.stacks.guessed_metres import GUESSED
 from mrbokeh.stacks.photograph import read_photograph
 from mrbokeh.system.atomic_files import require_safe_outputs
+from mrbokeh.system.channel import warn
 from mrbokeh.system.console import flag
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.typed_numbers import numbers_in
@@ -78,10 +79,10 @@ def require_options_of_stacks(
     """Raise InputError if an option is given that is of one picture, and that --all-slices would not follow."""
     one_picture = (
         (taken, ("slice_", "depth", "rgb", "disparity", "depth_scale", "matte", "near_distance")),
-        (optics, ("focus",)),
+        (optics, ("focus", "focus_at")),
         (look, tuple(vars(look))),
         (colour, ("input_space", "output_space")),
-        (result, ("save_layer", "deep_out")),
+        (result, ("save_layer", "save_deep")),
     )
     given = [name for group, names in one_picture for name in names if getattr(group, name) != getattr(type(group)(), name)]
     if given:
@@ -94,26 +95,26 @@ def require_options_of_stacks(
 
 def check_outputs(out: Path, result: ResultOptions, read: Sequence[Path | None], *, all_slices: bool) -> None:
     """Raise InputError if a file would be lost, or cannot be what is asked for. read: the files that the command reads."""
-    for path, name in ((result.save_layer, "--save-layer"), (result.deep_out, "--deep-out")):
+    for path, name in ((result.save_layer, "--save-layer"), (result.save_deep, "--save-deep")):
         if path is not None:
             require_suffix(path, (".exr",), name)
     if all_slices and out.suffix:
         raise InputError(f"--all-slices writes a focal stack: expected the name of a folder, got --out {out}")
     if not all_slices:
         require_suffix(out, (".exr", *INTEGER_SUFFIXES), "--out")
-    require_safe_outputs((out, result.save_layer, result.deep_out), read, result.overwrite)
+    require_safe_outputs((out, result.save_layer, result.save_deep), read, result.overwrite)
 
 
 def blur_told(plate: Plate, sharp: Sequence[Layer]) -> tuple[str, dict[str, Any], dict[str, Any]]:
     """Describe the lens and its blur, with what is known of the lens, and figures; if metres are guessed, give the measured pixels."""
     lens, width_px = plate.lens, plate.rgb.shape[1]
     unit = GUESSED if plate.metres_guessed else "m"
-    told = "blur as measured in the slices," if plate.lens_guessed else f"{lens.focal_length_mm:.4g} mm f/{lens.f_number:.3g}"
-    told += f" focused at {lens.focus_distance_m:.3g} {unit}"
+    told = f"{plate.blur_from}," if plate.blur_from else f"{lens.focal_length_mm:.4g} mm f/{lens.f_number:.3g}"
+    told += f" focused at {f'{lens.focus_distance_m:.3g} {GUESSED}' if plate.metres_guessed else lens.focus_described}"
     seen_m = np.concatenate(
         [np.empty(0, np.float32), *(layer.depth_m[(layer.alpha > 0.5) & np.isfinite(layer.depth_m)] for layer in sharp)]
     )
-    known = {} if plate.lens_guessed or plate.metres_guessed else lens.facts
+    known = {} if plate.blur_from or plate.metres_guessed else lens.facts
     if not len(seen_m):
         return told, known, {}
     nearest_m, farthest_m = seen_m.min(), seen_m.max()
@@ -128,6 +129,19 @@ def _size_px(sharp: Sequence[Layer]) -> str:
     """Width x height of what is put in."""
     rows, columns = np.nonzero(np.maximum.reduce([layer.alpha for layer in sharp]) > 0.5)
     return f"{np.ptp(columns) + 1}x{np.ptp(rows) + 1}"
+
+
+def nothing_seen(standing: ObjectOptions, virtual: VirtualOptions) -> None:
+    """Raise InputError if what was rendered is not in the picture; an empty layer of another program is only warned of."""
+    if standing.object_ is not None:
+        where = f"--at-pixel {standing.at_pixel}" if standing.at_pixel else f"--at {standing.at}"
+        raise InputError(
+            f"nothing of {standing.object_} is in the picture: by {where} it stands beside the frame or is too small to be seen; choose "
+            f"another place with --at X,Y,Z (metres right, down, forward of the lens) or --at-pixel X,Y, or another --height"
+        )
+    if virtual.scene is not None:
+        raise InputError(f"nothing of {virtual.scene} is in the picture: its objects are beside the frame or behind the --camera")
+    warn("nothing of the layers is in the picture: their alpha is 0 everywhere")
 
 
 def placing_warning(sharp: Sequence[Layer], plate: Plate, mode: str, height: str | None) -> str | None:
@@ -165,8 +179,8 @@ def write_results(
     write_picture(out, inserted, plate, sharp, colour)
     if result.save_layer is not None:
         write_layer(result.save_layer, inserted.virtual)
-    if result.deep_out is not None:
-        write_deep_exr(result.deep_out, sharp)
+    if result.save_deep is not None:
+        write_deep_exr(result.save_deep, sharp)
 
 
 def write_picture(out: Path, inserted: Inserted, plate: Plate, sharp: Sequence[Layer], colour: ColourOptions) -> None:
@@ -287,7 +301,7 @@ def _object_layers(glb: Path, options: ObjectOptions, rendering: RenderingOption
         raise InputError("--at and --at-pixel both say where the object stands: give one of them")
     stands_at_m = _triple(options.at) if options.at else first.point_under_pixel_m(*pair_of(options.at_pixel))
     light = Lighting(options.environment, exposure=options.exposure)
-    turn, tilt = math.radians(options.turn), math.radians(options.tilt)
+    turn, tilt = math.radians(options.turn), math.radians(options.pitch)
     one = OneObject(
         glb=glb,
         stands_at_m=stands_at_m,
@@ -336,7 +350,7 @@ def _scene_layers(path: Path, camera: Path | None, rendering: RenderingOptions) 
 def _filmed(description: SceneDescription, rendering: RenderingOptions, seen_by: Callable[[Plate], Camera]) -> LayersFor:
     from mrbokeh.scene.staging.filming import FilmedLayers
 
-    filmed = FilmedLayers(rendering.filming(), description)
+    filmed = FilmedLayers(rendering.of_photograph.filming(), description)
 
     def layers(plate: Plate) -> list[Layer]:
         sharp_rgb = plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb

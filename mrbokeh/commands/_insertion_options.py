@@ -1,33 +1,30 @@
 """Options that `mrbokeh composite` and `mrbokeh video` have in common: what is inserted, how it is rendered, colour spaces, look."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.typed_numbers import numbers_in
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from mrbokeh.images.color_management import NamedSpace
     from mrbokeh.optics.lens import Lens
     from mrbokeh.renderers.base import Renderer
     from mrbokeh.scene.moving_layers import ShutterTiming
     from mrbokeh.scene.staging.filming import Filming
 
-PLATE, VIRTUAL, LENS, RESULT = "The plate", "What is put in", "The lens", "The result"
 
-BackendOption = Annotated[str, typer.Option(help="Who renders objects and scenes: auto, embree, wgpu or mitsuba.", rich_help_panel=VIRTUAL)]
-OverwriteOption = Annotated[bool, typer.Option(help="Replace what exists.", rich_help_panel=RESULT)]
-
-LOOK = "Its look"
+OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace what exists.")]
 
 
 @dataclass(frozen=True)
 class NearOptions:
     """Options of what stands in front of virtual things. near_distance: in metres."""
-
-    PANEL = PLATE
 
     matte: Annotated[
         Path | None,
@@ -44,8 +41,6 @@ class NearOptions:
 @dataclass(frozen=True)
 class VirtualOptions:
     """Layers of other renderers and a scene, and how they go in."""
-
-    PANEL = VIRTUAL
 
     layer: Annotated[
         list[Path] | None,
@@ -92,18 +87,17 @@ class VirtualOptions:
 class RenderingOptions:
     """Options of rendering --scene and --object."""
 
-    PANEL = VIRTUAL
-
-    scene_renderer: BackendOption = "auto"
-    samples: Annotated[int, typer.Option(min=1, help="Paths per pixel of mitsuba.")] = 64
+    scene_renderer: Annotated[
+        str,
+        typer.Option(help="Who renders objects and scenes: embree, wgpu, mitsuba, or auto (embree in a photograph, else a graphics card)."),
+    ] = "auto"
+    paths: Annotated[int, typer.Option(min=1, help="Paths per pixel of mitsuba.")] = 64
     catch: Annotated[str, typer.Option(help="What the ground under them catches: shadow, or light (also reflections, with mitsuba).")] = (
         "shadow"
     )
     distortion: Annotated[
         Path | None,
-        typer.Option(
-            metavar="DISTORTION.json", help="How the lens bends straight lines: what is rendered is bent alike.", rich_help_panel=LENS
-        ),
+        typer.Option(metavar="DISTORTION.json", help="How the lens bends straight lines: what is rendered is bent alike."),
     ] = None
 
     def filming(self, shutter: "ShutterTiming | None" = None) -> "Filming":
@@ -112,14 +106,33 @@ class RenderingOptions:
         from mrbokeh.scene.staging.filming import Filming
 
         distortion = read_distortion(self.distortion)
-        return Filming(self.scene_renderer, self.samples, catches=self.catch, distortion=distortion, shutter=shutter)
+        return Filming(self.scene_renderer, self.paths, catches=self.catch, distortion=distortion, shutter=shutter)
+
+
+DisparityOption = Annotated[
+    str | None, typer.Option(metavar="NEAR:FAR", help="--depth is even in 1/distance, largest number at NEAR, 0 at FAR metres.")
+]
+FocusAtOption = Annotated[str | None, typer.Option(help="Focus on pixel X,Y, or on what lies within R pixels of it: X,Y,R.")]
+
+
+def focused_at_pixel(lens: "Lens", depth_m: "np.ndarray | None", place: str) -> "Lens":
+    """Return the lens focused on what the depth has at a place, X,Y or X,Y,R as typed. Raises InputError without depth."""
+    if depth_m is None:
+        raise InputError("--focus-at looks up how far away the place is, but there is no depth: give --depth, or --focus METRES")
+    x_px, y_px, radius_px = (*numbers_in(place, "--focus-at: expected X,Y or X,Y,RADIUS in whole pixels", (2, 3), number=int), 0)[:3]
+    return lens.focused_on(depth_m, x_px + 0.5, y_px + 0.5, float(radius_px))
+
+
+def require_one_focus(**given: object) -> None:
+    """Raise InputError if more than one of these options says where the focus lies."""
+    named = [f"--{name.replace('_', '-')}" for name, value in given.items() if value is not None]
+    if len(named) > 1:
+        raise InputError(f"{' and '.join(named)} say where the focus lies: give one of them, not both")
 
 
 @dataclass(frozen=True)
 class LensFacts:
     """Facts of the lens in place of those of --lens or of the photograph; None leaves them."""
-
-    PANEL = LENS
 
     focal_length_mm: Annotated[float | None, typer.Option("--focal-length", max=10_000.0, metavar="MM", help="Focal length in mm.")] = None
     f_number: Annotated[float | None, typer.Option(metavar="N", help="f-number.")] = None
@@ -137,20 +150,16 @@ class LensFacts:
 
         if self.given and isinstance(renderer, OnnxNetwork):
             raise InputError("a network blurs as the lens that it learned: leave --focal-length, --f-number and --sensor-width out")
-        lens = lens or Lens.default()
-        height_mm = lens.sensor_height_mm and self.sensor_width_mm and lens.sensor_height_mm * self.sensor_width_mm / lens.sensor_width_mm
-        return replace(lens, **self.given, sensor_height_mm=height_mm or lens.sensor_height_mm)  # type: ignore[arg-type]
+        return (lens or Lens.default()).stating(self.given)
 
 
 @dataclass(frozen=True)
 class ColourOptions:
     """Colour spaces of OpenColorIO, by name; None is as files state, and linear Rec.709 or sRGB out."""
 
-    PANEL = RESULT
-
-    input_space: Annotated[
-        str | None, typer.Option(help="OpenColorIO space of the plate's numbers, such as ACEScg or 'ARRI LogC4'.", rich_help_panel=PLATE)
-    ] = None
+    input_space: Annotated[str | None, typer.Option(help="OpenColorIO space of the plate's numbers, such as ACEScg or 'ARRI LogC4'.")] = (
+        None
+    )
     output_space: Annotated[
         str | None, typer.Option(help="OpenColorIO space of OUT, such as ACEScg; OUT then holds the picture alone.")
     ] = None
@@ -181,8 +190,6 @@ if TYPE_CHECKING:
 @dataclass(frozen=True)
 class LookGroup:
     """Options that make virtual light look photographed: texts as typed, see `mrbokeh.compositing.plate_look.finishing.LookOptions`."""
-
-    PANEL = LOOK
 
     match_grey: Annotated[str | None, typer.Option(metavar="X,Y[,R]", help="A grey card in the plate sets exposure and white balance.")] = (
         None

@@ -2,8 +2,6 @@
 
 @dataclass(frozen=True)
 class NearOptions:
-    PANEL = "The plate"
-
     matte: Annotated[Path | None, typer.Option(help="...")] = None
 
 @app.command()
@@ -14,10 +12,8 @@ def video(clip: ClipArgument, near: NearOptions) -> None: ...      # mrbokeh vid
 from collections.abc import Callable
 from dataclasses import MISSING, Field, fields, is_dataclass
 from functools import wraps
-from inspect import Parameter, Signature, get_annotations, signature
-from typing import Any, get_args, get_type_hints
-
-from typer.models import OptionInfo
+from inspect import Parameter, Signature, signature
+from typing import Any, get_type_hints
 
 
 def grouped(command: Callable[..., None]) -> Callable[..., None]:
@@ -41,18 +37,7 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 
 def _options_of(group: type) -> list[Parameter]:
     hints = get_type_hints(group, include_extras=True)
-    for owner in group.__mro__:
-        panel: str = vars(owner).get("PANEL", "")
-        for name in get_annotations(owner) if panel else ():
-            _put_on_panel(hints[name], panel)
     return [Parameter(each.name, Parameter.KEYWORD_ONLY, default=_default(each), annotation=hints[each.name]) for each in fields(group)]
-
-
-def _put_on_panel(annotation: Any, panel: str) -> None:
-    """Show an option of a group on the group's panel of --help, unless it says itself on which one."""
-    for option in get_args(annotation)[1:]:
-        if isinstance(option, OptionInfo) and option.rich_help_panel is None:
-            option.rich_help_panel = panel
 
 
 def _default(option: "Field[Any]") -> Any:

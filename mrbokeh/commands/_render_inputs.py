@@ -7,11 +7,12 @@ from typing import Annotated
 import numpy as np
 import typer
 
+from mrbokeh.commands._insertion_options import DisparityOption, FocusAtOption, focused_at_pixel, require_one_focus
+from mrbokeh.depth.depth_map import parse_near_far
 from mrbokeh.images.layer import Layer, flatten
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.typed_numbers import numbers_in
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,7 @@ class SharpOptions:
         Path | None,
         typer.Option(help="Its depth in metres: EXR channel Z, depth.Z or Y (inf or <= 0: background), or one number."),
     ] = None
+    disparity: DisparityOption = None
     layer: Annotated[list[Path] | None, typer.Option(help="EXR layer with premultiplied RGBA and Z; repeat it, front first.")] = None
     behind: Annotated[
         list[Path] | None, typer.Option(help="EXR layer behind --rgb: what is known of what it hides (clean plate, other view).")
@@ -30,11 +32,9 @@ class SharpOptions:
     motion: Annotated[
         Path | None, typer.Option(help="EXR with forward.u and forward.v: how far --rgb moves right and up, in pixels of one frame.")
     ] = None
-    shutter: Annotated[float, typer.Option(help="Part of the frame's time for which the shutter is open: 0.5 is 180 degrees.", min=0.0)] = (
-        0.5
-    )
+    shutter: Annotated[float, typer.Option(min=0.0, help="Shutter angle: 360 is open for the whole time of a frame.")] = 180.0
     samples: Annotated[
-        Path | None, typer.Option(help="Noisy light field samples (.npz, .exr) in place of pictures, for --method lrdm or laplacian.")
+        Path | None, typer.Option(help="Noisy light field samples (.npz, .exr) in place of pictures, for --renderer lrdm or laplacian.")
     ] = None
     srgb: Annotated[bool, typer.Option("--srgb", help="--rgb holds integers encoded as sRGB (highlights are lost).")] = False
 
@@ -56,7 +56,7 @@ class FocusOptions:
     focus_distance_m: Annotated[
         float | None, typer.Option("--focus", help="Focus distance in metres in place of the lens file's; inf is allowed.")
     ] = None
-    focus_at: Annotated[str | None, typer.Option(help="Focus on pixel X,Y, or on what lies within R pixels of it: X,Y,R.")] = None
+    focus_at: FocusAtOption = None
 
     @property
     def is_given(self) -> bool:
@@ -68,21 +68,18 @@ def reconstructed(renderer: Renderer, method: str, samples: Path, lens: Lens) ->
     from mrbokeh.stacks.light_field_samples_file import read_samples
 
     if not hasattr(renderer, "reconstruct"):
-        raise InputError(f"--samples are for --method lrdm or laplacian, got --method {method}")
+        raise InputError(f"--samples are for --renderer lrdm or laplacian, got --renderer {method}")
     return renderer.reconstruct(read_samples(samples), lens)
 
 
 def focused(lens: Lens, sharp: dict[str, Layer], focus: FocusOptions) -> Lens:
     """Return the lens at the distance that was asked for, or focused on what is frontmost at a pixel."""
-    if focus.focus_distance_m is not None and focus.focus_at is not None:
-        raise InputError("give either --focus or --focus-at, not both")
+    require_one_focus(focus=focus.focus_distance_m, focus_at=focus.focus_at)
     if focus.focus_distance_m is not None:
         return lens.focused_at(focus.focus_distance_m)
     if focus.focus_at is None:
         return lens
-    given = numbers_in(focus.focus_at, "--focus-at: expected X,Y or X,Y,RADIUS in whole pixels", (2, 3), number=int)
-    x_px, y_px, radius_px = (*given, 0)[:3]
-    return lens.focused_on(flatten(list(sharp.values())).depth_m, x_px + 0.5, y_px + 0.5, float(radius_px))
+    return focused_at_pixel(lens, flatten(list(sharp.values())).depth_m, focus.focus_at)
 
 
 def read_sharp(sources: SharpOptions) -> dict[str, Layer]:
@@ -96,7 +93,7 @@ def _read(sources: SharpOptions) -> dict[str, Layer]:
     if (rgb is None) != (depth is None):
         raise InputError("--rgb and --depth belong together: give both, or only --layer")
     if rgb is not None and depth is not None:
-        sharp[str(rgb)] = _picture(rgb, depth, sources.srgb)
+        sharp[str(rgb)] = _picture(rgb, depth, sources)
     if sources.behind and rgb is None:
         raise InputError("--behind is for what lies behind --rgb: without a picture list all layers with --layer, front first")
     sharp |= {str(path): _whole_layer(path) for path in sources.behind or ()}
@@ -115,13 +112,17 @@ def _whole_layer(path: Path) -> Layer:
     return layer
 
 
-def _picture(rgb: Path, depth: Path, srgb: bool) -> Layer:
-    from mrbokeh.images.image_io import read_depth, read_image, read_linear
+def _picture(rgb: Path, depth: Path, sources: SharpOptions) -> Layer:
+    from mrbokeh.depth.open_depth import depth_of_file
+    from mrbokeh.images.image_io import read_image, read_linear
     from mrbokeh.images.layer import opaque
 
     linear_or = "develop the RAW file to EXR first, or say with --srgb that it is sRGB if that is all there is"
-    colour = read_image(rgb) if srgb else read_linear(rgb, linear_or)
-    depth_m = read_depth(depth) if depth.exists() or not _is_distance(depth) else np.full(colour.shape[:2], float(str(depth)), np.float32)
+    colour = read_image(rgb) if sources.srgb else read_linear(rgb, linear_or)
+    if depth.exists() or not _is_distance(depth):
+        depth_m = depth_of_file(depth, None if sources.disparity is None else parse_near_far(sources.disparity))
+    else:
+        depth_m = np.full(colour.shape[:2], float(str(depth)), np.float32)
     if colour.shape[:2] != depth_m.shape:
         sizes = f"{rgb} is {colour.shape[1]}x{colour.shape[0]} px, {depth} {depth_m.shape[1]}x{depth_m.shape[0]} px"
         raise InputError(f"picture and depth must be of one size, but {sizes}: resize the depth with its nearest pixels, not between them")
@@ -143,9 +144,9 @@ def _moving(sharp: dict[str, Layer], sources: SharpOptions) -> dict[str, Layer]:
 
     if sources.motion is not None and sources.rgb is None:
         raise InputError("--motion belongs to --rgb: layers have their motion in their own channels forward.u and forward.v")
-    moving = {path: taken_from_channels(each, sources.shutter) for path, each in sharp.items()}
+    moving = {path: taken_from_channels(each, sources.shutter / 360.0) for path, each in sharp.items()}
     if sources.motion is not None:
-        moving[str(sources.rgb)] = with_motion(moving[str(sources.rgb)], read_motion(sources.motion), sources.shutter)
+        moving[str(sources.rgb)] = with_motion(moving[str(sources.rgb)], read_motion(sources.motion), sources.shutter / 360.0)
     return moving
 
 

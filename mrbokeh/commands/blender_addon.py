@@ -13,7 +13,7 @@ app = typer.Typer(add_completion=False)
 @app.command()
 def blender_addon(
     out: Annotated[Path, typer.Option(help="Folder for the add-on, mrbokeh_export.py.")] = Path("."),
-    overwrite: Annotated[bool, typer.Option(help="Replace an add-on that is there already.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an add-on that is there already.")] = False,
 ) -> None:
     """Write the Blender add-on (4.2 and later) that exports objects, camera track and render settings for mrbokeh.
 

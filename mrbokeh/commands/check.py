@@ -64,7 +64,7 @@ class ReportOptions:
     """Files beside the report."""
 
     map_out: Annotated[
-        Path | None, typer.Option("--map", help="Where leaked pixels are shown (.png), written only where there are some.")
+        Path | None, typer.Option("--leaks", help="Where leaked pixels are shown (.png), written only where there are some.")
     ] = None
 
 
@@ -80,13 +80,13 @@ def check(
 
     Exit code 0: nothing found; 1: findings; 2: cannot be read. The map is replaced where it exists; --json prints all that was found.
 
-    Example: mrbokeh check out.exr --against plate.exr --virtual blurred_layer.exr --map leaks.png --json > check.json
+    Example: mrbokeh check out.exr --against plate.exr --virtual blurred_layer.exr --leaks leaks.png --json > check.json
     """
     from mrbokeh.images.image_io import require_suffix
     from mrbokeh.system.atomic_files import require_safe_outputs
 
     if result.map_out is not None:
-        require_suffix(result.map_out, (".png",), "--map")
+        require_suffix(result.map_out, (".png",), "--leaks")
     require_safe_outputs((result.map_out,), (picture, *made.files), overwrite=True)
     if made.lens is not None and made.sharp is None:
         raise InputError("--lens tells how far light of the sharp layer reaches: give --sharp LAYER.exr too")

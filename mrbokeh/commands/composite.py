@@ -1,12 +1,13 @@
 """`mrbokeh composite`: virtual objects into a photograph, or into all slices of a focal stack."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import typer
 
 from mrbokeh.commands import _composite_options as options
-from mrbokeh.commands._insertion_options import ColourOptions, LensFacts, LookGroup, VirtualOptions
+from mrbokeh.commands._insertion_options import ColourOptions, LensFacts, LookGroup, VirtualOptions, focused_at_pixel, require_one_focus
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.system.channel import guess, say, tell, warn
 
@@ -49,6 +50,7 @@ def composite(
         blur_told,
         check_outputs,
         layers_by,
+        nothing_seen,
         pair_of,
         placing_warning,
         plate_by,
@@ -79,7 +81,11 @@ def composite(
     bundle = read_bundle(photo) if is_bundle(photo) else None
     lens, renderer = lens_and_renderer(optics.lens, optics.renderer or (bundle.renderer if bundle and optics.lens is None else None))
     lens = lens and facts.on(lens, renderer)
-    plate = plate_by(photo, taken, colour, bundle, lens=lens, focus_m=optics.focus, facts={} if lens else facts.given)
+    require_one_focus(focus=optics.focus, focus_at=optics.focus_at)
+    open_focused = partial(plate_by, photo, taken, colour, bundle, lens=lens, facts={} if lens else facts.given)
+    plate = open_focused(focus_m=optics.focus)
+    if optics.focus_at is not None:
+        plate = open_focused(focus_m=focused_at_pixel(plate.lens, plate.depth_m, optics.focus_at).focus_distance_m)
     _tell_metres(photo, virtual, standing, lens)
     layers_for = layers_by(virtual, standing, rendering, plate, bundle)
     mode = virtual.mode or best_mode(plate)
@@ -90,7 +96,7 @@ def composite(
     finishing = finishing_of(look.wanted, plate.rgb, None if photo.is_dir() else photo)
     sharp = layers_for(plate)
     if not any((layer.alpha > 0).any() for layer in sharp):
-        warn("nothing of what is put in is in the picture: is it behind the camera, or beside the frame?")
+        nothing_seen(standing, virtual)
     if standing.at_pixel:
         plate = with_ground_behind(plate, pair_of(standing.at_pixel), sharp)
     if standing.object_ is not None and (warning := placing_warning(sharp, plate, mode, standing.height)):
@@ -107,13 +113,13 @@ def composite(
 def _tell_metres(photo: Path, virtual: VirtualOptions, standing: options.ObjectOptions, lens: "Lens | None") -> None:
     """Print which of a stack's metres are guessed, and what follows for layers and for another lens."""
     from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
-    from mrbokeh.stacks.guessed_metres import growth_note, metres_note
+    from mrbokeh.stacks.guessed_metres import growth_note, metres_line, metres_note
 
     if not (photo / FILE_NAME).is_file():
         return
     stack = read_focal_stack(photo)
-    for note in filter(None, (metres_note(stack), growth_note(stack, lens))):
-        guess(note)
+    guess(metres_note(stack), metres_line(stack))
+    guess(growth_note(stack, lens))
     if not stack.metres_known and virtual.layer and not standing.at_pixel:
         say("the layers' depth is taken for guessed metres: --at-pixel X,Y puts them onto the surface at a pixel")
 

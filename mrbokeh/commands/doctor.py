@@ -64,7 +64,7 @@ WORK = (
     (
         ("lens", "new", "lens.json", "--focal-length", "50", "--f-number", "1.8", "--focus", "0.8"),
         *(
-            ("render", "--rgb", str(_TRUTH / "all_in_focus.exr"), *_BLUR, "--method", method, "--out", f"{method}.exr")
+            ("render", "--rgb", str(_TRUTH / "all_in_focus.exr"), *_BLUR, "--renderer", method, "--out", f"{method}.exr")
             for method in ("polygon", "laplacian", "low-rank", "scatter")
         ),
         ("transfer", str(_TRUTH / "all_in_focus.exr"), *_BLUR, "--focus", "0.8", "--out", "transferred.png"),
@@ -154,8 +154,8 @@ def _kernels() -> Component:
     sources = [path for package in ("mrbokeh", "capture", "viewfinder") for path in (root / package).rglob("*_numba.py")]
     folders = [compiled.folder_of(path, ".".join(path.relative_to(root).with_suffix("").parts)) for path in sources]
     ready = sum(folder is not None and any(folder.glob("*.nbc")) for folder in folders)
-    found = f"in {ready} of {len(folders)} modules" if ready else None
-    return Component("compiled kernels", found, "commands that begin at once", "mrbokeh doctor --compile")
+    found = f"{ready / len(folders):.0%} of them; the rest when first needed" if 0 < ready < len(folders) else ("all" if ready else None)
+    return Component("parts compiled for this machine", found, "commands that begin at once", "mrbokeh doctor --compile")
 
 
 def _version(package: str) -> str | None:

@@ -21,11 +21,11 @@ class BankOptions:
     """Options of the models; None leaves a model's default."""
 
     lens: Annotated[Path | None, typer.Option(help="Lens file whose opening is used (model simple; a disc without).")] = None
-    image: Annotated[Path | None, typer.Option(help="The picture of a PSF (model stylized).")] = None
+    image: Annotated[Path | None, typer.Option("--psf-picture", help="The picture of a PSF (model stylized).")] = None
     diameter_px: Annotated[
         float | None, typer.Option("--diameter", max=4096.0, help="Largest circle of confusion in px (simple, combined, stylized).")
     ] = None
-    motion_px: Annotated[float | None, typer.Option("--motion", help="Longest motion in px per shutter (combined).")] = None
+    motion_px: Annotated[float | None, typer.Option("--longest-motion", help="Longest motion in px per shutter (combined).")] = None
     prescription: Annotated[Path | None, typer.Option(help="A .dat file of lens surfaces (model physical; a bi-convex lens without).")] = (
         None
     )
@@ -45,8 +45,7 @@ class BankOptions:
         float | None, typer.Option("--far", help="Farthest depth of the bank in metres (physical: else 100; volume: else 5).")
     ] = None
     vignetting: Annotated[
-        bool | None,
-        typer.Option("--vignetting/--no-vignetting", help="Whether kernels darken off the axis (physical; else they do)."),
+        bool | None, typer.Option("--no-vignetting", help="Kernels do not darken off the axis (physical; else they do).")
     ] = None
     density_per_m: Annotated[float | None, typer.Option(help="Collisions per metre (volume; else 0.9).")] = None
     anisotropy: Annotated[float | None, typer.Option(help="Henyey-Greenstein's g, -1 to 1 (volume; else 0.8).")] = None
@@ -64,7 +63,9 @@ class BankOptions:
         from mrbokeh.psf_models.build import ModelOptions
 
         counts = None if self.counts is None else _steps(self.counts)
-        return ModelOptions(**vars(self) | {"counts": counts, "device": self.device or None})
+        return ModelOptions(
+            **vars(self) | {"counts": counts, "device": self.device or None, "vignetting": False if self.vignetting else None}
+        )
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,7 @@ class BuildOptions:
         int | None, typer.Option(max=100_000_000, help="Rays per kernel; 0 takes the closed form. (What suits the model where not given.)")
     ] = None
     seed: Annotated[int, typer.Option(min=0, help="Seed of the rays.")] = 0
-    overwrite: Annotated[bool, typer.Option(help="Replace the bank where it exists.")] = False
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the bank where it exists.")] = False
 
 
 @grouped
@@ -87,7 +88,7 @@ def psf(
 ) -> None:
     """Build a bank of point spread functions. An interrupted build goes on when the same command is given again.
 
-    Example: mrbokeh lens psf combined --out combined_bank --diameter 128 --motion 128
+    Example: mrbokeh lens psf combined --out combined_bank --diameter 128 --longest-motion 128
 
     Example: mrbokeh lens psf physical --prescription dgauss.50mm.dat --focus 1.5 --f-number 2.8 --sensor-width 23.5
     --image-width 1920 --counts 40,40 --out double_gauss
@@ -117,7 +118,7 @@ def spreadlets(
     lloyd_steps: Annotated[int, typer.Option(help="Steps of Lloyd's relaxation, as in the paper; 10 % nearer than none.")] = 50,
     annealing_steps: Annotated[int, typer.Option(help="Steps of annealing (the paper: 400; fitted values gain nothing by it).")] = 0,
     seed: Annotated[int, typer.Option(min=0, help="Seed of darts and annealing.")] = 0,
-    overwrite: Annotated[bool, typer.Option(help="Compute them again where they are.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Compute them again where they are.")] = False,
 ) -> None:
     """Compute what `render --psf BANK` splats (sparse points of the kernels' Laplacians) and keep it in BANK/spreadlets.npz.
 
@@ -220,7 +221,7 @@ def new(
     optics: OpticsOptions,
     opening: OpeningOptions,
     aberrations: AberrationOptions,
-    overwrite: Annotated[bool, typer.Option(help="Replace the file where it exists.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file where it exists.")] = False,
 ) -> None:
     """Write a lens file.
 
@@ -277,7 +278,7 @@ def show(
     lens: Annotated[Path, typer.Argument(help="Lens file, or the folder of a bank of PSFs.")],
     out: Annotated[Path, typer.Option(help="The picture to write (.png, .pdf or .svg).")],
     width: Annotated[int, typer.Option("--image-width", min=16, help="Image width in pixels (of a lens file).")] = 1920,
-    overwrite: Annotated[bool, typer.Option(help="Replace OUT where it exists.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT where it exists.")] = False,
 ) -> None:
     """Draw the blur of a lens: its kernels over diameter and field, its outlines and low-rank error, and blur over depth.
 
@@ -318,7 +319,7 @@ def export(
     bank: Annotated[Path, typer.Argument(help="The folder of a bank of PSFs.")],
     out: Annotated[Path, typer.Option(help="The folder to write: one picture per kernel, and index.csv with their coordinates.")],
     format_: Annotated[str, typer.Option("--format", help="exr (float, as they are) or png (16 bit, linear, the peak white).")] = "exr",
-    overwrite: Annotated[bool, typer.Option(help="Write into OUT where it exists.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Write into OUT where it exists.")] = False,
 ) -> None:
     """Write the kernels of a bank as pictures, for a convolution in Nuke, OpenDefocus or Blender.
 

@@ -25,8 +25,8 @@ class LightOptions:
     """Place of the lights, and meaning of the file's integers."""
 
     side: Annotated[str, typer.Option(help="Where the lights are: behind the focus, or in front.")] = "behind"
-    depth_m: Annotated[float | None, typer.Option(help="Depth of the lights in metres; inf is allowed.")] = None
-    encoding: Annotated[str, typer.Option(help="What integers of the file mean: srgb or linear.")] = "srgb"
+    depth_m: Annotated[float | None, typer.Option("--light-distance", help="Depth of the lights in metres; inf is allowed.")] = None
+    linear: Annotated[bool, typer.Option("--linear", help="Integers of the file are linear, not encoded as sRGB.")] = False
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class MatchResultOptions:
     """Picture beside OUT, and replacement."""
 
     evidence: Annotated[Path | None, typer.Option(help="A picture to write of what was found (.png, .pdf or .svg).")] = None
-    overwrite: Annotated[bool, typer.Option(help="Replace OUT and EVIDENCE where they exist.")] = False
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT and EVIDENCE where they exist.")] = False
 
 
 @grouped
@@ -74,7 +74,7 @@ def match(
     _check_match(lights, result)
     for path in (out, *([result.evidence] if result.evidence else [])):
         refuse_existing(path, result.overwrite)
-    rgb = read_image(photo, "linear" if lights.encoding == "linear" else "srgb")
+    rgb = read_image(photo, "linear" if lights.linear else "srgb")
     facts = read_facts(photo, (rgb.shape[1], rgb.shape[0])).given(**vars(stated))
     facts.require(photo)
     largest = 1.0 if photo.suffix.lower() in ENCODED_SUFFIXES else float("inf")
@@ -90,8 +90,6 @@ def match(
 def _check_match(lights: LightOptions, result: MatchResultOptions) -> None:
     if lights.side not in _SIDES:
         raise InputError(f"expected --side behind or front, got {lights.side!r}")
-    if lights.encoding not in ("srgb", "linear"):
-        raise InputError(f"expected --encoding srgb or linear, got {lights.encoding!r}")
     if result.evidence and result.evidence.suffix.lower() not in (".png", ".pdf", ".svg"):
         raise InputError(f"cannot draw {result.evidence}: expected .png, .pdf or .svg")
 
@@ -143,7 +141,7 @@ def fit(
     evidence: EvidenceOptions,
     fitting: FittingOptions,
     stacks: Annotated[list[Path] | None, typer.Argument(help="Merged focal stacks, or scenes of them.")] = None,
-    overwrite: Annotated[bool, typer.Option(help="Replace the bank where it exists.")] = False,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the bank where it exists.")] = False,
 ) -> None:
     """Measure the kernels of a lens over signed blur, field and colour.
 

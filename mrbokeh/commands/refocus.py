@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from mrbokeh.commands._insertion_options import FocusAtOption, LensFacts, focused_at_pixel, require_one_focus
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.refocus import Refocusing
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
@@ -21,10 +22,9 @@ _SETTINGS = "refocus.json"
 class BlurOptions:
     """Lens and renderer of the new slices."""
 
-    f_number: Annotated[float | None, typer.Option(help="Another opening of the stack's lens.")] = None
     lens: Annotated[Path | None, typer.Option(help="LENS.json or LENS.onnx in place of the stack's lens.")] = None
     renderer: Annotated[
-        str | None, typer.Option("--renderer", "--method", help="polygon, low-rank, scatter or NETWORK.onnx. Default: --lens if a network.")
+        str | None, typer.Option("--renderer", help="polygon, low-rank, scatter or NETWORK.onnx. Default: --lens if a network.")
     ] = None
     residuals: Annotated[
         bool,
@@ -40,23 +40,25 @@ class ResultOptions:
     """Files beside OUT, and its replacement."""
 
     sheet: Annotated[Path | None, typer.Option(help="Also write a contact sheet of the new slices (.png).")] = None
-    overwrite: Annotated[bool, typer.Option(help="Replace OUT where it exists.")] = False
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT where it exists.")] = False
 
 
 @app.command()
 @grouped
 def refocus(
     stack: Annotated[Path, typer.Argument(help="Folder of a merged focal stack.")],
+    out: Annotated[Path, typer.Option(help="Folder for the new focal stack.")],
+    blur: BlurOptions,
+    facts: LensFacts,
+    result: ResultOptions,
     focus: Annotated[
-        str,
+        str | None,
         typer.Option(
             help="Where to focus: metres, such as 0.8,1.2,inf; @X,Y on what is seen at that pixel; #2.5 between slices 2 and 3, counted "
             "from 0; or FROM:TO:COUNT of these, such as 0.5:inf:12 or #0:#13:24, evenly in dioptres and so in blur."
         ),
-    ],
-    out: Annotated[Path, typer.Option(help="Folder for the new focal stack.")],
-    blur: BlurOptions,
-    result: ResultOptions,
+    ] = None,
+    focus_at: FocusAtOption = None,
 ) -> None:
     """Make slices between and beyond the captured ones, from the all-in-focus picture and the depth, through the lens of the stack.
 
@@ -70,22 +72,29 @@ def refocus(
     from mrbokeh.images.image_io import require_suffix
     from mrbokeh.stacks.focal_stack import read_focal_stack, write_focal_stack
     from mrbokeh.stacks.focus_places import FocusLookup, parse_focus
-    from mrbokeh.stacks.guessed_metres import growth_note, inherited_facts, metres_note, unit_of
+    from mrbokeh.stacks.guessed_metres import growth_note, inherited_facts, metres_line, metres_note, unit_of
     from mrbokeh.system.atomic_files import require_safe_outputs
     from mrbokeh.system.console import kept_when_interrupted
 
+    require_one_focus(focus=focus, focus_at=focus_at)
+    if focus is None and focus_at is None:
+        raise InputError("where to focus? Give --focus, such as --focus 0.8,1.2 in metres, or --focus-at X,Y on what is seen at a pixel")
     if out.resolve() == stack.resolve():
         raise InputError("--out must be another folder than the stack's own")
     if result.sheet is not None:
         require_suffix(result.sheet, (".png",), "--sheet")
         require_safe_outputs((result.sheet,), (blur.lens, out), result.overwrite)
     source = read_focal_stack(stack)
-    distances_m = parse_focus(focus, FocusLookup.of(source))
-    way = _refocusing(source, blur)
-    for note in filter(None, (metres_note(source), growth_note(source, way.lens))):
-        guess(note)
+    way = _refocusing(source, blur, facts)
+    if focus is not None:
+        distances_m = parse_focus(focus, FocusLookup.of(source))
+    else:
+        lens = source.lens_of(source.reference) if way.lens is None else way.lens
+        distances_m = (focused_at_pixel(lens, source.depth_m(), focus_at or "").focus_distance_m,)
+    guess(metres_note(source), metres_line(source))
+    guess(growth_note(source, way.lens))
     _make_room(out, result.overwrite)
-    settings = {"stack": str(stack.resolve()), **vars(blur), "lens": str(blur.lens)}
+    settings = {"stack": str(stack.resolve()), **vars(blur), **facts.given, "lens": str(blur.lens)}
     with kept_when_interrupted(f"finished slices are kept in {out}", result.overwrite):
         slices = _write_slices(way, distances_m, out, settings, result.overwrite)
     metadata = {"refocused": settings} | inherited_facts(source, with_lens=way.lens is None)
@@ -94,7 +103,8 @@ def refocus(
     write_focal_stack(made)
     if result.sheet is not None:
         _write_sheet(result.sheet, made)
-    told = f"wrote {out} ({len(slices)} slices, in focus at {', '.join(f'{each:.3g}' for each in distances_m)} {unit_of(source)})"
+    focused = ", ".join(f"{each:.3g}" for each in distances_m)
+    told = f"wrote {out} ({len(slices)} slice{'' if len(slices) == 1 else 's'}, in focus at {focused} {unit_of(source)} from the lens)"
     tell(told, known=way.lens_at(distances_m[0]).facts if source.metres_known else {}, slices=len(slices), focus_distances_m=distances_m)
 
 
@@ -126,14 +136,12 @@ def _make_room(out: Path, overwrite: bool) -> None:
     (out / FILE_NAME).unlink()
 
 
-def _refocusing(source: FocalStack, blur: BlurOptions) -> Refocusing:
+def _refocusing(source: FocalStack, blur: BlurOptions, facts: LensFacts) -> Refocusing:
     from mrbokeh.renderers.choose import lens_and_renderer
 
-    if blur.f_number is not None and not blur.f_number > 0:
-        raise InputError(f"expected --f-number above 0, got {blur.f_number:g}")
     lens, renderer = lens_and_renderer(blur.lens, blur.renderer)
-    if blur.f_number is not None:
-        lens = replace(lens or source.lens_of(source.reference), f_number=blur.f_number)
+    if facts.given:
+        lens = (lens or source.lens_of(source.reference)).stating(facts.given)
     return Refocusing(source, renderer, lens, blur.residuals)
 
 

@@ -22,7 +22,7 @@ class BlurOptions:
     """Renderer and its settings."""
 
     method: Annotated[
-        str, typer.Option("--method", "--renderer", help="polygon, low-rank, laplacian, lrdm, scatter (exact, slow), or a network (.onnx).")
+        str, typer.Option("--renderer", help="polygon, low-rank, laplacian, lrdm, scatter (exact, slow), or a network (.onnx).")
     ] = DEFAULT
     psf: Annotated[Path | None, typer.Option(help="Bank of PSFs in place of the opening, for polygon, low-rank, laplacian, scatter.")] = (
         None
@@ -30,7 +30,7 @@ class BlurOptions:
     slices: Annotated[int, typer.Option(help="How many slices of depth at most.", min=1)] = 16
     threads: Annotated[int, typer.Option(help="Threads; 0 takes all cores. The result does not depend on it.", min=0, max=4096)] = 0
     device: Annotated[
-        str, typer.Option(help="cuda, cuda:1 or cpu: --method laplacian or lrdm by torch there; without it compiled loops on the CPU.")
+        str, typer.Option(help="cuda, cuda:1 or cpu: --renderer laplacian or lrdm by torch there; without it compiled loops on the CPU.")
     ] = ""
 
 
@@ -39,7 +39,7 @@ class ResultOptions:
     """Channels and replacement of OUT."""
 
     alpha_out: Annotated[bool, typer.Option("--alpha-out", help="Write A, Z and all extra channels of the layers beside R, G, B.")] = False
-    overwrite: Annotated[bool, typer.Option(help="Replace OUT where it exists.")] = False
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT where it exists.")] = False
 
 
 @app.command()

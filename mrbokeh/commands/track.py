@@ -113,16 +113,14 @@ class FactOptions:
     metric: Annotated[
         bool | None, typer.Option("--metric/--no-metric", help="Whether lengths are metres, where the file leaves it open.")
     ] = None
-    distortion: Annotated[bool, typer.Option(help="Leave the lens distortion of IN out with --no-distortion.")] = True
+    no_distortion: Annotated[bool, typer.Option("--no-distortion", help="Leave the lens distortion of IN out.")] = False
 
 
 @dataclass(frozen=True)
 class FrameOptions:
     """Numbers and times of the frames."""
 
-    frame_rate: Annotated[
-        float | None, typer.Option("--rate", min=0.001, help="Frames per second: gives frames the times of their numbers.")
-    ] = None
+    rate: Annotated[str | None, typer.Option(help="Frames per second: gives frames the times of their numbers.")] = None
     frame_offset: Annotated[int, typer.Option(help="Added to every frame number.")] = 0
 
 
@@ -151,6 +149,7 @@ def convert(
     """
     from mrbokeh.tracking.camera_track.formats import read_track
     from mrbokeh.tracking.camera_track.track import TrackOptions
+    from mrbokeh.video.picture_source import parse_rate
 
     refuse_existing(out, result.overwrite)
     options = TrackOptions(
@@ -159,10 +158,10 @@ def convert(
         rotation_order=facts.rotation_order,
         sensor_width_mm=facts.sensor_width,
         metric=facts.metric,
-        keep_distortion=facts.distortion,
+        keep_distortion=not facts.no_distortion,
     )
     read = read_track(source, options, from_).shifted(frames.frame_offset)
-    read = read.timed(frames.frame_rate) if frames.frame_rate is not None else read
+    read = read.timed(float(parse_rate(frames.rate))) if frames.rate is not None else read
     _write(out, read, TrackOptions(result.out_up, None, facts.rotation_order, facts.sensor_width), result.format_)
     unit = "" if read.metric else ", the scale of its lengths is arbitrary"
     told = f"{out}: {len(read.frames)} frames, {read.numbers[0]} to {read.numbers[-1]}, {read.size_px[0]}x{read.size_px[1]} px{unit}"

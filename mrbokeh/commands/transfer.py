@@ -14,7 +14,7 @@ import numpy as np
 import typer
 from jaxtyping import Float32
 
-from mrbokeh.commands._insertion_options import LensFacts
+from mrbokeh.commands._insertion_options import DisparityOption, FocusAtOption, LensFacts, focused_at_pixel, require_one_focus
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.depth.depth_map import DepthSettings, parse_known, parse_near_far, parse_stereo
 from mrbokeh.optics.lens import Lens
@@ -42,15 +42,15 @@ class DepthOptions:
         Path | None,
         typer.Option(help="EXR with Z, PNG or TIFF, disparity (.npz), a phone's JPEG, or a depth network (.onnx). Default: PHOTO's own."),
     ] = None
-    disparity: Annotated[
-        str | None, typer.Option(metavar="NEAR:FAR", help="--depth is even in 1/distance, largest number at NEAR, 0 at FAR metres.")
-    ] = None
+    disparity: DisparityOption = None
     depth_scale: Annotated[float | None, typer.Option(help="--depth holds distance: metres for each step; 0 is unknown.")] = None
     stereo: Annotated[str | None, typer.Option(metavar="FOCAL_PX,BASELINE_M,OFFSET_PX", help="Cameras of a disparity file.")] = None
     depth_model_gives: Annotated[str, typer.Option(help="What a depth network gives: inverse (up to scale) or metric (metres).")] = (
         "inverse"
     )
-    known: Annotated[list[str] | None, typer.Option(metavar="X,Y,METRES", help="A known distance; twice to scale a network.")] = None
+    known: Annotated[
+        list[str] | None, typer.Option("--distance-at", metavar="X,Y,METRES", help="A known distance; twice to scale a network.")
+    ] = None
     refine: Annotated[
         bool | None,
         typer.Option("--refine/--no-refine", help="Sharpen soft depth edges along the photograph. Default: where depth is soft."),
@@ -77,7 +77,7 @@ class FocusOptions:
         str | None,
         typer.Option(help="Metres, such as 1.2 or 0.8,1.2,inf; @X,Y at a pixel; #2.5 of a stack; FROM:TO:COUNT, evenly in dioptres."),
     ] = None
-    focus_at: Annotated[str | None, typer.Option(help="Focus on pixel X,Y, or on what lies within R pixels of it: X,Y,R.")] = None
+    focus_at: FocusAtOption = None
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class BlurOptions:
     """Renderer, field of view and highlights."""
 
     renderer: Annotated[
-        str | None, typer.Option("--renderer", "--method", help="polygon, low-rank, scatter or NETWORK.onnx. Default: --lens if a network.")
+        str | None, typer.Option("--renderer", help="polygon, low-rank, scatter or NETWORK.onnx. Default: --lens if a network.")
     ] = None
     same_view: Annotated[
         bool, typer.Option("--same-view", help="Give the lens PHOTO's field of view (from its Exif), keep its f-number.")
@@ -97,10 +97,10 @@ class BlurOptions:
 class ResultOptions:
     """Rate of a film, files beside OUT, and replacement."""
 
-    frame_rate: Annotated[float, typer.Option("--rate", min=1.0, help="Frames per second of a film.")] = 25.0
+    rate: Annotated[str, typer.Option(help="Frames per second of a film: 25, 23.976, 24000/1001.")] = "25"
     sheet: Annotated[Path | None, typer.Option(help="Also write a contact sheet of all distances (.png).")] = None
     save_depth: Annotated[Path | None, typer.Option(help="Also write the depth that was used (.exr).")] = None
-    overwrite: Annotated[bool, typer.Option(help="Replace files that exist.")] = False
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False
 
 
 @app.command()
@@ -125,15 +125,16 @@ def transfer(
     """
     from mrbokeh.refocus import open_sharp, seen_like, with_recovered_highlights
     from mrbokeh.renderers.choose import lens_and_renderer
-    from mrbokeh.stacks.guessed_metres import metres_note, note_of_file
+    from mrbokeh.stacks.guessed_metres import metres_line, metres_note, stack_of_file
     from mrbokeh.stacks.photograph import lens_for_photograph
+    from mrbokeh.video.picture_source import parse_rate
 
     _require_outputs(out, result, (photo, lens, depth.depth))
     settings = depth.settings
     given, blurs = lens_and_renderer(lens, blur.renderer)
     sharp = open_sharp(photo, depth.depth, settings)
-    for note in dict.fromkeys(filter(None, (metres_note(sharp.stack) if sharp.stack else "", note_of_file(depth.depth)))):
-        guess(note)
+    for stack in filter(None, (sharp.stack, stack_of_file(depth.depth))):
+        guess(metres_note(stack), metres_line(stack))
     held = lens_for_photograph(facts.on(given, blurs), sharp.photograph, photo)
     chosen = seen_like(held, sharp.photograph, photo) if blur.same_view else held
     distances_m = _distances(chosen, sharp, focusing)
@@ -145,7 +146,7 @@ def transfer(
 
         return blurs.render([opaque(rgb, sharp.depth.depth_m)], chosen.focused_at(distance_m)).rgb
 
-    write_blurred(out, sharp, chosen, distances_m, blurred, result.frame_rate)
+    write_blurred(out, sharp, chosen, distances_m, blurred, parse_rate(result.rate))
     if result.sheet is not None:
         write_sheet(result.sheet, distances_m, blurred, sharp.photograph.rgb)
     if result.save_depth is not None:
@@ -183,17 +184,14 @@ def _require_outputs(out: Path, result: ResultOptions, inputs: tuple[Path | None
 
 def _distances(lens: Lens, sharp: SharpPhotograph, focusing: FocusOptions) -> tuple[float, ...]:
     """Return the focus distances: from --focus, from the depth at a pixel, else of the phone, else of the lens file."""
-    from mrbokeh.commands import _render_inputs
     from mrbokeh.stacks.focus_places import FocusLookup, parse_focus
 
-    if focusing.focus is not None and focusing.focus_at is not None:
-        raise InputError("give either --focus or --focus-at, not both")
+    require_one_focus(focus=focusing.focus, focus_at=focusing.focus_at)
     if focusing.focus is not None:
         slices_m = () if sharp.stack is None else tuple(each for each in sharp.stack.focus_distances_m if each is not None)
         return parse_focus(focusing.focus, FocusLookup(lens, sharp.depth.depth_m, slices_m))
     if focusing.focus_at is not None:
-        on_pixel = _render_inputs.FocusOptions(focus_at=focusing.focus_at)
-        return (_render_inputs.focused(lens, {"photo": sharp.layer}, on_pixel).focus_distance_m,)
+        return (focused_at_pixel(lens, sharp.depth.depth_m, focusing.focus_at).focus_distance_m,)
     return (lens.focus_distance_m if sharp.focus_m is None else sharp.focus_m,)
 
 
@@ -210,11 +208,9 @@ def check_out(out: Path, count: int) -> None:
         raise InputError(f"--focus states {count} distances: give a folder or a film ({', '.join(FILMS)}) to write to, got {out}")
 
 
-def write_blurred(
-    out: Path, sharp: SharpPhotograph, lens: Lens, distances_m: tuple[float, ...], blurred: Blurred, frame_rate: float
-) -> None:
+def write_blurred(out: Path, sharp: SharpPhotograph, lens: Lens, distances_m: tuple[float, ...], blurred: Blurred, rate: Fraction) -> None:
     if out.suffix.lower() in FILMS:
-        _write_film(out, distances_m, blurred, frame_rate)
+        _write_film(out, distances_m, blurred, rate)
     elif out.suffix:
         from mrbokeh.images.image_io import write_image
 
@@ -223,10 +219,9 @@ def write_blurred(
         _write_stack(out, sharp, lens, distances_m, blurred)
 
 
-def _write_film(out: Path, distances_m: Sequence[float], blurred: Blurred, frame_rate: float) -> None:
+def _write_film(out: Path, distances_m: Sequence[float], blurred: Blurred, rate: Fraction) -> None:
     from mrbokeh.video.writer import VideoWriter
 
-    rate = Fraction(frame_rate).limit_denominator(1001)
     first = blurred(distances_m[0])
     with VideoWriter(out, first.shape[1], first.shape[0], rate) as writer:
         for index, distance_m in enumerate(track(distances_m, "pulling focus")):

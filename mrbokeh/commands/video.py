@@ -3,22 +3,24 @@
 Options alone say what the shot is: what makes its frames, where they go, and which of the clip they are.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mrbokeh.commands import _insertion_options as shared
-from mrbokeh.commands._insertion_options import LENS, PLATE, RESULT, VIRTUAL, ColourOptions, LookGroup, VirtualOptions
+from mrbokeh.commands._insertion_options import ColourOptions, LensFacts, LookGroup, VirtualOptions, focused_at_pixel, require_one_focus
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.compositing.choose import DEFAULT_MODE
 from mrbokeh.compositing.plate_look.finishing import LookOptions
-from mrbokeh.optics.lens_file import read_lens
+from mrbokeh.depth.depth_map import parse_near_far
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.choose import BY_NAME, DEFAULT
 from mrbokeh.shots.composite_recipe import CompositeRecipe
 from mrbokeh.shots.executors import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
 from mrbokeh.shots.frame_sources import CameraFile, ClipLook, DepthFiles, FocusPulled, MatteFiles
+from mrbokeh.shots.inputs import Moment
 from mrbokeh.shots.layer_sources import LayerFiles, sources_by_depth
 from mrbokeh.shots.render_shot import SequenceTarget, VideoTarget, render_shot
 from mrbokeh.shots.shot import SEGMENT_S, Shot, Target
@@ -33,21 +35,15 @@ from mrbokeh.video.encodings import with_alpha
 from mrbokeh.video.image_sequence import is_pattern
 from mrbokeh.video.picture_source import PictureSource, open_source, parse_rate
 
-WORK = "Who works"
-
 ClipArgument = Annotated[
     Path,
     typer.Argument(metavar="CLIP", help="A video; or, with --rate, numbered pictures: frames.%04d.exr, frames.####.exr or their folder."),
 ]
-LensOption = Annotated[
-    Path, typer.Option(metavar="LENS.json", help="The lens, focused as it was when the clip was shot.", rich_help_panel=LENS)
-]
+LensOption = Annotated[Path | None, typer.Option(help="The lens, focused as it was when the clip was shot. Default: 50 mm f/1.8.")]
 OutOption = Annotated[
     Path,
     typer.Option(
-        metavar="VIDEO",
-        help=".mov (ProRes 4444), .mp4 (H.264), .mxf (DNxHR), .mkv (FFV1, lossless) or frames.%04d.exr|png|tif|jpg.",
-        rich_help_panel=RESULT,
+        metavar="VIDEO", help=".mov (ProRes 4444), .mp4 (H.264), .mxf (DNxHR), .mkv (FFV1, lossless) or frames.%04d.exr|png|tif|jpg."
     ),
 ]
 
@@ -55,8 +51,6 @@ OutOption = Annotated[
 @dataclass(frozen=True)
 class ClipOptions(shared.NearOptions):
     """Options of the clip: which frames are taken, their numbers, and depth."""
-
-    PANEL = PLATE
 
     rate: Annotated[str | None, typer.Option(help="Frames per second of numbered pictures: 25, 23.976, 24000/1001.")] = None
     frames: Annotated[str, typer.Option(metavar="START:STOP", help="Frames to take, counted from 0; STOP is left out.")] = ":"
@@ -67,6 +61,7 @@ class ClipOptions(shared.NearOptions):
     depth: Annotated[
         Path | None, typer.Option(metavar="DEPTH.exr", help="Depth of the filmed scene in metres, one file or depth.%04d.exr.")
     ] = None
+    disparity: shared.DisparityOption = None
     steady_depth: Annotated[bool, typer.Option("--steady-depth", help="Filter numbered depth in time, against flicker.")] = False
 
 
@@ -74,11 +69,7 @@ class ClipOptions(shared.NearOptions):
 class RenderingOptions(shared.RenderingOptions):
     """Options of filming --scene. shutter: angle in degrees; readout, scene_begin: in seconds."""
 
-    PANEL = LENS
-
-    scene_begin: Annotated[
-        float, typer.Option(help="Second of the clip at which the animations of --scene begin.", rich_help_panel=VIRTUAL)
-    ] = 0.0
+    scene_begin: Annotated[float, typer.Option(help="Second of the clip at which the animations of --scene begin.")] = 0.0
     shutter: Annotated[
         float | None, typer.Option(min=0.0, max=360.0, metavar="DEGREES", help="Shutter angle: --scene is blurred by its motion.")
     ] = None
@@ -89,19 +80,17 @@ class RenderingOptions(shared.RenderingOptions):
 class BlurOptions:
     """Focus by frame, and the renderer."""
 
-    PANEL = LENS
-
+    focus: Annotated[float | None, typer.Option(help="Focus distance in metres in place of the lens file's; inf is allowed.")] = None
+    focus_at: shared.FocusAtOption = None
     focus_pull: Annotated[
         str | None, typer.Option(metavar="KEYS|FILE.csv", help="Focus by frame: FRAME:METRES,FRAME:METRES or metadata of a camera.")
     ] = None
-    renderer: Annotated[str, typer.Option("--renderer", "--method", help="polygon, low-rank, scatter, or a network (.onnx).")] = DEFAULT
+    renderer: Annotated[str, typer.Option("--renderer", help="polygon, low-rank, scatter, or a network (.onnx).")] = DEFAULT
 
 
 @dataclass(frozen=True)
 class ResultOptions:
     """Options of the written result."""
-
-    PANEL = RESULT
 
     encoding: Annotated[
         str | None,
@@ -126,20 +115,21 @@ class ResultOptions:
 class WorkOptions:
     """Options of the workers. workers: processes here; cluster: a scheduler elsewhere; segment: in seconds."""
 
-    PANEL = WORK
-
     workers: Annotated[int, typer.Option(min=0, help="Processes on this machine; 0 takes one for each core.")] = 0
     cluster: Annotated[str | None, typer.Option(metavar="tcp://HOST:8786", help="Dask scheduler whose workers see the same files.")] = None
     segment: Annotated[float, typer.Option(min=0.01, help="Seconds of a segment, the least that a kill can lose.")] = SEGMENT_S
 
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from mrbokeh.shots.layer_sources import SceneLayers
 
 
 def recipe_of(
     source: PictureSource,
-    lens: Path,
+    lens: Path | None,
+    facts: LensFacts,
     taken: ClipOptions,
     virtual: VirtualOptions,
     rendering: RenderingOptions,
@@ -150,23 +140,41 @@ def recipe_of(
 ) -> CompositeRecipe:
     """Return the recipe of every frame. Raises InputError if options do not go together."""
     _check_virtual(virtual, rendering)
+    require_one_focus(focus=blur.focus, focus_at=blur.focus_at, focus_pull=blur.focus_pull)
     objects = virtual.object_names
     files = tuple(LayerFiles(path.resolve(), objects) for path in virtual.layer or ())
-    return CompositeRecipe(
-        lens=lens.resolve(),
+    recipe = CompositeRecipe(
+        lens=None if lens is None else lens.resolve(),
         layers=sources_by_depth(files, _scene_layers(source, virtual, rendering)),
         renderer=_renderer(blur.renderer),
         mode=virtual.mode or (DEFAULT_MODE if taken.matte is None else "between"),
         camera=_camera(source, virtual),
         focus=None if blur.focus_pull is None else FocusPulled.of(blur.focus_pull),
-        depth=None if taken.depth is None else DepthFiles(taken.depth.resolve(), taken.steady_depth),
+        depth=None if taken.depth is None else _depth(taken.depth, taken),
         matte=None if taken.matte is None else MatteFiles(taken.matte.resolve()),
         near_m=taken.near_distance,
         look=_look(look, source, taken),
         first_number=_first_number(source, taken),
         virtual_only=virtual_only,
-        holding=_holding(source, lens),
+        holding=SensorOrientation((source.info.width_px, source.info.height_px), source.info.quarter_turns),
+        facts=tuple((facts.given | ({} if blur.focus is None else {"focus_distance_m": blur.focus})).items()),
     )
+    if blur.focus_at is not None:
+        focused = focused_at_pixel(_held(recipe), _first_depth_m(recipe, source, taken), blur.focus_at)
+        recipe = replace(recipe, facts=(*recipe.facts, ("focus_distance_m", focused.focus_distance_m)))
+    _held(recipe, source.path)
+    return recipe
+
+
+def _depth(path: Path, taken: ClipOptions) -> DepthFiles:
+    return DepthFiles(path.resolve(), taken.steady_depth, None if taken.disparity is None else parse_near_far(taken.disparity))
+
+
+def _first_depth_m(recipe: CompositeRecipe, source: PictureSource, taken: ClipOptions) -> "np.ndarray | None":
+    """Return the depth of the first frame that is taken, on which --focus-at focuses for the whole clip."""
+    start, _ = parse_frames(taken.frames)
+    moment = Moment(recipe.first_number + start, 0.0, (source.info.width_px, source.info.height_px))
+    return None if recipe.depth is None else recipe.depth.opened(1).depth_m_at(moment)
 
 
 def target_of(out: Path, source: PictureSource, recipe: CompositeRecipe, colour: ColourOptions, result: ResultOptions) -> Target:
@@ -240,11 +248,10 @@ def _look(look: LookGroup, source: PictureSource, taken: ClipOptions) -> ClipLoo
     )
 
 
-def _holding(source: PictureSource, lens: Path) -> SensorOrientation:
-    """Return the orientation of the camera; told here once, for every worker turns the lens alike."""
-    holding = SensorOrientation((source.info.width_px, source.info.height_px), source.info.quarter_turns)
-    lens_for_orientation(read_lens(lens), holding, source.path)
-    return holding
+def _held(recipe: CompositeRecipe, told_of: Path | None = None) -> Lens:
+    """Return the lens for the orientation of the camera, of which a line tells once, for every worker turns the lens alike."""
+    assert recipe.holding is not None
+    return lens_for_orientation(recipe.stated_lens, recipe.holding, told_of)
 
 
 def _first_number(source: PictureSource, taken: ClipOptions) -> int:
@@ -268,6 +275,7 @@ def video(
     rendering: RenderingOptions,
     look: LookGroup,
     lens: LensOption,
+    facts: LensFacts,
     blur: BlurOptions,
     out: OutOption,
     colour: ColourOptions,
@@ -284,7 +292,7 @@ def video(
     """
     require_safe_outputs((out,), (clip, taken.depth, taken.matte, *virtual.files, rendering.distortion, lens), overwrite=True)
     source = open_source(clip, taken.rate, colour.of_plate)
-    recipe = recipe_of(source, lens, taken, virtual, rendering, look, blur, virtual_only=result.virtual_only)
+    recipe = recipe_of(source, lens, facts, taken, virtual, rendering, look, blur, virtual_only=result.virtual_only)
     target = target_of(out, source, recipe, colour, result)
     shot = shot_of(source, recipe, target, taken.frames, work.segment)
     target.require_new(shot, result.overwrite or shot.was_begun)

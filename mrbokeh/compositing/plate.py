@@ -44,8 +44,8 @@ class Plate:
     sharp_rgb: (H, W, 3) the same view all in focus (of a focal stack), in the colours of rgb, or None.
     near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects, sharp; or None.
     alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
-    metres_guessed: of a stack that knows no focus distance; blur is right in pixels all the same. lens_guessed: the lens has its blur,
-        but its focal length and f-number are made up.
+    metres_guessed: of a stack that knows no focus distance; blur is right in pixels all the same. blur_from: where the lens has its blur
+        from, in words, if its focal length and f-number are made up.
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -56,7 +56,7 @@ class Plate:
     near_alpha: Float32[np.ndarray, "height width"] | None = None
     alpha: Float32[np.ndarray, "height width"] | None = None
     metres_guessed: bool = False
-    lens_guessed: bool = False
+    blur_from: str = ""
 
     def __post_init__(self) -> None:
         size = self.rgb.shape[:2]
@@ -111,15 +111,16 @@ def open_plate(
     if slice_index is not None:
         raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}: leave it out")
     photograph, phone = read_photograph(photo).stating(facts or {}), _phone(photo)
+    blur_from = ""
     if lens is None and not facts and phone is not None and phone.focus is not None:
-        photograph = _with_the_phones_blur(photograph, phone.focus, photo)
+        photograph, blur_from = _with_the_phones_blur(photograph, phone.focus, photo), "the phone's own blur"
     lens = photograph.lens(photo, focus_m) if lens is None else lens_for_photograph(lens, photograph, photo)
     focused = lens if focus_m is None else lens.focused_at(focus_m)
     plate = with_own_alpha(plate_of(photograph.rgb, focused), photo, read_alpha(photo, photograph.orientation))
     if phone is None:
         return plate
     original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
-    return replace(with_depth(plate, photo, DepthSettings()), sharp_rgb=original)
+    return replace(with_depth(plate, photo, DepthSettings()), sharp_rgb=original, blur_from=blur_from)
 
 
 def _phone(photo: Path) -> PhonePhoto | None:
@@ -217,7 +218,8 @@ def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus
     # A stack of a scene knows where its camera stood; objects are placed in camera axes.
     upright = replace(camera, camera_from_world=np.eye(4))
     plate = Plate(rgb=rgb, depth_m=stack.depth_m(), lens=focused, camera=upright, sharp_rgb=stack.all_in_focus())
-    return replace(plate, metres_guessed=not stack.metres_known, lens_guessed=lens is None and is_lens_guessed(stack))
+    guessed = lens is None and is_lens_guessed(stack)
+    return replace(plate, metres_guessed=not stack.metres_known, blur_from="blur as measured in the slices" if guessed else "")
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ def demo_stages(out: Path, minutes: float) -> list[Stage]:
     return [
         *merged_stages(desk, "RAW photographs of a desk (simulated camera, known truth)", DATA / "raw_stack", VIEWS, []),
         *deepened_stages(desk, VIEWS),
-        report_stage(desk, VIEWS, "--width", "400"),
+        report_stage(desk, VIEWS, "--max-width", "400"),
         *_network(desk, minutes, HELD_OUT_VIEW),
         *_composites(desk, desk / "scene" / HELD_OUT_VIEW, DESK),
         *merged_stages(board, "photographs of a circuit board", DATA / "pcb_oblique", BOARD_VIEWS, ["--max-width", "512"]),
@@ -119,7 +119,7 @@ def _composite(folder: Path, stack: Path, placement: Placement, renderer: str) -
     arguments = (
         *("composite", str(stack), "--slice", str(placement.slice_index), "--object", str(DATA / "objects" / placement.glb)),
         *("--at-pixel", placement.at_pixel, "--height", f"{placement.height_m:g}", "--turn", f"{placement.turn_deg:g}"),
-        *("--tilt", f"{placement.tilt_deg:g}", "--exposure", f"{placement.exposure:g}", "--shadow", "0.5", *blur),
+        *("--pitch", f"{placement.tilt_deg:g}", "--exposure", f"{placement.exposure:g}", "--shadow", "0.5", *blur),
         *("--save-layer", str(picture.with_suffix(".exr")), "--out", str(picture), "--overwrite"),
     )
     purpose = f"Put {placement.glb} into slice {placement.slice_index} ({folder.name}), blurred by the {renderer}"

@@ -77,7 +77,7 @@ def network_depth(model: Path, photo_rgb: Rgb, settings: DepthSettings) -> Depth
     if settings.near_far_m is None:
         raise InputError(
             f"{model} gives depth without a scale: state the nearest and farthest distance with --disparity NEAR:FAR, or two known ones "
-            f"with --known X,Y,METRES, or --depth-model-gives metric if it gives metres"
+            f"with --distance-at X,Y,METRES, or --depth-model-gives metric if it gives metres"
         )
     low, high = float(given.min()), float(given.max())
     levels = ((given - low) / max(high - low, 1e-12)).astype(np.float32)
@@ -93,7 +93,7 @@ def _fitted(given: Given, photo_rgb: Rgb, settings: DepthSettings) -> Given:
     rows, columns = given.shape
     seen = np.array([given[int(each.y_px * rows / height), int(each.x_px * columns / width)] for each in settings.known], np.float64)
     if len(seen) < 2 or np.ptp(seen) <= 1e-6 * max(float(np.ptp(given)), 1e-12):
-        raise InputError("expected two known distances at places that the network sees at different depths: give --known twice")
+        raise InputError("expected two known distances at places that the network sees at different depths: give --distance-at twice")
     slope, offset = np.polyfit(seen, [1.0 / each.depth_m for each in settings.known], 1)
     if slope <= 0:
         raise InputError(
@@ -198,6 +198,13 @@ def _levels(numbers: np.ndarray) -> Plane:
         return without_steps((numbers / np.float32(most)).astype(np.float32), int(most) + 1)
     low, high = float(np.nanmin(numbers)), float(np.nanmax(np.where(np.isfinite(numbers), numbers, np.nan)))
     return np.clip((np.nan_to_num(numbers, posinf=high, neginf=low, nan=low) - low) / max(high - low, 1e-30), 0, 1).astype(np.float32)
+
+
+def depth_of_file(path: Path, near_far_m: tuple[float, float] | None = None) -> Plane:
+    """Read depth in metres as a file stores it: EXR with Z, or with near_far_m a picture that is even in 1/distance."""
+    if near_far_m is None:
+        return read_depth(path)
+    return with_holes_filled(read_number_map(path, DepthSettings(near_far_m))).depth_m
 
 
 def read_stereo(path: Path, settings: DepthSettings) -> DepthMap:

@@ -67,7 +67,7 @@ def _table(aperture: Aperture) -> Float32[np.ndarray, " steps"]:
     made = _made_table(aperture)
     with suppress(OSError):
         if path is not None:
-            with atomic_path(path) as temporary, temporary.open("wb") as file:
+            with atomic_path(path, is_result=False) as temporary, temporary.open("wb") as file:
                 np.save(file, made)
     return made
 

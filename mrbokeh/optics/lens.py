@@ -1,6 +1,7 @@
 """Lens: the thin lens that tells how large a point's blur is; the only place where millimetres meet metres."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -108,6 +109,12 @@ class Lens:
         x, y = np.tan(self.tilt_rad)
         length = float(np.sqrt(1.0 + x * x + y * y))
         return float(x) / length, float(y) / length, 1.0 / length
+
+    def stating(self, facts: Mapping[str, float]) -> "Lens":
+        """Return the lens with other facts, by their names; the height of its sensor keeps its proportion to the width."""
+        width_mm = facts.get("sensor_width_mm", self.sensor_width_mm)
+        height_mm = self.sensor_height_mm and self.sensor_height_mm * width_mm / self.sensor_width_mm
+        return replace(self, **{"sensor_height_mm": height_mm, **facts})  # type: ignore[arg-type]
 
     def focused_at(self, focus_distance_m: float) -> "Lens":
         return replace(self, focus_distance_m=float(focus_distance_m))

@@ -194,7 +194,7 @@ def _stylized(options: ModelOptions) -> PsfModel:
     from mrbokeh.psf_models.simple_lens import Stylized
 
     if options.image is None:
-        raise InputError("a stylized PSF is made from a picture: give one with --image")
+        raise InputError("a stylized PSF is made from a picture: give one with --psf-picture")
     return Stylized(read_image(options.image), **_given(options, "diameter_px", "counts", "device"))
 
 

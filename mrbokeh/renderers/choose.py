@@ -63,7 +63,7 @@ def make_renderer(
     device: "" for compiled loops on the CPU; "cuda", "cuda:1" or "cpu" for torch there, where the renderer has such a twin.
     """
     if device and name not in ON_DEVICES:
-        raise InputError(f"--device is for --method {' or '.join(ON_DEVICES)}, got {name!r}: the others run on the CPU, leave --device out")
+        raise InputError(f"--device is for --renderer {' or '.join(ON_DEVICES)}, got {name!r}: others run on the CPU, leave --device out")
     if name in BY_NAME:
         on = {"device": device} if device else {}
         return BY_NAME[name](threads=threads, layering=layering or Layering(), **on, **kernels or {})
@@ -95,7 +95,7 @@ def chosen_renderer(method: str, psf: Path | None, *, threads: int = 0, layering
         return make_renderer(method, threads=threads, layering=layering, device=device)
     if method not in WITH_BANKS:
         raise InputError(
-            f"--psf is for --method {', '.join(WITH_BANKS)}, got --method {method}: other methods take the opening of the lens file"
+            f"--psf is for --renderer {', '.join(WITH_BANKS)}, got --renderer {method}: other methods take the opening of the lens file"
         )
     from mrbokeh.optics.psf_bank_file import read_bank
 

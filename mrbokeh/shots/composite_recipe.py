@@ -119,11 +119,12 @@ def _hidden_layers(layers: Sequence[Layer], photo_depth_m: Plane, box: Box) -> l
 class CompositeRecipe:
     """A MakerRecipe. first_number: what frame 0 of the clip is called by in sequences, tracks and focus pulls.
 
-    focus: None leaves the lens as its file has it. holding: of the camera, by which the file's lens is turned; None leaves it.
+    lens: None is `Lens.default`; facts: by name, in place of the lens's own. focus: None leaves the lens as that has it.
+    holding: of the camera, by which the lens is turned; None leaves it.
     near_m: how far what the matte shows is, where there is no depth. virtual_only: the blurred virtual layer alone, not the picture.
     """
 
-    lens: Path
+    lens: Path | None
     layers: tuple[Description[LayerSource], ...]
     renderer: str = DEFAULT
     mode: str = DEFAULT_MODE
@@ -136,12 +137,18 @@ class CompositeRecipe:
     first_number: int = 0
     virtual_only: bool = False
     holding: SensorOrientation | None = None
+    facts: tuple[tuple[str, float], ...] = ()
 
     @property
     def files(self) -> tuple[Path, ...]:
         described = (*self.layers, self.camera, self.focus, self.depth, self.matte, self.look)
         network = () if self.renderer in BY_NAME else (Path(self.renderer),)
-        return (self.lens, *network, *(path for each in described if each is not None for path in each.files))
+        return (*([self.lens] if self.lens else []), *network, *(path for each in described if each is not None for path in each.files))
+
+    @property
+    def stated_lens(self) -> Lens:
+        """Lens of the file, or the default one, with the facts that were stated."""
+        return (Lens.default() if self.lens is None else read_lens(self.lens)).stating(dict(self.facts))
 
     def build(self, threads: int) -> "CompositeMaker":
         return CompositeMaker(self, threads)
@@ -151,7 +158,7 @@ class CompositeMaker:
     """A FrameMaker. What did not change since the last frame is not made again: reading, rendering, cutting, blur."""
 
     def __init__(self, recipe: CompositeRecipe, threads: int) -> None:
-        lens = read_lens(recipe.lens)
+        lens = recipe.stated_lens
         self._recipe, self._lens = recipe, lens if recipe.holding is None else lens_for_orientation(lens, recipe.holding)
         self._sources = [each.opened(threads) for each in recipe.layers]
         self._camera = None if recipe.camera is None else recipe.camera.opened(threads)

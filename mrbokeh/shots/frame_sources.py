@@ -13,8 +13,9 @@ from mrbokeh.compositing.plate_look.colour_match import ColourMatch, triple_of
 from mrbokeh.compositing.plate_look.exposure_match import stated_exposure
 from mrbokeh.compositing.plate_look.finishing import Finishing, LookOptions, finished, finishing_of
 from mrbokeh.depth.depth_filters import TemporalDepthFilter
+from mrbokeh.depth.open_depth import depth_of_file
 from mrbokeh.images.color_management import NamedSpace
-from mrbokeh.images.image_io import read_depth, read_image
+from mrbokeh.images.image_io import read_image
 from mrbokeh.optics.camera import Camera, have_same_shape
 from mrbokeh.shots.inputs import CameraSource, DepthSource, Finisher, FocusSource, Kept, MatteSource, Moment
 from mrbokeh.system.atomic_files import read_json
@@ -94,10 +95,16 @@ class DepthFiles:
 
     steady: numbered depth goes through a temporal filter. It looks at 48 frames before the first one asked for, so that
     a segment begins as if the one before had gone through it too; the clip itself begins with a filter that has settled.
+    near_far_m: metres of the largest and the smallest number of pictures that are even in 1/distance.
     """
 
     path: Path
     steady: bool = False
+    near_far_m: tuple[float, float] | None = None
+
+    def read(self, name: str | Path) -> Plane:
+        """Read one file of depth."""
+        return depth_of_file(Path(name), self.near_far_m)
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -109,7 +116,7 @@ class DepthFiles:
 
 class _Depth:
     def __init__(self, described: DepthFiles) -> None:
-        self._path, self._read = described.path, Kept(lambda name: read_depth(Path(name)))
+        self._path, self._read = described.path, Kept(described.read)
 
     def depth_m_at(self, moment: Moment) -> Plane:
         return _of_size(self._read(str(numbered(self._path, moment.number))), moment, self._path)
@@ -146,7 +153,7 @@ class _SteadyDepth:
     def depth_m_at(self, moment: Moment) -> Plane:
         if self._plane is None or self._next != moment.number + 1:
             for number in self._still_to_go(moment.number):
-                self._plane = self._filter.filtered(read_depth(numbered(self._described.path, number)))
+                self._plane = self._filter.filtered(self._described.read(numbered(self._described.path, number)))
             self._next = moment.number + 1
         assert self._plane is not None
         return _of_size(self._plane, moment, self._described.path)

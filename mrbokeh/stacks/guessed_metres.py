@@ -79,6 +79,16 @@ def metres_note(stack: FocalStack) -> str:
     return f"{stack.folder}: {facts['why']}; still guessed: {guessed}" if guessed else ""
 
 
+def metres_line(stack: FocalStack) -> str:
+    """Say in a few words what is guessed and where more is told; empty where all metres are known. `metres_note` gives the reasons."""
+    if not metres_note(stack):
+        return ""
+    more = f"more in {stack.folder / FILE_NAME}"
+    if stack.metres_known:
+        return f"{stack.folder}: still guessed: {guesses(stack)} ({more})"
+    return f"{stack.folder}: metres are guessed; `mrbokeh capture scale --ruler` makes them known ({more})"
+
+
 def growth_note(stack: FocalStack, lens: Lens | None) -> str:
     """State how fast another lens's blur grows, focused as the reference slice; empty for the stack's lens and where metres are known."""
     if lens is None or not metres_note(stack):
@@ -110,14 +120,12 @@ def _guessed_end(stack: FocalStack) -> str | None:
 
 def metres_notes(stacks: Iterable[FocalStack]) -> str:
     """Return one line for all stacks of a command; empty if all metres are known."""
-    notes = [note for note in map(metres_note, stacks) if note]
-    if len(notes) < 2:
-        return "".join(notes)
-    return f"metres are guessed, at least in part, in {len(notes)} of the stacks, in pixels blur is measured; the first: {notes[0]}"
+    lines = [line for line in map(metres_line, stacks) if line]
+    if len(lines) < 2:
+        return "".join(lines)
+    return f"metres are guessed, at least in part, in {len(lines)} of the stacks, in pixels blur is measured; the first: {lines[0]}"
 
 
-def note_of_file(path: Path | None) -> str:
-    """Return the note of the stack that a picture or depth file belongs to."""
-    if path is None or not (path.parent / FILE_NAME).is_file():
-        return ""
-    return metres_note(read_focal_stack(path.parent))
+def stack_of_file(path: Path | None) -> FocalStack | None:
+    """Return the stack that a picture or depth file belongs to."""
+    return None if path is None or not (path.parent / FILE_NAME).is_file() else read_focal_stack(path.parent)

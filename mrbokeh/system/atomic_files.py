@@ -15,11 +15,14 @@ from mrbokeh.system.errors import InputError, require_file
 
 
 @contextmanager
-def atomic_path(path: Path | str) -> Iterator[Path]:
-    """Open a temporary path beside `path` with its suffix; rename it to `path` if the block ends well, else remove it."""
+def atomic_path(path: Path | str, is_result: bool = True) -> Iterator[Path]:
+    """Open a temporary path beside `path` with its suffix; rename it to `path` if the block ends well, else remove it.
+
+    is_result: False for what is only kept to be faster next time.
+    """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    with _staged(path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}"), path) as temporary:
+    with _staged(path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}"), path, is_result) as temporary:
         yield temporary
 
 
@@ -37,7 +40,7 @@ def atomic_folder(folder: Path | str) -> Iterator[Path]:
 
 
 @contextmanager
-def _staged(temporary: Path, path: Path) -> Iterator[Path]:
+def _staged(temporary: Path, path: Path, is_result: bool = True) -> Iterator[Path]:
     made = None
     unfinished(temporary)
     try:
@@ -46,7 +49,7 @@ def _staged(temporary: Path, path: Path) -> Iterator[Path]:
         made = path
     finally:
         _remove(temporary)
-        finished(temporary, made)
+        finished(temporary, made if is_result else None)
 
 
 def _remove(temporary: Path) -> None:

@@ -137,14 +137,11 @@ def warn(text: str) -> None:
     say(f"warning: {text}", err=True)
 
 
-def guess(text: str, short: str = "", indent: str = "") -> None:
-    """Say what is guessed, once; short: what is said of it from the second time on, nothing by default."""
-    if text in _channel.guessed:
-        text = short
-    elif text:
+def guess(text: str, short: str = "") -> None:
+    """Say once what is guessed. short: what is said in its place, where the whole of it was said before, by another command."""
+    if text and text not in _channel.guessed:
         _channel.guessed.append(text)
-    if text:
-        say(indent + text)
+        say(short or text)
 
 
 def unfinished(temporary: Path) -> None:

@@ -123,6 +123,8 @@ def kept_when_interrupted(kept: str, overwrite: bool = False) -> Iterator[None]:
 
 
 FLAGS = {
+    "image": "--psf-picture",
+    "vignetting": "--no-vignetting",
     "focus_distance_m": "--focus",
     "focal_length_mm": "--focal-length",
     "sensor_width_mm": "--sensor-width",
@@ -131,7 +133,7 @@ FLAGS = {
     "nearest_m": "--near",
     "farthest_m": "--far",
     "diameter_px": "--diameter",
-    "motion_px": "--motion",
+    "motion_px": "--longest-motion",
     "frame_rate": "--rate",
 }
 

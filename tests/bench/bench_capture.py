@@ -47,7 +47,7 @@ def captured(lab: Path, scene: Path, truths: list[ViewTruth]) -> None:
     run("merge", scene)
     run("poses", scene)
     columns, rows = BOARD_SQUARES
-    sizes_mm = ("--square-mm", 1e3 * BOARD_SQUARE_M, "--marker-mm", 1e3 * BOARD_MARKER_M)
+    sizes_mm = ("--square", 1e3 * BOARD_SQUARE_M, "--marker", 1e3 * BOARD_MARKER_M)
     run("scale", scene, "--board", f"{columns}x{rows}", *sizes_mm)
     first = scene.with_name("first")
     shutil.copytree(scene, first)

@@ -77,7 +77,7 @@ def found_by(*arguments: object, expected: int) -> dict:
 
 def checked(files: dict[str, Path], expected: int, *more: object) -> dict:
     """The JSON of a check of out.exr against everything that is known."""
-    layers = ("--virtual", files["virtual"], "--sharp", files["sharp"], "--map", files["map"])
+    layers = ("--virtual", files["virtual"], "--sharp", files["sharp"], "--leaks", files["map"])
     document = found_by(files["out"], "--against", files["plate"], *layers, *more, expected=expected)
     assert document["clean"] is (expected == 0)
     return document

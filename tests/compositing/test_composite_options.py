@@ -169,7 +169,7 @@ def test_sharp_layers_go_out_as_a_deep_picture(files: Path) -> None:
     alpha[40:80, 60:110] = 0.5
     behind = Layer(np.repeat(0.4 * alpha[..., None], 3, axis=2), alpha, np.where(alpha > 0, 1.8, np.inf).astype(np.float32))
     write_layer(files / "behind.exr", behind, half=False)
-    put_in(files, "--layer", files / "behind.exr", "--deep-out", files / "virtual.exr")
+    put_in(files, "--layer", files / "behind.exr", "--save-deep", files / "virtual.exr")
     deep = DeepSamples.read(files / "virtual.exr")
     counts = deep.counts.reshape(HEIGHT, WIDTH)
     assert (counts[50, 70], counts[50, 40], counts[50, 100], counts[5, 5]) == (2, 1, 1, 0)
@@ -181,14 +181,14 @@ def test_sharp_layers_go_out_as_a_deep_picture(files: Path) -> None:
     # Put in again it gives the same picture.
     again = put_in(files, card="virtual.exr")
     np.testing.assert_allclose(again, put_in(files, "--layer", files / "behind.exr"), atol=2e-3)
-    refused("--deep-out: expected a name", put_in, files, "--deep-out", files / "virtual.png")
-    refused("exists already", put_in, files, "--deep-out", files / "virtual.exr")
+    refused("--save-deep: expected a name", put_in, files, "--save-deep", files / "virtual.png")
+    refused("exists already", put_in, files, "--save-deep", files / "virtual.exr")
 
 
 @pytest.mark.parametrize(
     ("words", "named"),
     [
-        (("--deep-out", "other.exr"), "--deep-out"),
+        (("--save-deep", "other.exr"), "--save-deep"),
         (("--save-layer", "layer.exr", "--output-space", "ACEScg"), "--output-space, --save-layer"),
         (("--grain", "auto", "--seed", "3", "--light-wrap", "0.5"), "--grain, --light-wrap, --seed"),
         (("--slice", "1", "--depth", "depth.exr", "--focus", "2"), "--slice, --depth, --focus"),
@@ -237,7 +237,7 @@ def test_distortion_bends_what_is_rendered(files: Path) -> None:
 
 
 def test_the_ground_catches_a_shadow_or_all_that_changes(files: Path) -> None:
-    standing = ("--object", CAKE, "--at", "0,0.2,2", "--height", "0.2", "--tilt", "25", "--shadow", "0.7")
+    standing = ("--object", CAKE, "--at", "0,0.2,2", "--height", "0.2", "--pitch", "25", "--shadow", "0.7")
     plain, shadow, light = (put_in(files, *standing[: 8 if n == 0 else 10], *("--catch", "light") * (n == 2), card=None) for n in range(3))
     darker = [float((plain - each).clip(0).sum()) for each in (shadow, light)]
     assert min(darker) > 1.0, "both darken the ground"

@@ -61,7 +61,7 @@ def test_the_gallery_is_made_by_the_commands_and_what_a_check_finds_is_its_resul
     write_image(out / "out.png", plate)
     write_layer(out / "layer.exr", Layer(plate * 0.0, plate[..., 0] * 0.0, np.full((16, 24), np.inf, np.float32)))
     new = "mrbokeh lens new lens.json --focal-length 50 --f-number 2 --focus 1"
-    commands = ("mrbokeh demo --out demo_out", new, "mrbokeh check out.png --against plate.png --virtual layer.exr --map leaks.png")
+    commands = ("mrbokeh demo --out demo_out", new, "mrbokeh check out.png --against plate.png --virtual layer.exr --leaks leaks.png")
     made = Entry(title="check", commands=commands, caption="A", picture=Path("docs/pictures/a.jpg"), shows="out.png leaks.png")
     build(out, [made], demo)
     assert decoded((out / "a.jpg").read_bytes()).shape == (16, 48, 3)

@@ -72,7 +72,7 @@ def test_an_unknown_command_and_an_unknown_renderer_are_refused(tmp_path: Path) 
     small_layer(tmp_path / "layer.exr")
     write_lens(tmp_path / "lens.json", Lens(50.0, 2.0, 1.0, 36.0))
     paths = ("--layer", tmp_path / "layer.exr", "--lens", tmp_path / "lens.json", "--out", tmp_path / "o.exr")
-    done = mrbokeh("render", *paths, "--method", "magic")
+    done = mrbokeh("render", *paths, "--renderer", "magic")
     assert done.returncode == 2 and "expected a renderer" in done.stderr
 
 
@@ -101,7 +101,10 @@ def test_extras_are_those_of_the_package() -> None:
 
 def test_shell_completion() -> None:
     script = [sys.executable, "-c", "import sys; sys.argv[0] = 'mrbokeh'; from mrbokeh.cli import main; main()"]
-    for words, expected in (("mrbokeh ", "composite"), ("mrbokeh capture ", "ingest")):
+    for words, expected in (
+        ("mrbokeh ", "composite"), ("mrbokeh capture ", "ingest"), ("mrbokeh render --renderer ", "low-rank"),
+        ("mrbokeh composite --mode ", "between"), ("mrbokeh capture merge --prefer ", "near"), ("mrbokeh lens psf ", "physical"),
+    ):  # fmt: skip
         asked = {"_MRBOKEH_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(len(words.split()))}
         assert expected in subprocess.run(script, capture_output=True, text=True, env=os.environ | asked).stdout.split()
 

@@ -45,7 +45,7 @@ def test_a_camera_is_let_go_when_a_shoot_is_stopped(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(SimulatedCamera, "close", closing)
     monkeypatch.setattr(SimulatedCamera, "capture", Mock(side_effect=KeyboardInterrupt))
     plan, out = tmp_path / "plan.json", tmp_path / "view_0"
-    done = mrbokeh("capture", "shoot", "--plan", plan, "--camera", "simulated", "--out", out, "--settle", "0")
+    done = mrbokeh("capture", "shoot", "--plan", plan, "--source", "simulated", "--out", out, "--settle", "0")
     assert done.returncode == 130 and closing.call_count == 1
     # On a busy machine a line of progress comes before it.
     assert done.stderr.endswith(f"stopped: what was shot is kept in {out}; the same command goes on from there\n")

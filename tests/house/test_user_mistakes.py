@@ -79,9 +79,9 @@ def test_what_is_read_is_never_written_over(card: Path) -> None:
     before = {path: path.read_bytes() for path in (card, plate, lens)}
     plan = ("capture", "plan", lens, "--near", 0.5, "--far", 3, "--image-width", 600, "--out", lens, "--overwrite")
     renders = (("render", "--layer", card, "--lens", lens, "--out", out, "--overwrite") for out in (card, link))
-    for words in (*renders, ("check", plate, "--against", plate, "--map", plate), plan):
+    for words in (*renders, ("check", plate, "--against", plate, "--leaks", plate), plan):
         assert "is read and would be written over" in refusal(*words)
-    assert "--map: expected a name that ends in .png" in refusal("check", card, "--against", card, "--map", card)
+    assert "--leaks: expected a name that ends in .png" in refusal("check", card, "--against", card, "--leaks", card)
     assert "--log" in refusal("lens", "coc", lens, 1, "--log", lens)
     assert {path: path.read_bytes() for path in before} == before
 

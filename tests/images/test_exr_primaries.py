@@ -135,7 +135,7 @@ def test_the_all_in_focus_picture_of_a_raw_stack_is_rendered_in_its_colours(tmp_
     write_image(tmp_path / "rec709.exr", convert(camera_rgb, np.array(CAMERA)), half=False)
     rendered = []
     for name in ("camera.exr", "rec709.exr"):
-        words = ["--rgb", name, "--depth", "z.exr", "--lens", "lens.json", "--method", "scatter", "--out", f"rendered_{name}"]
+        words = ["--rgb", name, "--depth", "z.exr", "--lens", "lens.json", "--renderer", "scatter", "--out", f"rendered_{name}"]
         result = CliRunner().invoke(render, [str(tmp_path / word) if "." in word else word for word in words])
         assert result.exit_code == 0, result.output
         rendered.append(read_image(tmp_path / f"rendered_{name}"))

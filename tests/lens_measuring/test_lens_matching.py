@@ -191,7 +191,7 @@ def test_focus_and_effective_f_number_of_a_photograph() -> None:
     assert abs(opened.lens.f_number - 1.8) < 3.0 * float(opened.sizes.f_number_error or 0.0)
     unknown = match_lens(picture, replace(FACTS, focus_distance_m=None), largest_value=1.0)
     assert not unknown.sizes.focus_known and unknown.lens.focus_distance_m > 1.0  # farther than it is: the lights were taken as far away
-    assert "--depth-m" in unknown.sizes.note
+    assert "--light-distance" in unknown.sizes.note
     found = match_lens(linear(photograph(DISC)), replace(FACTS, f_number=4.0), largest_value=1.0)
     bound = float(replace(LENS, f_number=4.0).coc_px(np.inf, WIDTH)) * 4.0 / COC_PX
     assert "effective f-number is at most" in found.sizes.note and f"{bound:.2f}"[:3] in found.sizes.note
@@ -275,7 +275,7 @@ def test_texture_two_discs_and_impossible_sizes_are_refused() -> None:
     require_refused(np.full_like(noise, 0.3), "found 0")
     require_refused(linear(photograph(DISC, count=2)), "expected at least 3.*found 2.*night")
     refused("--side", effective_f_number, LENS, -10.0, 4.0, WIDTH)
-    refused("--depth-m", focus_from_size, LENS, -2000.0, 4.0, WIDTH)
+    refused("--light-distance", focus_from_size, LENS, -2000.0, 4.0, WIDTH)
 
 
 @pytest.mark.parametrize("name", ["stacks/usb_two_layers/13.jpg", "rgbd/bokehme_3_image.jpg"])
@@ -334,7 +334,7 @@ def test_the_command_writes_a_lens_and_its_evidence(tmp_path: Path) -> None:
     exif = Image.Exif()
     exif.get_ifd(0x8769).update({0x829D: 1.8, 0x920A: 50.0})
     Image.fromarray(photograph(HEPTAGON)).save(photo, exif=exif, quality=92, subsampling=0)
-    given = ["match", str(photo), "--out", str(out), "--evidence", str(evidence), "--depth-m", f"{lit_depth_m(1)}"]
+    given = ["match", str(photo), "--out", str(out), "--evidence", str(evidence), "--light-distance", f"{lit_depth_m(1)}"]
     lacking = CliRunner().invoke(app, given)
     assert isinstance(lacking.exception, InputError) and "give --sensor-width" in str(lacking.exception)
     result = CliRunner().invoke(app, [*given, "--sensor-width", "14"])

@@ -198,7 +198,7 @@ def test_all_slices_hold_it_and_its_position_in_blur(guessed: FocalStack, tmp_pa
 def test_objects_are_sized_in_pixels(guessed: FocalStack, tmp_path: Path, run: Run, height: tuple[str, ...], rows_px: float) -> None:
     """Seen level, so that its height in the picture is its own; without a size it takes a quarter of the picture."""
     arguments = ("--slice", 2, "--object", CAKE, "--at-pixel", "50,40", *height, "--renderer", "scatter", "--mode", "front")
-    run("composite", guessed.folder, *arguments, "--out", tmp_path / "made.exr", "--deep-out", tmp_path / "sharp.exr")
+    run("composite", guessed.folder, *arguments, "--out", tmp_path / "made.exr", "--save-deep", tmp_path / "sharp.exr")
     alpha = read_exr(tmp_path / "made.exr")[0].channels["sharp.A"].astype(np.float32)
     rows = np.flatnonzero((alpha > 0.5).any(axis=1))
     assert np.ptp(rows) + 1 == pytest.approx(rows_px, abs=3.5)  # its round foot reaches below the pixel it stands on
@@ -461,7 +461,7 @@ def test_what_cannot_be_told_is_refused(known: FocalStack, guessed: FocalStack, 
         (guessed.folder, ("--distance-at", "9,9,-1"), "--distance-at: expected"),
         (guessed.folder, ("--distance-at", "99,9,1"), "outside the picture of 72x48"),
         (guessed.folder, ("--distance-at", "9,9,1", "--distance", "a,b,1"), "--distance is for a whole scene"),
-        (guessed.folder, ("--distance-at", "9,9,1", "--square-mm", 30, "--marker-mm", 22), "--square-mm, --marker-mm is for a whole scene"),
+        (guessed.folder, ("--distance-at", "9,9,1", "--square", 30, "--marker", 22), "--square, --marker is for a whole scene"),
         (guessed.folder, ("--nearest", "last", "--no-calibrate"), "--no-calibrate is for a whole scene"),
         (guessed.folder, ("--nearest", "last", "--overwrite"), "--nearest works without it"),
     ):

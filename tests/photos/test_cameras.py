@@ -33,7 +33,7 @@ def test_none_connected(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_several_connected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cameras_module, "detected", lambda: [("A", "usb:001,001"), ("B", "usb:001,002")])
-    refused(r"several cameras .*A at usb:001,001, B at usb:001,002.* --camera gphoto2:PORT", cameras_module.open_camera)
+    refused(r"several cameras .*A at usb:001,001, B at usb:001,002.* --source gphoto2:PORT", cameras_module.open_camera)
 
 
 def test_a_camera_that_another_program_holds(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,13 +51,28 @@ def test_the_opening_of_a_lens_file_and_a_picture_become_banks(tmp_path: Path) -
     expected = SimpleLens(Aperture.heart()).kernel(bank.boxes[3], 0, 0)
     np.testing.assert_allclose(bank.kernels[3], expected, atol=1e-7)
     assert bank.near_side_turned
-    run("psf", "stylized", "--image", picture_file(tmp_path / "logo.png"), "--out", tmp_path / "logo", *SMALL)
+    run("psf", "stylized", "--psf-picture", picture_file(tmp_path / "logo.png"), "--out", tmp_path / "logo", *SMALL)
     bank = read_bank(tmp_path / "logo")
     assert bank.channels == 3 and len(bank.kernels) == 4 and bank.near_side_turned
 
 
 def test_combined_traced_by_rays(tmp_path: Path) -> None:
-    run("psf", "combined", "--out", tmp_path / "bank", "--diameter", 8, "--motion", 6, "--counts", "3,3", "--rays", 1 << 18, "--seed", 4)
+    run(
+        "psf",
+        "combined",
+        "--out",
+        tmp_path / "bank",
+        "--diameter",
+        8,
+        "--longest-motion",
+        6,
+        "--counts",
+        "3,3",
+        "--rays",
+        1 << 18,
+        "--seed",
+        4,
+    )
     bank = read_bank(tmp_path / "bank")
     assert (bank.turns, bank.settings["rays"], bank.settings["seed"]) == ("motion", 1 << 18, 4)
     assert bank.axes[0].high == 8.0 and bank.axes[1].high == 6.0
@@ -112,7 +127,7 @@ def test_a_part_of_another_bank_is_not_gone_on_with(tmp_path: Path) -> None:
 
 
 def test_export_and_sheet(tmp_path: Path) -> None:
-    run("psf", "combined", "--out", tmp_path / "bank", "--diameter", 8, "--motion", 6, "--counts", "3,3")
+    run("psf", "combined", "--out", tmp_path / "bank", "--diameter", 8, "--longest-motion", 6, "--counts", "3,3")
     run("export", tmp_path / "bank", "--out", tmp_path / "kernels", "--format", "exr")
     bank = read_bank(tmp_path / "bank")
     assert sorted(path.suffix for path in (tmp_path / "kernels").iterdir()) == [".csv", *[".exr"] * len(bank.kernels)]
@@ -155,7 +170,7 @@ def test_physical_lenses_and_media_are_what_their_options_say(tmp_path: Path) ->
 
 def test_cells_in_proportion_or_the_papers_grid(tmp_path: Path) -> None:
     for name, option in (("ours", ("--cells", 30)), ("paper", ("--counts", "9,9"))):
-        run("psf", "combined", "--diameter", 16, "--motion", 16, *option, "--out", tmp_path / name)
+        run("psf", "combined", "--diameter", 16, "--longest-motion", 16, *option, "--out", tmp_path / name)
     ours, paper = read_bank(tmp_path / "ours"), read_bank(tmp_path / "paper")
     assert 25 <= len(ours.kernels) <= 30 and ours.knee_px and len(paper.kernels) == 28 and paper.nested and paper.knee_px is None
 
@@ -219,16 +234,16 @@ def test_interrupted_spreadlets_go_on(tmp_path: Path, monkeypatch: pytest.Monkey
 
 MISTAKES = {
     "an unknown model": (["psf", "blob"], "expected a model out of simple, combined, physical, volume, stylized"),
-    "no picture": (["psf", "stylized"], "--image"),
-    "an option of another model": (["psf", "combined", "--image", "a.png"], "--image does nothing"),
-    "a motion for a model without": (["psf", "simple", "--motion", "3"], "--motion does nothing"),
+    "no picture": (["psf", "stylized"], "--psf-picture"),
+    "an option of another model": (["psf", "combined", "--psf-picture", "a.png"], "--psf-picture does nothing"),
+    "a motion for a model without": (["psf", "simple", "--longest-motion", "3"], "--longest-motion does nothing"),
     "no such lens": (["psf", "simple", "--lens", "none.json"], "none.json"),
-    "no such picture": (["psf", "stylized", "--image", "none.png"], "none.png"),
+    "no such picture": (["psf", "stylized", "--psf-picture", "none.png"], "none.png"),
     "counts in words": (["psf", "simple", "--counts", "many"], "--counts as whole numbers"),
     "too many counts": (["psf", "simple", "--counts", "3,3"], "have one count"),
     "a diameter below 0": (["psf", "simple", "--diameter", "-3"], "positive number"),
     "a focus for a model without": (["psf", "simple", "--focus", "3"], "--focus does nothing"),
-    "vignetting of a thin lens": (["psf", "combined", "--no-vignetting"], "--vignetting does nothing"),
+    "vignetting of a thin lens": (["psf", "combined", "--no-vignetting"], "--no-vignetting does nothing"),
     "two grids": (["psf", "combined", "--cells", "9", "--counts", "3,3"], "either --counts"),
     "no cells": (["psf", "combined", "--cells", "0"], "at least one cell"),
     "too open": (["psf", "physical", "--f-number", "2"], "opens to f/4 only"),

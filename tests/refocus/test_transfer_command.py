@@ -122,7 +122,7 @@ def test_the_same_view_is_a_lens_of_another_length_and_asks_the_photograph(files
 
 def test_what_is_missing_or_odd_is_one_sentence(files: dict[str, Path]) -> None:
     for more, words in (
-        (["--focus", "1", "--focus-at", "3,3"], "either"),
+        (["--focus", "1", "--focus-at", "3,3"], "give one of them"),
         (["--focus", "soon"], "--focus"),
         (["--focus-at", "900,3"], "900"),
         (["--disparity", "3"], "NEAR:FAR"),

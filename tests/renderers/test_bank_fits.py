@@ -139,7 +139,7 @@ def test_the_command_takes_a_bank_for_every_method_that_spreads(tmp_path: Path) 
     seen = {}
     for method in ("scatter", "polygon", "low-rank", "laplacian"):
         out = tmp_path / f"{method}.exr"
-        result = CliRunner().invoke(app, ["render", *map(str, words), "--method", method, "--slices", "4", "--out", str(out)])
+        result = CliRunner().invoke(app, ["render", *map(str, words), "--renderer", method, "--slices", "4", "--out", str(out)])
         assert result.exit_code == 0, result.output
         seen[method] = read_image(out)
         assert psnr(seen[method], seen["scatter"], 2.0) > 35.0, method

@@ -256,7 +256,7 @@ def test_without_motion_kernels_stand_still_and_a_bank_without_it_gets_its_light
     assert psnr(found.rgb, drawn.rgb) > 45.0
     for layers, said in (
         ([still(-50.0)], r"up to 32 px, but this picture has 50\.0 px: .*--diameter"),
-        ([card(30, 5.0, (60.0, 0.0)), still(9.0)], r"motion up to 40 px, but this picture has 60\.0 px: .*--motion"),
+        ([card(30, 5.0, (60.0, 0.0)), still(9.0)], r"motion up to 40 px, but this picture has 60\.0 px: .*--longest-motion"),
     ):
         with pytest.raises(InputError, match=said):
             LaplacianSpreadlets(combined).render(layers, LENS)

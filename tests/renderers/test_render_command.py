@@ -50,12 +50,12 @@ def run(folder: Path, *arguments: str, out: str = "out.exr") -> Path:
     return folder / out
 
 
-PICTURE = ("--rgb", "aif.exr", "--depth", "z.exr", "--lens", "lens.json", "--method", "scatter")
+PICTURE = ("--rgb", "aif.exr", "--depth", "z.exr", "--lens", "lens.json", "--renderer", "scatter")
 
 
 def test_a_lens_can_be_told_in_options_instead_of_a_file(folder: Path) -> None:
     """Options go before the file's facts; without a file the lens is 50 mm f/1.8 on 36 mm, with a round opening."""
-    picture = ("--rgb", "aif.exr", "--depth", "z.exr", "--method", "scatter", "--focus", "2")
+    picture = ("--rgb", "aif.exr", "--depth", "z.exr", "--renderer", "scatter", "--focus", "2")
     (folder / "round.json").write_text(json.dumps(LENS | {"focal_length_mm": 40, "aperture": {"shape": "disc"}}))
     by_file = read_image(run(folder, *picture, "--lens", "round.json", "--focal-length", "50"))
     by_options = read_image(run(folder, *picture, "--sensor-width", "12", out="options.exr"))
@@ -97,7 +97,7 @@ def test_layers_lie_over_the_picture_and_alone_keep_their_alpha_and_channels(fol
     matte = done.extra["matte"][..., 0]
     assert 0.2 < matte[8, 20] < 0.8 and matte[14, 20] == pytest.approx(1.0, abs=1e-3), "a blurred card of 20 x 12 px with a soft edge"
     np.testing.assert_array_equal(done.depth_m[14, 20], np.float32(0.7))
-    done = read_layer(run(folder, "--layer", "card.exr", "--lens", "lens.json", "--method", "scatter", "--alpha-out", out="alone.exr"))
+    done = read_layer(run(folder, "--layer", "card.exr", "--lens", "lens.json", "--renderer", "scatter", "--alpha-out", out="alone.exr"))
     np.testing.assert_allclose(done.rgb[..., 1], done.alpha, atol=1e-3)
     assert done.alpha.max() > 0.99 and done.alpha[0, 40] == 0.0
 
@@ -140,7 +140,7 @@ MISTAKES = {
     "focus in words": (lambda _: None, ("--focus-at", "middle"), "expected X,Y"),
     "focus twice": (lambda _: None, ("--focus-at", "4,4", "--focus", "1"), "not both"),
     "no lens": (lambda f: (f / "lens.json").unlink(), (), "lens"),
-    "an unknown method": (lambda _: None, ("--method", "magic"), "expected a renderer"),
+    "an unknown method": (lambda _: None, ("--renderer", "magic"), "expected a renderer"),
     "a missing picture": (lambda f: (f / "aif.exr").unlink(), (), "aif.exr"),
     "not an EXR": (lambda f: (f / "z.exr").write_text("no"), (), "cannot be read as EXR"),
 }
@@ -173,7 +173,7 @@ def test_a_bank_of_kernels_takes_the_place_of_the_opening(folder: Path, method: 
 def test_noisy_samples_become_a_clean_picture(tmp_path: Path, method: str) -> None:
     """8 samples a pixel of a fence before moving boards, against 1024: 26.1 dB as they are."""
     scene = Path(__file__).parents[1] / "data" / "samples" / "fence_1"
-    words = ["--samples", str(scene / "samples.npz"), "--lens", str(scene / "lens.json"), "--method", method]
+    words = ["--samples", str(scene / "samples.npz"), "--lens", str(scene / "lens.json"), "--renderer", method]
     result = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "clean.exr")])
     assert result.exit_code == 0, result.output
     clean, truth = (np.clip(read_image(path), 0.0, 1.0) for path in (tmp_path / "clean.exr", scene / "reference.exr"))
@@ -185,7 +185,7 @@ def test_samples_do_not_go_with_pictures_or_other_methods(folder: Path) -> None:
     with pytest.raises(InputError, match="leave out"):
         run(folder, *PICTURE, "--samples", str(scene / "samples.npz"))
     with pytest.raises(InputError, match="lrdm or laplacian"):
-        run(folder, "--samples", str(scene / "samples.npz"), "--lens", str(scene / "lens.json"), "--method", "polygon")
+        run(folder, "--samples", str(scene / "samples.npz"), "--lens", str(scene / "lens.json"), "--renderer", "polygon")
 
 
 @pytest.mark.parametrize("method", ["laplacian", "lrdm"])
@@ -195,7 +195,7 @@ def test_a_device_gives_the_same_picture_or_one_sentence(folder: Path, method: s
     words = (*PICTURE[:-1], method)
     plain, on_device = (read_image(run(folder, *words, *more, out=f"{i}.exr")) for i, more in enumerate([(), ("--device", "cpu")]))
     assert psnr(on_device, plain) > 80.0
-    for wrong, said in (((*words, "--device", "abacus"), "got 'abacus'"), ((*PICTURE, "--device", "cpu"), "--device is for --method")):
+    for wrong, said in (((*words, "--device", "abacus"), "got 'abacus'"), ((*PICTURE, "--device", "cpu"), "--device is for --renderer")):
         with pytest.raises(InputError, match=said):
             run(folder, *wrong, out="none.exr")
     assert not (folder / "none.exr").exists()

@@ -315,7 +315,7 @@ def test_from_the_infinity_stop(tmp_path: Path) -> None:
 
 def shoot_by(folder: Path, *more: str) -> str:
     """What the command prints, which takes the plan of the folder with the simulated camera."""
-    words = ["--plan", folder / "plan.json", "--camera", "simulated", "--out", folder / "view", "--settle", "0"]
+    words = ["--plan", folder / "plan.json", "--source", "simulated", "--out", folder / "view", "--settle", "0"]
     return printed_by(shoot_command, *words, *more, answer="\n")
 
 
@@ -339,12 +339,12 @@ def test_the_command_measures_steps_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        (["--camera", "phone"], "--camera must be"),
+        (["--source", "phone"], "--source must be"),
         (["--exposure-time", "fast"], "seconds such as"), (["--exposure-time", "0"], "got '0'"),
         (["--near-steps", "10"], "belong together"), (["--near-steps", "9", "--far-steps", "20", "--home", "left"], "--home must be"),
         (["--target", "0.5,0.5"], "X,Y=METRES"), (["--target", "0.5=2"], "X,Y from 0 to 1"), (["--spot", "2,2"], "a spot needs"),
         (["--near-steps", "9", "--far-steps", "20", "--target", "0.5,0.5=1"], "both given and to be measured"),
-        (["--camera", "folder:/nowhere/at/all"], "expected the folder"),
+        (["--source", "folder:/nowhere/at/all"], "expected the folder"),
     ],
 )  # fmt: skip
 def test_mistakes_of_the_command(tmp_path: Path, more: list[str], said: str) -> None:

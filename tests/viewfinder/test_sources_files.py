@@ -239,7 +239,7 @@ def test_anything_else_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatc
         with pytest.raises(InputError, match=sentence) as caught:
             open_source(text)
         assert "\n" not in str(caught.value)
-    refused("--fps", open_source, "test", fps=0.0)
+    refused("--max-rate", open_source, "test", fps=0.0)
     monkeypatch.setattr("viewfinder.sources.choose.find_spec", lambda _name: None)
     with pytest.raises(MissingExtraError, match=r"pip install .*\[viewfinder\]"):
         open_source("whip")

@@ -74,8 +74,9 @@ REFUSED = {
     "--scene bad.toml --lens lens.json": "none.glb",
 }  # fmt: skip
 REFUSED |= {f"{GIVEN} {more}": sentence for more, sentence in {
-    "--backend vulkan": "--backend: expected one of auto, wgpu, embree", "--backend embree": "leave --backend out",
-    "--fps -1": "--fps: expected a positive number", "--renderer magic": "--renderer: expected one of polygon",
+    "--scene-renderer vulkan": "--scene-renderer: expected one of auto, wgpu, embree",
+    "--scene-renderer embree": "leave --scene-renderer out",
+    "--max-rate -1": "--max-rate: expected a positive number", "--renderer magic": "--renderer: expected one of polygon",
     "--renderer polygon --renderer none.onnx": "no such file", "--renderer lrdm --psf bank.exr": "leave --psf out",
     "--board bad.json": "bad.json", "--pose bad.json": "expected width_px", "--camera none.json": "none.json",
     "--board board.json --pose pose.json": "got --board and --pose: give one",
@@ -90,9 +91,9 @@ REFUSED |= {f"{GIVEN} {more}": sentence for more, sentence in {
     "--phone 0 --rig rig.json --phone-camera pose.json --board board.json": "not a phone rig",
     "--phone test --rig rig.json --phone-camera pose.json --board board.json": "are both test",
     "--phone 0 --rig rig.json --phone-camera pose.json --freed 5000": "--freed and --phone",
-    "--delay-ms 20": "--delay-ms is for poses that come from elsewhere",
-    "--board board.json --delay-ms 20": "--delay-ms is for poses that come from elsewhere", "--smoothing": "--smoothing needs a track",
-    "--smoothing --pose pose.json": "--smoothing needs a track",
+    "--delay 20": "--delay is for poses that come from elsewhere",
+    "--board board.json --delay 20": "--delay is for poses that come from elsewhere", "--smooth": "--smooth needs a track",
+    "--smooth --pose pose.json": "--smooth needs a track",
     "--focus-from luck": "--focus-from: expected one of hand, tracking, source, board",
     "--focus-from board": "--focus-from board needs --board", "--focus-from tracking": "--focus-from tracking needs a tracking system",
     "--focus-from tracking --freed 5000": "needs --lens-table", "--interface eth0": "--interface eth0 is for --lan",
@@ -118,7 +119,7 @@ def test_what_cannot_be_is_refused_before_a_camera_is_opened(monkeypatch: pytest
         refused = CliRunner().invoke(app, ["--source", "test", *shlex.split(line)]).exception
         assert isinstance(refused, InputError) and sentence in str(refused) and "\n" not in str(refused), (line, refused)
     with pytest.raises(RuntimeError, match="a camera was opened"):
-        printed_by(app, "--source", "test", *shlex.split(f"{GIVEN} --board board.json --focus-from board --smoothing"))
+        printed_by(app, "--source", "test", *shlex.split(f"{GIVEN} --board board.json --focus-from board --smooth"))
 
 
 @pytest.mark.usefixtures("in_folder")
@@ -216,7 +217,7 @@ def test_a_browser_camera_behind_a_layer_can_be_sent(folder: Path) -> None:
 def test_a_board_to_print(tmp_path: Path) -> None:
     """The markers span six blurs: at f/2.8 and half a dioptre from the focus the blur of this lens is 17 px of 1280."""
     write_lens(tmp_path / "lens.json", LENS)
-    words = ["--lens", tmp_path / "lens.json", "--distance-m", "0.8,1.2", "--out", tmp_path / "board.pdf"]
+    words = ["--lens", tmp_path / "lens.json", "--near", "0.8", "--far", "1.2", "--out", tmp_path / "board.pdf"]
     told = printed_by(board_command, *words)
     assert "print it at 100 %" in told and "blurs" in told and (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
     marker_px = LENS.focused_at(1.2).focal_px(1280) * read_board(tmp_path / "board.json").grids[0].marker_mm / 1000 / 0.8
@@ -228,9 +229,9 @@ def test_a_board_to_print(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
-        ("--out board.png", "ends in .pdf"), ("--out board.pdf --distance-m near", "--distance-m: expected NEAREST,FARTHEST"),
-        ("--out board.pdf --distance-m 2,1", "2"), ("--out board.pdf --paper napkin", "napkin"),
-        ("--out board.pdf --lens lens.json --distance-m 0.2,30", "no paper holds a board"),
+        ("--out board.png", "ends in .pdf"),
+        ("--out board.pdf --near 2 --far 1", "2"), ("--out board.pdf --paper napkin", "napkin"),
+        ("--out board.pdf --lens lens.json --near 0.2 --far 30", "no paper holds a board"),
     ],
 )  # fmt: skip
 def test_boards_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: str, sentence: str) -> None:
@@ -313,7 +314,7 @@ def test_every_command_of_the_guide_is_one() -> None:
 def test_the_guide_names_every_option() -> None:
     text, group = DOC.read_text(encoding="utf-8"), get_command(app)
     options = {option for parameter in group.params for option in parameter.opts if option.startswith("--")}
-    missing = {option for option in options - {"--help", "--method"} if option not in text}
+    missing = {option for option in options - {"--help", "--renderer"} if option not in text}
     assert not missing, missing
 
 

@@ -143,7 +143,7 @@ def test_boards_come_from_options_and_files_and_intervals_from_slices(tmp_path: 
     ("make", "message"),
     [
         (lambda: board_from_options("8", 30.0, 22.0, "DICT_4X4_50"), "COLUMNSxROWS"),
-        (lambda: board_from_options("8x6", 30.0, None, "DICT_4X4_50"), "--marker-mm"),
+        (lambda: board_from_options("8x6", 30.0, None, "DICT_4X4_50"), "--marker"),
         (lambda: board_from_options("8x6", 30.0, 31.0, "DICT_4X4_50"), "marker < square"),
         (lambda: board_from_options("8x6", 30.0, 22.0, "DICT_9X9"), "dictionary of cv2"),
         (lambda: board_from_options("2x6", 30.0, 22.0, "DICT_4X4_50"), "at least 3x3"),

@@ -18,7 +18,7 @@ def open_source(text: str, limit: SizeLimit = UNLIMITED, fps: float | None = Non
     many frames per second, where the source can do that. Raises InputError for anything else and for what is not there.
     """
     if fps is not None and fps <= 0:
-        raise InputError(f"--fps: expected a positive number of frames per second, got {fps}")
+        raise InputError(f"--max-rate: expected a positive number of frames per second, got {fps}")
     if text.isdigit():
         from viewfinder.sources.attached_camera import WebcamSource
 

@@ -31,7 +31,7 @@ def focus_from_size(lens: Lens, coc_px: float, depth_m: float, image_width_px: i
     if opening_m + blur_m <= 0.0 or not 0.0 <= dioptres < 1.0 / focal_m:
         raise InputError(
             f"no focus {'nearer' if coc_px > 0 else 'farther'} than points at {depth_m:g} m blurs them to {abs(coc_px):.1f} px "
-            f"with this lens: check --depth-m, --side and the f-number"
+            f"with this lens: check --light-distance, --side and the f-number"
         )
     return 1.0 / dioptres if dioptres > 0.0 else float(np.inf)
 
@@ -42,7 +42,7 @@ def effective_f_number(lens: Lens, coc_px: float, depth_m: float, image_width_px
     if expected_px * coc_px <= 0.0:
         raise InputError(
             f"lights at {depth_m:g} m are {'behind' if expected_px > 0 else 'in front of'} a focus at {lens.focus_distance_m:g} m, but "
-            f"discs of the other side were asked for: check --depth-m, --focus and --side"
+            f"discs of the other side were asked for: check --light-distance, --focus and --side"
         )
     return lens.f_number * expected_px / coc_px
 
@@ -91,7 +91,7 @@ def size_facts(
     full: whether the light of most discs is beyond what the file can hold.
     """
     if depth_m is not None and not depth_m > 0.0:
-        raise InputError(f"expected --depth-m above 0 (inf is allowed), got {depth_m:g}")
+        raise InputError(f"expected --light-distance above 0 (inf is allowed), got {depth_m:g}")
     facts.require("the photograph")
     diameter = float(np.median(diameters_px))
     error = float(np.hypot(1.2533 * diameters_px.std() / np.sqrt(len(diameters_px)), FULL_EDGE_PX if full else EDGE_PX))
@@ -125,7 +125,7 @@ def size_facts(
         return made(stated.f_number, None, facts.focus_distance_m, None, True, _lights_at(stated, side * diameter, image_width_px))
     far_m = focus_from_size(stated, diameter, np.inf, image_width_px) if side > 0 else np.inf
     bound = f"at most {far_m:.3g} m, which the lens file holds (lights far away)" if side > 0 else "the lens file holds infinity"
-    return made(stated.f_number, None, far_m, None, False, f"focus unknown, {bound}: give --depth-m or --focus")
+    return made(stated.f_number, None, far_m, None, False, f"focus unknown, {bound}: give --light-distance or --focus")
 
 
 def _with_error(value: Callable[[float], float], at: float, error: float) -> tuple[float, float]:
@@ -138,11 +138,11 @@ def _lights_at(lens: Lens, coc_px: float, image_width_px: int) -> str:
     """Say where the lights are by the stated f-number, or how far it is off if they would have to be beyond infinity."""
     depth_m = depth_from_size(lens, coc_px, image_width_px)
     if depth_m > 0.0:
-        return f"the stated f-number has the lights at {depth_m:.3g} m; give --depth-m for the effective one"
+        return f"the stated f-number has the lights at {depth_m:.3g} m; give --light-distance for the effective one"
     largest_px = float(lens.coc_px(np.inf, image_width_px))
     return (
         f"discs are larger than f/{lens.f_number:g} makes them even far away: the effective f-number is at most "
-        f"{lens.f_number * largest_px / coc_px:.3g}; give --depth-m"
+        f"{lens.f_number * largest_px / coc_px:.3g}; give --light-distance"
     )
 
 

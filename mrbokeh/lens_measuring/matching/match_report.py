@@ -105,7 +105,7 @@ def _sizes(match: LensMatch) -> list[Row]:
         if sizes.f_number_error is None
         else f"stated {sizes.stated_f_number:g}, scale {sizes.f_number / sizes.stated_f_number:.3f}"
     )
-    focus = f"{sizes.focus_distance_m:.3g} m" if sizes.focus_known else "not known"
+    focus = lens.focused_at(sizes.focus_distance_m).focus_described if sizes.focus_known else "not known"
     return [
         Row("f-number", f"{sizes.f_number:.3g}", effective, scale),
         Row("focus distance", focus, "" if sizes.focus_error_m is None else f"{sizes.focus_error_m:.2g}", sizes.note),

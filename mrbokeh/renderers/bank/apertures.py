@@ -49,7 +49,7 @@ def fit_polygons(kernel: Float[np.ndarray, "size size"], diameter_px: float, lev
     wanted = kernel.astype(np.float64) / kernel.sum(dtype=np.float64)
     fits = {count: fit for count in _counts(levels) if (fit := _fit(wanted, diameter_px, count, _SPECK_PX2)) is not None}
     if not fits:
-        raise InputError(f"this kernel of {len(kernel)} px has no inside to draw polygons around: take --method laplacian, or more blur")
+        raise InputError(f"this kernel of {len(kernel)} px has no inside to draw polygons around: take --renderer laplacian, or more blur")
     best = min(fit.relative_error for fit in fits.values())
     count = next(each for each, fit in fits.items() if fit.relative_error <= _FEWER_LEVELS * best)
     cleaned = [_fit(wanted, diameter_px, count, share * 0.25 * np.pi * diameter_px**2) for share in _ISLANDS]
@@ -228,7 +228,7 @@ def _fitted_nodes(diameters_px: Float64[np.ndarray, " nodes"]) -> list[int]:
     if diameters_px[-1] < LEAST_FITTED_PX:
         raise InputError(
             f"polygons need kernels of at least {LEAST_FITTED_PX:g} px, but this bank ends at {diameters_px[-1]:.1f} px: "
-            "take --method laplacian, or a bank of more blur"
+            "take --renderer laplacian, or a bank of more blur"
         )
     count = 1 + int(np.log(diameters_px[-1] / LEAST_FITTED_PX) / np.log(_STEP))
     wanted = diameters_px[-1] / _STEP ** np.arange(count)

@@ -156,7 +156,7 @@ class BankPsf:
 
 
 def _too_small(model: str, axis: Axis, largest: float) -> str:
-    what, option = ("circles of confusion", "--diameter") if axis.name == "diameter_px" else ("motion", "--motion")
+    what, option = ("circles of confusion", "--diameter") if axis.name == "diameter_px" else ("motion", "--longest-motion")
     return (
         f"the bank '{model}' holds {what} up to {axis.high:g} px, but this picture has {largest:.1f} px: "
         f"build one that goes so far ({option}), or blur less"

@@ -36,10 +36,10 @@ class BankLattice:
         others = [name for name in names if name not in _AXES]
         if others or "diameter_px" not in names or self.bank.turns == "motion":
             raise InputError(
-                f"expected a bank over diameter and place in the frame, got {', '.join(names)}: --method laplacian takes every bank"
+                f"expected a bank over diameter and place in the frame, got {', '.join(names)}: --renderer laplacian takes every bank"
             )
         if len(names) > 1 and (self.bank.knee_px is not None or self.bank.nested):
-            raise InputError("a bank over diameter and place must lie on a regular grid: --method laplacian takes every bank")
+            raise InputError("a bank over diameter and place must lie on a regular grid: --renderer laplacian takes every bank")
 
     @cached_property
     def diameters_px(self) -> dict[int, Float64[np.ndarray, " nodes"]]:

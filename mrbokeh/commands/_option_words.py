@@ -1,0 +1,139 @@
+"""Words of options in --help and in shell completion, by their names: unit, panel and choices are the same in all commands."""
+
+from types import SimpleNamespace
+from typing import Any
+
+FEW = 9
+"""A command with no more options shows them on one panel."""
+
+EVERYDAY = {
+    "capture shoot": "plan source out target by-hand",
+    "capture ingest": "out group max-width overwrite",
+    "capture process": "out max-width board prefer overwrite",
+    "capture merge": "overwrite prefer from-slice mask",
+    "capture poses": "overwrite images out mapper",
+    "capture plan": "near far image-width focal-length f-number sensor-width out",
+    "capture matchmove": "out board overwrite",
+    "capture scale": "ruler distance-at nearest board distance",
+    "capture dataset": "out licence test overwrite",
+    "train fit": "out preset minutes overwrite",
+    "train evaluate": "data out renderer overwrite",
+    "train ablate": "out table minutes dry-run",
+    "lens new": "focal-length f-number focus sensor-width blades overwrite",
+    "lens psf": "out lens diameter overwrite",
+    "lens fit": "out lights overwrite",
+    "lens match": "out evidence focus f-number overwrite",
+    "render": "out rgb depth lens focus focus-at",
+    "composite": "object at at-pixel height slice depth out overwrite",
+    "video": "scene layer camera lens depth out overwrite",
+    "refocus": "focus out f-number lens overwrite",
+    "transfer": "out depth f-number focus focus-at lens overwrite",
+    "check": "against virtual sharp",
+    "track clip": "board out calibrate camera overwrite",
+    "track convert": "size format overwrite",
+    "viewfinder": "source demo scene board lens lan",
+    "viewfinder calibrate-phone": "source phone phone-camera board out",
+}
+"""Options of a command that most people need, which come first."""
+
+PANELS = {
+    "The plate": "all-slices behind depth depth-model-gives depth-scale disparity exact-depth first-number frames input-space matte "
+    "near-distance rate refine rgb slice srgb steady-depth stereo linear side light-distance images registration half-size sidecar group",
+    "What is put in": "at at-pixel camera catch height layer mode object objects paths pitch scene scene-begin scene-renderer time turn "
+    "keyframes",
+    "Its light": "environment exposure shadow",
+    "Its look": "grain grey-value light-wrap match-black match-exposure match-grey match-white plate-exposure vignetting seed",
+    "The lens": "distortion f-number focal-length focus focus-at focus-pull lens petzval-radius psf readout same-view sensor-height "
+    "sensor-width shutter tilt prescription",
+    "The opening": "axial-chromatic blades cat-eye curvature image inner lateral-chromatic levels path rotation shape "
+    "spherical-aberration squeeze",
+    "The blur": "alpha-out highlights motion renderer residuals samples slices",
+    "The kernels": "anisotropy cells counts density-per-m diameter diameters far focal-px image-width longest-motion near near-lights "
+    "pixels psf-picture rays regions smoothness symmetric",
+    "Metres": "board dictionary distance distance-at ground lens-calibration marker metric nearest ruler square",
+    "The camera": "backlash by-hand check exposure-time far-steps focus-level focus-steps home iso live near-steps planned-distances "
+    "reverse-focus settle spot sweep-step target timeout white-balance",
+    "Tracking": "camera-model cameras delay focus-from freed lens-table longest-gap map mapper max-image-size metres-per-unit opentrackio "
+    "phone phone-camera pose rig smooth steadier",
+    "The page": "captures interface lan max-rate port qr tls tls-key webcam",
+    "The result": "constant-rate encoding evidence format leaks no-distortion ocio out output-space overwrite save-deep save-depth "
+    "save-layer sheet virtual-only allow-absent strict",
+    "The work": "cluster device epochs max-width minutes segment threads work workers",
+}
+"""Subjects of the other options; a name that is on none of them comes with "More"."""
+
+METAVARS = {
+    "MM": "focal-length sensor-width sensor-height petzval-radius square marker",
+    "N": "f-number",
+    "METRES": "near far near-distance light-distance depth-scale",
+    "PX": "image-width max-width max-image-size residual diameter longest-motion tile-px overlap-px focal-px steadier",
+    "DEGREES": "turn pitch rotation shutter",
+    "SECONDS": "settle timeout time scene-begin readout segment seconds",
+    "MS": "delay",
+    "MINUTES": "minutes",
+    "FPS": "rate max-rate constant-rate",
+    "X,Y[,R]": "focus-at",
+    "cpu|cuda": "device",
+    "DEPTH": "depth",
+    "LENS": "lens",
+    "CAMERA": "camera phone-camera pose",
+    "BOARD": "board",
+    "SCENE.toml": "scene",
+    "RGBAZ.exr": "layer behind",
+    "PICTURE": "rgb",
+    "SOURCE": "source phone",
+    "RENDERER": "renderer",
+    "A,B,METRES": "distance",
+    "lens.toml|focus.csv": "sidecar",
+}
+"""What options take, in one word."""
+
+CHOICES = {
+    "renderer": "polygon low-rank laplacian lrdm scatter",
+    "scene-renderer": "auto embree wgpu mitsuba",
+    "mode": "front over matte between rerender",
+    "catch": "shadow light",
+    "group": "folder time focus none",
+    "home": "near infinity",
+    "origin": "lens film_plane",
+    "mapper": "incremental global",
+    "camera-model": "auto SIMPLE_RADIAL RADIAL",
+    "cameras": "auto shared separate",
+    "depth-model-gives": "inverse metric",
+    "device": "cpu cuda",
+    "encoding": "h264 h264-10bit h265-10bit prores4444 prores4444-alpha prores422 dnxhr-hqx ffv1 ffv1-alpha",
+    "focus-from": "hand tracking source board",
+    "ocio": "aces aces-cg",
+    "paper": "a4 a3 letter board",
+    "shape": "disc polygon ring star heart image outline",
+    "side": "behind front",
+    "source": "gphoto2 whip test simulated folder:",
+    "white-balance": "camera",
+    "model": "simple combined physical volume stylized",
+}
+"""Values that the shell completes; where none fits, it completes files."""
+
+
+def _by_name(table: dict[str, str]) -> dict[str, str]:
+    return {name: word for word, names in table.items() for name in names.split()}
+
+
+def with_words(command: Any, path: str) -> None:
+    """Give the options of a command their words. path: of the command, such as "lens new"."""
+    panels, metavars, first = _by_name(PANELS), _by_name(METAVARS), EVERYDAY.get(path, "").split()
+    for parameter in command.params:
+        name = parameter.opts[0].removeprefix("--") if parameter.param_type_name == "option" else parameter.name
+        if name in CHOICES and not parameter.type_descriptor.is_choice:
+            parameter.shell_complete = _completing(CHOICES[name].split())
+        if parameter.param_type_name == "option":
+            parameter.metavar = metavars.get(name, parameter.metavar)
+            if len(command.params) > FEW and name not in first:
+                parameter.rich_help_panel = panels.get(name, "More")
+    order = {name: place for place, name in enumerate(first)}
+    command.params.sort(key=lambda each: order.get(each.opts[0].removeprefix("--"), len(order)))
+
+
+def _completing(choices: list[str]) -> Any:
+    return lambda _context, incomplete: [
+        SimpleNamespace(value=each, type="plain", help=None) for each in choices if each.startswith(incomplete)
+    ]
