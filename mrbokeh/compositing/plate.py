@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 
 from mrbokeh.depth.depth_map import DepthSettings
 from mrbokeh.depth.open_depth import open_depth
@@ -177,27 +177,43 @@ def with_depth(plate: Plate, source: Path, settings: DepthSettings) -> Plate:
 
 _SAME_SURFACE = 0.02
 """Largest share by which depth changes from pixel to pixel of one surface."""
+_FOUND = 2
 
 
-def with_ground_behind(plate: Plate, foot_px: tuple[float, float], layers: Sequence[Layer]) -> Plate:
-    """Return the plate with the ground on which something stands no nearer than that, where it is seen above the foot.
+def on_the_ground(plate: Plate, foot_px: tuple[float, float], layers: Sequence[Layer]) -> tuple[Plate, list[Layer]]:
+    """Return (plate, layers) that agree about the ground on which something stands: what goes on from the foot without a jump of depth.
 
-    A floor or a table is the farther the higher it is in the picture, so that it never hides what stands on it; depth that says otherwise
-    is wrong. The ground is what goes on from the foot without a jump of depth, but not below the foot, where near things stand.
+    A floor or a table is the farther the higher it is in the picture, so that it never hides what stands on it: above the foot it lies no
+    nearer than the layers; depth that says otherwise is wrong. Shadows (layers without light) are drawn on a plane without end, and stop
+    where the ground stops and what is seen lies farther: they would hang sharp in the air over what lies blurred beyond a table's edge.
     """
+    if plate.depth_m is None:
+        return plate, list(layers)
+    covered_m = np.minimum.reduce([np.where(layer.alpha > 0.0, layer.depth_m, np.inf) for layer in layers])
+    above = np.broadcast_to(np.arange(len(covered_m))[:, None] <= int(foot_px[1]), covered_m.shape)
+    ground = _same_surface(plate.depth_m, foot_px, above) & np.isfinite(covered_m)
+    depth_m = np.where(ground, np.maximum(plate.depth_m, covered_m), plate.depth_m)
+    beyond = ~_same_surface(plate.depth_m, foot_px, np.isfinite(covered_m))
+
+    def ended(shadow: Layer) -> Layer:
+        farther = plate.depth_m > shadow.depth_m * np.float32(1.0 + _SAME_SURFACE)
+        return replace(shadow, alpha=np.where(beyond & farther, np.float32(0.0), shadow.alpha))
+
+    return replace(plate, depth_m=depth_m), [layer if layer.rgb.any() else ended(layer) for layer in layers]
+
+
+def _same_surface(
+    depth_m: Float32[np.ndarray, "height width"], start_px: tuple[float, float], within: Bool[np.ndarray, "height width"]
+) -> Bool[np.ndarray, "height width"]:
+    """Return the pixels (H, W) that are reached from one of them without a jump of depth and without leaving a mask."""
     import cv2
 
-    if plate.depth_m is None:
-        return plate
-    x_px, below = int(foot_px[0]), int(foot_px[1]) + 1
-    dioptres = np.log(np.minimum(plate.depth_m[:below], np.float32(1e6)))
-    found = np.zeros((below + 2, plate.depth_m.shape[1] + 2), np.uint8)
-    cv2.floodFill(dioptres, found, (x_px, below - 1), 0.0, _SAME_SURFACE, _SAME_SURFACE, 4 | (1 << 8) | cv2.FLOODFILL_MASK_ONLY)
-    covered_m = np.minimum.reduce([np.where(layer.alpha > 0.0, layer.depth_m, np.inf) for layer in layers])[:below]
-    depth_m = plate.depth_m.copy()
-    ground = (found[1:-1, 1:-1] > 0) & np.isfinite(covered_m)
-    depth_m[:below][ground] = np.maximum(depth_m[:below], covered_m)[ground]
-    return replace(plate, depth_m=depth_m)
+    x_px, y_px = (int(each) for each in start_px)
+    found = cv2.copyMakeBorder((~within).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
+    found[y_px + 1, x_px + 1] = 0
+    logs = np.log(np.minimum(depth_m, np.float32(1e6)))
+    cv2.floodFill(logs, found, (x_px, y_px), 0.0, _SAME_SURFACE, _SAME_SURFACE, 4 | (_FOUND << 8) | cv2.FLOODFILL_MASK_ONLY)
+    return found[1:-1, 1:-1] == _FOUND
 
 
 def with_matte(plate: Plate, path: Path) -> Plate:

@@ -14,7 +14,7 @@ from mrbokeh.commands._composite_parts import plate_by
 from mrbokeh.commands._insertion_options import ColourOptions
 from mrbokeh.commands.composite import app
 from mrbokeh.compositing.choose import best_mode, insertion_of
-from mrbokeh.compositing.plate import plate_of, with_ground_behind
+from mrbokeh.compositing.plate import on_the_ground, plate_of
 from mrbokeh.demo.plan import DATA
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.exr_io import read_exr
@@ -122,11 +122,24 @@ def test_the_ground_never_hides_what_stands_on_it_and_a_post_before_it_does() ->
     card = Layer(np.repeat(alpha[..., None], 3, axis=2), alpha, np.where(alpha > 0, foot_m, np.inf).astype(np.float32))
     plate = plate_of(plate_rgb(), replace(LENS, focus_distance_m=foot_m), wrong_m)
     hidden, whole = (
-        insertion_of("over").insert(each, [card], ScatterReference()).rgb for each in (plate, with_ground_behind(plate, (72, 70), [card]))
+        insertion_of("over").insert(each, [card], ScatterReference()).rgb for each in (plate, on_the_ground(plate, (72, 70), [card])[0])
     )
     assert hidden[40, 120].max() < 0.5 < 0.95 < whole[40, 120].min(), "where depth is wrong"
     assert whole[60, 30].max() < 0.5, "the post, whose own foot is nearer"
     np.testing.assert_array_equal(hidden[80:], whole[80:])
+
+
+def test_a_shadow_ends_where_the_table_ends() -> None:
+    """A table to column 80 and a wall at 8 m beyond: the shadow lies on a plane without end, 60 columns wide. The table seems 5% farther."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    plane_m = 1.0 + (HEIGHT - 1 - rows) / HEIGHT
+    plate = plate_of(plate_rgb(), replace(LENS, focus_distance_m=1.5), np.where(columns < 80, plane_m * 1.05, np.float32(8.0)))
+    alpha = ((abs(rows - 60) < 10) & (abs(columns - 90) < 30)).astype(np.float32)
+    shadow = Layer(np.zeros((HEIGHT, WIDTH, 3), np.float32), alpha, np.where(alpha > 0, plane_m, np.inf).astype(np.float32))
+    card = replace(shadow, rgb=np.repeat(alpha[..., None], 3, axis=2))
+    _, (on_table, stands) = on_the_ground(plate, (65, 60), [shadow, card])
+    np.testing.assert_array_equal(on_table.alpha, alpha * (columns < 80))
+    assert stands is card
 
 
 @pytest.mark.parametrize(
@@ -288,3 +301,23 @@ def test_spaces_of_opencolorio_come_in_and_go_out(files: Path) -> None:
     np.testing.assert_allclose(out[5, 5], [1.0, 0.0, 0.0], atol=2e-3)  # its header says what it is
     back = put_in(files, "--input-space", "ACEScg", photo="red.exr")
     assert back[5, 5, 0] == pytest.approx(1.705, abs=5e-3) and back[5, 5, 1] < -0.1
+
+
+def test_the_focus_may_be_told_by_a_pixel(files: Path) -> None:
+    depth = ("--depth", files / "depth.exr")
+    np.testing.assert_array_equal(put_in(files, *depth, "--focus-at", "10,10"), put_in(files, *depth, "--focus", 0.8))
+    refused("there is no depth", put_in, files, "--focus-at", "10,10")
+    refused("not both", put_in, files, *depth, "--focus-at", "10,10", "--focus", 0.8)
+
+
+def test_an_object_beside_the_frame_is_a_mistake_and_an_empty_layer_is_told(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    refused("by --at 9,0,1 it stands beside the frame", put_in, files, "--object", CAKE, "--at", "9,0,1", card=None)
+    assert not list(files.glob("out*"))
+    write_layer(files / "empty.exr", Layer(np.zeros((HEIGHT, WIDTH, 3), np.float32), *np.zeros((2, HEIGHT, WIDTH), np.float32)))
+    np.testing.assert_allclose(put_in(files, card="empty.exr"), plate_rgb(), atol=2e-3)
+
+
+def test_what_is_told_of_a_phones_lens_is_no_f_number(shared_data: Path, tmp_path: Path) -> None:
+    words = ("--object", CAKE, "--at-pixel", "380,700", "--height", "200px", "--out", tmp_path / "out.png")
+    done = mrbokeh("composite", shared_data / "rgbd" / "phone_lens_blur_gdepth.jpg", *words)
+    assert done.returncode == 0 and "the phone's own blur, focused at" in done.stdout and "f/" not in done.stdout, done.stderr
