@@ -130,7 +130,7 @@ def test_the_ground_never_hides_what_stands_on_it_and_a_post_before_it_does() ->
 
 
 def test_a_shadow_ends_where_the_table_ends() -> None:
-    """A table to column 80 and a wall at 8 m beyond: the shadow lies on a plane without end, 60 columns wide. The table seems 5% farther."""
+    """A table to column 80 and a wall at 8 m beyond: the shadow lies on a plane without end, 60 columns wide. It seems 5% farther."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     plane_m = 1.0 + (HEIGHT - 1 - rows) / HEIGHT
     plate = plate_of(plate_rgb(), replace(LENS, focus_distance_m=1.5), np.where(columns < 80, plane_m * 1.05, np.float32(8.0)))
