@@ -104,7 +104,7 @@ def watch(driver: "CameraDriver", spot: "Spot | None") -> None:
 
     from capture.tether.live_view import enter_pressed, show_live
 
-    show_live(driver, enter_pressed(), Console(), spot)
+    show_live(driver, enter_pressed(), Console(stderr=True), spot)
 
 
 def measured(

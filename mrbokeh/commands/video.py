@@ -26,7 +26,7 @@ from mrbokeh.shots.render_shot import SequenceTarget, VideoTarget, render_shot
 from mrbokeh.shots.shot import SEGMENT_S, Shot, Target
 from mrbokeh.stacks.photograph import SensorOrientation, lens_for_orientation
 from mrbokeh.system.atomic_files import require_safe_outputs
-from mrbokeh.system.channel import tell, warn
+from mrbokeh.system.channel import guess, tell, warn
 from mrbokeh.system.console import kept_when_interrupted, progress_bars
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import cores
@@ -274,13 +274,13 @@ def video(
     virtual: VirtualOptions,
     rendering: RenderingOptions,
     look: LookGroup,
-    lens: LensOption,
     facts: LensFacts,
     blur: BlurOptions,
     out: OutOption,
     colour: ColourOptions,
     result: ResultOptions,
     work: WorkOptions,
+    lens: LensOption = None,
 ) -> None:
     """Blur virtual layers with the lens and put them into each frame in linear light; sound and times are kept.
 
@@ -293,6 +293,8 @@ def video(
     require_safe_outputs((out,), (clip, taken.depth, taken.matte, *virtual.files, rendering.distortion, lens), overwrite=True)
     source = open_source(clip, taken.rate, colour.of_plate)
     recipe = recipe_of(source, lens, facts, taken, virtual, rendering, look, blur, virtual_only=result.virtual_only)
+    if lens is None and not {"focal_length_mm", "f_number"} <= facts.given.keys():
+        guess(f"no whole lens is stated, so that this one is taken: {recipe.stated_lens.described}")
     target = target_of(out, source, recipe, colour, result)
     shot = shot_of(source, recipe, target, taken.frames, work.segment)
     target.require_new(shot, result.overwrite or shot.was_begun)
@@ -302,7 +304,7 @@ def video(
     note = _made(shot, _executor(work, len(shot.segments)), result.overwrite)
     frames = shot.stop - shot.start
     told = f"wrote {out} ({source.info.width_px}x{source.info.height_px} px, {frames} frame{'' if frames == 1 else 's'}, {note})"
-    tell(told, frames=frames, size_px=(source.info.width_px, source.info.height_px))
+    tell(told, known=recipe.stated_lens.facts, frames=frames, size_px=(source.info.width_px, source.info.height_px))
 
 
 def _alpha_lost(clip: Path, source: PictureSource, target: Target) -> str | None:

@@ -310,7 +310,7 @@ def test_the_focus_may_be_told_by_a_pixel(files: Path) -> None:
     refused("not both", put_in, files, *depth, "--focus-at", "10,10", "--focus", 0.8)
 
 
-def test_an_object_beside_the_frame_is_a_mistake_and_an_empty_layer_is_told(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_object_beside_the_frame_is_a_mistake_and_an_empty_layer_is_none(files: Path) -> None:
     refused("by --at 9,0,1 it stands beside the frame", put_in, files, "--object", CAKE, "--at", "9,0,1", card=None)
     assert not list(files.glob("out*"))
     write_layer(files / "empty.exr", Layer(np.zeros((HEIGHT, WIDTH, 3), np.float32), *np.zeros((2, HEIGHT, WIDTH), np.float32)))

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -133,3 +134,14 @@ def test_an_interrupt_ends_within_two_seconds_with_one_line(tmp_path: Path) -> N
         assert run.wait(10) == 130 and time.monotonic() - asked_s < 2.5
         assert run.stderr.read() == "stopped: nothing was written\n"
     assert not list(tmp_path.iterdir())
+
+
+def test_nobody_speaks_past_the_channel() -> None:
+    """A program of its own and the compiler's listener, which kernels depend on, print; tables and bars go to the consoles here."""
+    root = Path(__file__).resolve().parents[2]
+    speaking = {root / "mrbokeh/system" / name for name in ("channel.py", "compiled.py")} | {root / "mrbokeh/cli.py"}
+    speaking.add(root / "capture/poses/colmap_worker.py")
+    for package in ("mrbokeh", "capture", "training", "viewfinder"):
+        for path in sorted((root / package).rglob("*.py")):
+            text = path.read_text(encoding="utf-8")
+            assert path in speaking or not re.search(r"typer\.echo|(?<![.\w])print\(|[^r]Console\(\)", text), path

@@ -169,3 +169,16 @@ def test_autofocus_through_a_tilted_or_curved_field_makes_that_very_pixel_sharp(
     lens = replace(NIKKOR, tilt_rad=tilt_rad, petzval_radius_mm=float(radius_mm)).focused_on(depth_m, 22.5, 6.5)
     assert lens.coc_px(depth_m.astype(np.float64), 30)[6, 22] == pytest.approx(0.0, abs=1e-9)
     assert lens.focus_distance_m != 2.0
+
+
+def test_a_near_focus_says_from_where_it_counts() -> None:
+    """A camera's scale counts from the sensor: 1 / 50 mm = 1 / 360 mm + 1 / 58 mm, and 360 + 58 = 418."""
+    assert Lens(50.0, 2.0, 0.36, 36.0).focus_described == "0.36 m from the lens (0.418 m from the sensor)"
+    assert Lens(50.0, 2.0, 2.0, 36.0).focus_described == "2 m" and Lens(50.0, 2.0).focus_described == "infinity"
+
+
+def test_stated_facts_keep_the_shape_of_the_sensor() -> None:
+    upright = Lens(50.0, 2.0, 1.0, 24.0, sensor_height_mm=36.0)
+    small, dark = upright.stating({"sensor_width_mm": 12.0}), upright.stating({"f_number": 4.0})
+    assert (small.sensor_width_mm, small.sensor_height_mm) == (12.0, 18.0)
+    assert (dark.f_number, dark.sensor_width_mm, dark.sensor_height_mm) == (4.0, 24.0, 36.0)

@@ -50,6 +50,19 @@ def test_a_captured_focus_gives_the_captured_slice_and_others_what_the_lens_give
     np.testing.assert_array_equal(way.slice_at(0.5), way.rendered(0.5))
 
 
+def test_the_lens_and_the_focus_may_be_told_by_facts_and_by_a_pixel(tmp_path: Path) -> None:
+    stack = card_stack(tmp_path / "stack")
+    wide = replace(stack.lens_of(stack.reference), f_number=LENS.f_number / 2, sensor_width_mm=2 * LENS.sensor_width_mm)
+    write_lens(tmp_path / "wide.json", wide)
+    facts = ("--f-number", wide.f_number, "--sensor-width", wide.sensor_width_mm)
+    run(stack.folder, "--focus", "@5,5", "--lens", tmp_path / "wide.json", "--out", tmp_path / "by_file")
+    run(stack.folder, "--focus-at", "5,5", *facts, "--out", tmp_path / "by_facts")
+    by_file, by_facts = (read_focal_stack(tmp_path / name) for name in ("by_file", "by_facts"))
+    assert by_facts.focus_distances_m == pytest.approx(by_file.focus_distances_m)
+    np.testing.assert_allclose(by_facts.slice_rgb(0), by_file.slice_rgb(0), atol=1e-5)
+    refused("where to focus", run, stack.folder, "--out", tmp_path / "no")
+
+
 def test_nothing_pops_where_a_focus_pull_passes_a_captured_slice(tmp_path: Path) -> None:
     """The slice in the middle is 3 % brighter than its lens would make it. With residuals its neighbourhood is too; without, nothing is."""
     stack = card_stack(tmp_path / "stack")

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 from mrbokeh.cli import app as everything
 from mrbokeh.commands.render import app
 from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.images.image_io import read_image, read_layer, write_layer
+from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.lens_file import read_lens
@@ -62,6 +62,15 @@ def test_a_lens_can_be_told_in_options_instead_of_a_file(folder: Path) -> None:
     assert np.array_equal(by_file, by_options)
     wide = read_image(run(folder, *picture, "--sensor-width", "12", "--f-number", "16", out="wide.exr"))
     assert psnr(wide, by_options) < 40.0, "the f-number is heard"
+
+
+def test_depth_may_be_even_in_dioptres(folder: Path) -> None:
+    """White is 1 m, black infinity: half of it is 2 m."""
+    levels = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
+    levels[:, WIDTH // 2 :] = 0.0
+    write_image(folder / "levels.png", levels, "linear")
+    words = ("--rgb", "aif.exr", "--depth", "levels.png", "--disparity", "1:inf", "--lens", "lens.json", "--renderer", "scatter")
+    np.testing.assert_allclose(read_image(run(folder, *words)), read_image(run(folder, *PICTURE, out="metres.exr")), atol=2e-3)
 
 
 def test_a_picture_with_depth_is_what_the_library_renders(folder: Path) -> None:

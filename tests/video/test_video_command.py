@@ -152,6 +152,21 @@ def test_ctrl_c_keeps_finished_segments_and_the_same_command_goes_on(clip: Path,
     assert [file.name for file in out.parent.iterdir()] == ["out.mp4"] and len(list(read_frames(out))) == 12
 
 
+def test_facts_of_the_lens_may_stand_in_options(clip: Path, settings: list[str], tmp_path: Path) -> None:
+    """All of them in place of a file; the focus also by a pixel, on depth that is even in 1/distance."""
+    facts = ["--focal-length", "50", "--f-number", "2", "--sensor-width", "6", "--layer", tmp_path / "layer.exr", "--renderer", "scatter"]
+    write_image(tmp_path / "near.png", np.full((64, 96, 3), 0.5, np.float32), "linear")  # 2 m
+    near = ["--depth", tmp_path / "near.png", "--disparity", "1:inf", "--mode", "front"]
+    run(clip, *settings, "--renderer", "scatter", "--mode", "front", "--out", tmp_path / "by_file.mkv")
+    run(clip, *facts, "--focus", "2", "--mode", "front", "--out", tmp_path / "by_options.mkv")
+    run(clip, *facts, *near, "--focus-at", "48,32", "--out", tmp_path / "by_pixel.mkv")
+    by_file, by_options, by_pixel = (list(read_frames(tmp_path / f"by_{way}.mkv")) for way in ("file", "options", "pixel"))
+    np.testing.assert_array_equal(by_file[5].rgb, by_options[5].rgb)
+    np.testing.assert_allclose(by_pixel[5].rgb, by_file[5].rgb, atol=2e-3)  # the picture of disparity has 65536 steps
+    refused("not both", run, clip, *facts, "--focus", "2", "--focus-pull", "0:1", "--out", tmp_path / "no.mkv")
+    refused("there is no depth", run, clip, *facts, "--focus-at", "1,1", "--out", tmp_path / "no.mkv")
+
+
 def test_the_focus_is_pulled(clip: Path, settings: list[str], tmp_path: Path) -> None:
     """Each frame is blurred as by the lens at its own focus; between keys focus goes smoothly in dioptres (tracking.camera_track)."""
     out = tmp_path / "out.mkv"
