@@ -5,7 +5,7 @@ RUN := $(VENV)/bin
 READY := $(VENV)/.installed
 OUT ?= demo_out
 
-.PHONY: demo gallery test test-slow test-browser check bench wheel clean
+.PHONY: demo gallery docs test test-slow test-browser check bench wheel clean
 
 demo: $(READY)
 	$(RUN)/mrbokeh demo --out $(OUT)
@@ -14,13 +14,19 @@ gallery: $(READY)
 	$(RUN)/mrbokeh demo --out $(OUT)
 	$(RUN)/python -m datasets_scripts.gallery gallery_out --demo $(OUT)
 
+# Pages of the whole checkout, so that their links are those of the forge; docs_out/index.html leads to the map.
+docs: $(READY)
+	$(RUN)/python -m pip install --quiet --constraint constraints.txt --editable ".[docs]"
+	$(RUN)/python -m sphinx --fail-on-warning --keep-going --quiet --conf-dir docs . docs_out
+	echo '<meta http-equiv="refresh" content="0; url=docs/index.html">' > docs_out/index.html
+
 # Two workers and many processes start from the same sources: what Python compiles of them is kept, whatever the environment says.
 test: export PYTHONDONTWRITEBYTECODE =
 test: $(READY)
 	$(RUN)/python -m pytest -n 2 --dist worksteal -m "not slow" --durations 30 --durations-min 1
 
 test-slow: $(READY)
-	$(RUN)/python -m pip install --quiet --constraint constraints.txt --editable ".[all,dev,datasets]"
+	$(RUN)/python -m pip install --quiet --constraint constraints.txt --editable ".[all,dev,datasets,docs]"
 	$(RUN)/python -m pytest -m slow
 
 test-browser: $(READY)
@@ -52,8 +58,9 @@ wheel: $(READY)
 $(READY): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(RUN)/python -m pip install --quiet --upgrade pip
-	$(RUN)/python -m pip install --quiet --constraint constraints.txt --editable ".[all,dev]"
+	$(RUN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable ".[all,dev]"
+	-$(RUN)/python -m compileall -qq -j 0 $(VENV)/lib  # what pip does on one core
 	touch $@
 
 clean:
-	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf $(VENV) build dist docs_out *.egg-info .pytest_cache .mypy_cache .ruff_cache
