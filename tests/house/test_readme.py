@@ -1,22 +1,20 @@
-"""What README and guides promise: their commands exist with those options, their files exist, the Python runs, pages stay short."""
+"""What all pages promise: their commands exist with those options, their files exist, the Python runs, pages stay short."""
 
 import re
 from functools import cache
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from typer.main import get_command
 
 import mrbokeh as mb
-from mrbokeh.cli import SUB_COMMANDS
+from mrbokeh.cli import command_of
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-GUIDES = sorted((ROOT / "docs").glob("*.md"))
-PAGES = {path: path.read_text(encoding="utf-8") for path in (ROOT / "README.md", ROOT / "ARCHITECTURE.md", *GUIDES)}
+GUIDES = sorted((ROOT / "docs").rglob("*.md"))
+PAGES = {path: path.read_text(encoding="utf-8") for path in (*ROOT.glob("*.md"), *GUIDES)}
 LONGEST_PAGE_BYTES = 8000
 
 
@@ -25,13 +23,14 @@ def blocks(language: str) -> list[str]:
 
 
 def shell_lines() -> list[str]:
-    return [line.split("#")[0].strip() for block in blocks("sh") for line in block.splitlines() if line.split("#")[0].strip()]
+    lines = (line.split("#")[0].strip() for block in blocks("sh") for line in block.replace("\\\n", " ").splitlines())
+    return [line for line in lines if line]
 
 
 @cache
 def options_of(name: str, *rest: str) -> set[str]:
     """Return the options of a command or, where its group has such a sub-command, of that."""
-    command: Any = get_command(import_module(SUB_COMMANDS[name].module).app)
+    command: Any = command_of(name)
     for word in rest if hasattr(command, "commands") else ():
         command = command.commands[word]
     return {option for each in command.params for option in (*each.opts, *each.secondary_opts)} | {"--help"}

@@ -1,6 +1,6 @@
 """Layered reconstruction of defocus and motion blur from few samples of the light field.
 
-Munkberg et al. 2014 with the improvements of Hasselgren et al. 2015; docs/layered_reconstruction.md derives the filter.
+Munkberg et al. 2014 with the improvements of Hasselgren et al. 2015; docs/methods/layered_reconstruction.md derives the filter.
 
 1. Samples are sorted into tiles, depth buckets and cells of motion; buckets of a tile with like filters become one partition, and
    those that can hardly be seen join one.

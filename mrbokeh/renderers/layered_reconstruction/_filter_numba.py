@@ -1,4 +1,4 @@
-"""Compiled reprojection and filter formulas of layered reconstruction; docs/layered_reconstruction.md derives every line.
+"""Compiled reprojection and filter formulas of layered reconstruction; docs/methods/layered_reconstruction.md derives every line.
 
 Samples go tile by tile, within a tile by pixels in Morton order. The sheared filter of a partition comes from the sums over its
 samples, and the samples around a tile are reprojected along the partition's slopes (Eq. 1).
