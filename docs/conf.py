@@ -14,6 +14,8 @@ myst_heading_anchors = 3
 smartquotes = False  # options begin with two hyphens
 html_theme = "furo"
 html_title = "mrbokeh"
+html_static_path = ["site"]
+html_css_files = ["site.css"]
 html_show_sourcelink = html_show_copyright = False
 default_role = "code"
 autodoc_typehints = "description"
