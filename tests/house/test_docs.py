@@ -60,7 +60,7 @@ def test_tutorials_begin_with_what_comes_out() -> None:
 def test_tutorials_run(page: Path, tmp_path: Path) -> None:
     """All but the viewfinder, which runs until it is stopped, and what needs Mitsuba where there is none."""
     script = SHELL
-    for language, block in re.findall(r"```(sh|python)\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
+    for language, block in re.findall(r"```(sh|python)\n(.*?)```", page.read_text(encoding="utf-8").replace("\\\n", ""), re.DOTALL):
         script += f"python <<'END'\n{block}END\n" if language == "python" else block
     left_out = r"mrbokeh viewfinder (?!board)" + ("" if find_spec("mitsuba") else r"|python -m datasets_scripts.bokeh_stacks")
     script = re.sub(rf"^(?:{left_out}).*\n", "", script, flags=re.MULTILINE)
