@@ -139,10 +139,12 @@ class Aperture:
 
     @property
     def varies_over_field(self) -> bool:
+        """Return whether the pupil looks different from different places in the frame."""
         return self.cat_eye != 0.0 or any(self.lateral_chromatic)
 
     @property
     def is_chromatic(self) -> bool:
+        """Return whether blur differs from colour to colour."""
         return any(self.axial_chromatic) or any(self.lateral_chromatic)
 
     def channel_scale(self, side: int) -> PerColour:

@@ -53,6 +53,7 @@ class Camera:
 
     @property
     def world_from_camera(self) -> Float[np.ndarray, "4 4"]:
+        """Return (4, 4), the inverse of camera_from_world; its last column is where the camera stands."""
         return np.linalg.inv(self.camera_from_world)
 
     def project(self, points_m: Float[np.ndarray, "*batch 3"]) -> tuple[Float[np.ndarray, "*batch 2"], Float[np.ndarray, "*batch"]]:

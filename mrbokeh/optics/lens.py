@@ -94,6 +94,7 @@ class Lens:
 
     @property
     def aperture_diameter_mm(self) -> float:
+        """Return the diameter of the entrance pupil, focal length over f-number."""
         return self.focal_length_mm / self.f_number
 
     @property
@@ -117,6 +118,7 @@ class Lens:
         return replace(self, **{"sensor_height_mm": height_mm, **facts})  # type: ignore[arg-type]
 
     def focused_at(self, focus_distance_m: float) -> "Lens":
+        """Return the same lens focused at a distance in metres; inf is allowed."""
         return replace(self, focus_distance_m=float(focus_distance_m))
 
     def focused_on(self, depth_m: Float[np.ndarray, "height width"], x_px: float, y_px: float, radius_px: float = 0.0) -> "Lens":

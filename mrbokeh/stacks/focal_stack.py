@@ -52,7 +52,7 @@ class FocalStack:
 
     lens: the lens with the focus of the reference slice, or None where focal length, f-number or sensor are unknown.
     camera: intrinsics of the registered pictures, or None.
-    registered: the slices share the geometry of the all-in-focus image.
+    reference: the slice whose geometry the others were registered to. registered: the slices share it, as the all-in-focus image does.
     rec709_from_camera: linear Rec.709 from the camera RGB in which slices and all-in-focus image are stored; None: they are Rec.709.
     """
 
@@ -71,6 +71,7 @@ class FocalStack:
 
     @property
     def focus_distances_m(self) -> tuple[float | None, ...]:
+        """Return the focus distance of each slice in metres from the lens, None where it is unknown."""
         return tuple(each.focus_distance_m for each in self.slices)
 
     @property
@@ -84,9 +85,11 @@ class FocalStack:
         return bool((self.metadata.get(METRES) or {}).get("known", True))
 
     def slice_camera_rgb(self, index: int) -> Float32[np.ndarray, "height width 3"]:
+        """Read a slice as it is stored: linear, white-balanced camera RGB."""
         return read_camera_rgb(self.folder / self.slices[index].path)
 
     def iter_camera_rgb(self) -> Iterator[Float32[np.ndarray, "height width 3"]]:
+        """Read the slices one after the other in camera RGB."""
         return (self.slice_camera_rgb(index) for index in range(len(self)))
 
     def slice_rgb(self, index: int) -> Float32[np.ndarray, "height width 3"]:
@@ -94,12 +97,15 @@ class FocalStack:
         return self.to_rec709(self.slice_camera_rgb(index))
 
     def iter_rgb(self) -> Iterator[Float32[np.ndarray, "height width 3"]]:
+        """Read the slices one after the other in linear Rec.709."""
         return (self.slice_rgb(index) for index in range(len(self)))
 
     def slice_masks(self, index: int) -> SliceMasks:
+        """Read where a slice has data, and where it is clipped."""
         return read_slice_masks(self.folder / self.slices[index].path)
 
     def to_rec709(self, camera_rgb: Float32[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
+        """Convert from the camera RGB of this stack to linear Rec.709."""
         return camera_rgb if self.rec709_from_camera is None else convert(camera_rgb, np.array(self.rec709_from_camera))
 
     @property
@@ -115,10 +121,12 @@ class FocalStack:
         return self.folder / "exclusion.exr"
 
     def all_in_focus_camera_rgb(self) -> Float32[np.ndarray, "height width 3"]:
+        """Read the all-in-focus picture in camera RGB. Raises InputError if the stack is not merged."""
         self._require_merged()
         return read_camera_rgb(self.all_in_focus_path)
 
     def all_in_focus(self) -> Float32[np.ndarray, "height width 3"]:
+        """Read the all-in-focus picture in linear Rec.709. Raises InputError if the stack is not merged."""
         return self.to_rec709(self.all_in_focus_camera_rgb())
 
     def exclusions(self) -> dict[str, Bool[np.ndarray, "height width"]]:
@@ -142,6 +150,7 @@ class FocalStack:
         return self._depth_channel("confidence")
 
     def depth_valid(self, least_confidence: float = 0.1) -> Bool[np.ndarray, "height width"]:
+        """Return (H, W) where the depth can be trusted that much."""
         return self.depth_confidence() >= least_confidence
 
     def stated_lens_of(self, index: int) -> Lens:
