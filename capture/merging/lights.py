@@ -172,8 +172,8 @@ def spread_light(codes: Codes) -> Bool[np.ndarray, "slices height width"]:
     """
     full, light = codes >= _FULL_CODE, (codes / np.float32(255.0)) ** 2
     result = np.zeros(codes.shape, bool)
-    _, labels, boxes, _ = cv2.connectedComponentsWithStats(full.any(axis=0).astype(np.uint8), connectivity=8)
-    for number, (x, y, width, height, area) in enumerate(boxes[1:], 1):
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(np.asarray(full.any(axis=0), np.uint8), connectivity=8)
+    for number, (x, y, width, height, area) in enumerate(boxes[1:].tolist(), 1):
         if area <= _LEAST_SPREAD * _LEAST_FULL_PX or max(width, height) > _WIDEST_FULL * codes.shape[2]:
             continue
         around = max(width, height) // 2 + _RIM_PX

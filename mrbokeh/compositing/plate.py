@@ -187,16 +187,17 @@ def on_the_ground(plate: Plate, foot_px: tuple[float, float], layers: Sequence[L
     nearer than the layers; depth that says otherwise is wrong. Shadows (layers without light) are drawn on a plane without end, and stop
     where the ground stops and what is seen lies farther: they would hang sharp in the air over what lies blurred beyond a table's edge.
     """
-    if plate.depth_m is None:
+    seen_m = plate.depth_m
+    if seen_m is None:
         return plate, list(layers)
     covered_m = np.minimum.reduce([np.where(layer.alpha > 0.0, layer.depth_m, np.inf) for layer in layers])
     above = np.broadcast_to(np.arange(len(covered_m))[:, None] <= int(foot_px[1]), covered_m.shape)
-    ground = _same_surface(plate.depth_m, foot_px, above) & np.isfinite(covered_m)
-    depth_m = np.where(ground, np.maximum(plate.depth_m, covered_m), plate.depth_m)
-    beyond = ~_same_surface(plate.depth_m, foot_px, np.isfinite(covered_m))
+    ground = _same_surface(seen_m, foot_px, above) & np.isfinite(covered_m)
+    depth_m = np.where(ground, np.maximum(seen_m, covered_m), seen_m)
+    beyond = ~_same_surface(seen_m, foot_px, np.isfinite(covered_m))
 
     def ended(shadow: Layer) -> Layer:
-        farther = plate.depth_m > shadow.depth_m * np.float32(1.0 + _SAME_SURFACE)
+        farther = seen_m > shadow.depth_m * np.float32(1.0 + _SAME_SURFACE)
         return replace(shadow, alpha=np.where(beyond & farther, np.float32(0.0), shadow.alpha))
 
     return replace(plate, depth_m=depth_m), [layer if layer.rgb.any() else ended(layer) for layer in layers]

@@ -1,11 +1,13 @@
 """The shadow of an object is drawn only where it can fall: what comes out is that of the whole frame."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from mrbokeh.optics.camera import Camera
+from mrbokeh.scene.moving_layers import ShutterTiming
 from mrbokeh.scene.staging.filming import FilmedLayers, Filming
 from mrbokeh.scene.staging.picture_box import shadow_box
 from mrbokeh.scene.staging.scene_description import OneObject
@@ -29,3 +31,20 @@ def test_the_shadow_is_that_of_the_whole_frame(stands_at_m: tuple[float, float, 
     assert rows * columns < 0.8 * 160 * 112
     np.testing.assert_allclose(found.alpha, whole.alpha, atol=1e-6)
     np.testing.assert_allclose(found.depth_m, whole.depth_m, rtol=1e-5)
+
+
+def test_layers_agree_on_motion_where_only_one_of_them_moves() -> None:
+    """The head of the alien is in the picture, its foot and the shadow are not, and the camera goes to the right."""
+    one = OneObject(ALIEN, (0.0, 0.7, 2.0), height_m=0.3, shadow=0.7)
+    filmed = FilmedLayers(Filming("embree", shutter=ShutterTiming(frame_rate=25.0)), one.described(), threads=1)
+
+    def camera_at(time_s: float) -> Camera:
+        seen, shift = one.seen_by(CAMERA), np.eye(4)
+        shift[0, 3] = -time_s
+        return replace(seen, camera_from_world=shift @ seen.camera_from_world)
+
+    alien, shadow = filmed.at(camera_at)
+    assert (alien.alpha > 0).any() and not (shadow.alpha > 0).any()
+    moved_px = alien.extra["motion_px"][alien.alpha == 1.0]
+    np.testing.assert_allclose(moved_px.mean(0), (-220.0 / 2.0 / 50.0, 0.0), atol=0.2)  # focal length, distance, 1/50 s open
+    assert shadow.extra["motion_px"].shape == alien.extra["motion_px"].shape and not shadow.extra["motion_px"].any()

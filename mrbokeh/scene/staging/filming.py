@@ -8,6 +8,7 @@ from jaxtyping import Float32
 
 from mrbokeh.distortion import LensDistortion, distorted, overscan_camera
 from mrbokeh.images.layer import Layer, clear
+from mrbokeh.layering.motion import MOTION, with_motion
 from mrbokeh.layering.pixel_box import Box
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Scene, SceneRenderer
@@ -97,7 +98,10 @@ class FilmedLayers:
         shadow, catcher = self._staged.description.shadow, self._staged.catcher
         if shadow is not None and catcher is not None:
             layers.append(moving_shadow_layer(self._renderer, filmed, time_s, ShadowCatcher(catcher, shadow.strength)))
-        return layers
+        if all(MOTION not in layer.extra for layer in layers):
+            return layers
+        still_px = np.zeros((*layers[0].alpha.shape, 2), np.float32)  # of what was averaged over the shutter, or is out of sight
+        return [layer if MOTION in layer.extra else with_motion(layer, still_px) for layer in layers]
 
     def _objects(self, scene: Scene, camera: Camera) -> Layer:
         """The objects alone; with light on the ground they also see the ground, where the backend follows light so far."""
