@@ -17,6 +17,7 @@ from mrbokeh.images.image_io import INTEGER_SUFFIXES, LINEAR_SUFFIXES, read_imag
 from mrbokeh.images.layer import Layer
 from mrbokeh.images.picture_codec import stored_pixels
 from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
+from mrbokeh.stacks.photograph import is_raw, read_photograph
 from mrbokeh.system.errors import InputError
 
 Rgb = Float32[np.ndarray, "height width 3"]
@@ -67,7 +68,8 @@ LOSSLESS_FILM, LOSSY_FILM = Storage(False, 4.0 * _CODE_STEP_16), Storage(False, 
 class CheckedPicture:
     """Picture to check.
 
-    rgb: linear Rec.709; alpha: None if the file has none; layers by name; time_s: of a frame of a film, else None.
+    rgb: linear Rec.709; alpha: None if the file has none; layers by name; time_s: of a frame of a film, else None. depth_m: of what
+    is seen, inf where that is unknown, or None.
     """
 
     name: str
@@ -76,10 +78,13 @@ class CheckedPicture:
     alpha: Plane | None = None
     layers: Mapping[str, Layer] = field(default_factory=dict)
     time_s: float | None = None
+    depth_m: Plane | None = None
 
 
 def read_picture(path: Path) -> CheckedPicture:
-    """Read an EXR with its layers, or any other picture. Raises InputError if it cannot be read."""
+    """Read an EXR with its layers, RAW as `composite` develops it, or any other picture. Raises InputError if it cannot be read."""
+    if path.suffix.lower() not in _PICTURES:
+        return CheckedPicture(path.name, read_photograph(path).rgb, Storage(True, 0.0))
     if path.suffix.lower() != ".exr":
         return CheckedPicture(path.name, read_image(path), _integer_storage(path))
     parts = read_exr(path)
@@ -92,6 +97,7 @@ def read_picture(path: Path) -> CheckedPicture:
         storage=Storage(True, _HALF_STEP if is_half else 0.0),
         alpha=layer.alpha if has_alpha else None,
         layers=_layers(parts),
+        depth_m=layer.depth_m,
     )
 
 
@@ -161,7 +167,7 @@ def open_shot(path: Path) -> Shot:
         raise InputError(f"expected a picture, a folder of pictures, a focal stack or a film at {path}, but there is nothing")
     if path.is_dir():
         return _stack(path) if (path / FILE_NAME).is_file() else _numbered(path)
-    if path.suffix.lower() in _PICTURES:
+    if path.suffix.lower() in _PICTURES or is_raw(path):
         return Shot(path=path, numbers=(0,), missing=(), is_sequence=False, pictures=lambda: iter([read_picture(path)]))
     return _film(path)
 

@@ -81,6 +81,7 @@ ALPHA_SLACK = 1e-3
 """Error allowed for half floats and sums of weights."""
 DARK_SLACK = 1e-4
 _BORDER_PX = 2
+_SAME_DEPTH = 1e-3
 
 
 def check_numbers(report: CheckReport, picture: CheckedPicture, plate_rgb: Rgb | None) -> None:
@@ -127,8 +128,7 @@ def _note(
 def check_energy(report: CheckReport, picture: CheckedPicture, tolerance: float) -> None:
     """Compare the light of the virtual layer before and after the blur.
 
-    More is a finding; less only if no light can have left the frame. The sharp layer must be the one that was blurred, without what the
-    scene hides.
+    More is a finding; less only if no light can have left the frame, and nothing of the layer is hidden, as the picture's depth tells.
     """
     sharp, blurred = picture.layers.get(SHARP), picture.layers.get(VIRTUAL)
     if sharp is None or blurred is None:
@@ -140,7 +140,7 @@ def check_energy(report: CheckReport, picture: CheckedPicture, tolerance: float)
         ratio = after / before if before > 0 else (1.0 if after == 0 else float("inf"))
         report.raise_measure(f"largest {what} after over before", ratio)
         report.measures[f"smallest {what} after over before"] = min(ratio, report.measures.get(f"smallest {what} after over before", ratio))
-        lost = ratio < 1.0 - tolerance and not _leaves_the_frame(blurred)
+        lost = ratio < 1.0 - tolerance and not _leaves_the_frame(blurred) and not _is_hidden(sharp, picture.depth_m)
         if ratio > 1.0 + tolerance or lost or not np.isfinite(ratio):
             sentence = f"{what} of the virtual layer was {before:.6g} before the blur and is {after:.6g} after it ({ratio - 1:+.2%})"
             report.findings.append(
@@ -156,6 +156,11 @@ def _leaves_the_frame(layer: Layer) -> bool:
     lit = (layer.alpha > 0) | (layer.rgb > 0).any(axis=2)
     inner = lit[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX]
     return int(lit.sum()) > int(inner.sum())
+
+
+def _is_hidden(sharp: Layer, depth_m: Plane | None) -> bool:
+    drawn = (sharp.alpha > 0) & np.isfinite(sharp.depth_m)
+    return depth_m is not None and bool((depth_m[drawn] < sharp.depth_m[drawn] * np.float32(1.0 - _SAME_DEPTH)).any())
 
 
 Mask = Bool[np.ndarray, "height width"]

@@ -94,6 +94,11 @@ class Photograph:
         return f"{path} of {width_px}x{height_px} px was cut out of {self.cut_from_px[0]}x{self.cut_from_px[1]} px, as its EXIF tells"
 
 
+def is_raw(path: Path) -> bool:
+    """Return whether a file is RAW, by its suffix."""
+    return bool(import_module(_READER).is_raw(path))
+
+
 def read_photograph(path: Path | str) -> Photograph:
     """Read a RAW file, JPEG, TIFF, PNG, WebP, EXR or HDR.
 

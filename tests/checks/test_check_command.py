@@ -15,6 +15,7 @@ from mrbokeh.checks.picture_checks import reach_of_sharp
 from mrbokeh.commands.check import app
 from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.compositing.plate import plate_of
+from mrbokeh.demo.plan import DATA
 from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.image_io import write_image, write_layer
@@ -160,6 +161,15 @@ def test_light_made_or_lost_is_found_but_not_what_leaves_the_frame(files: dict[s
     radius_px = float(abs(LENS.coc_px(1.2, SIZE[1]))) / 2
     columns = np.flatnonzero(reached[24])
     assert columns[0] == pytest.approx(28 - radius_px - 1.5, abs=1.0) and columns[-1] == pytest.approx(43 + radius_px + 1.5, abs=1.0)
+
+
+def test_what_the_photograph_hides_is_not_lost_in_a_composite_of_a_raw_file(tmp_path: Path) -> None:
+    """A cake behind a ball of the desk, over a RAW file: its pixels are half floats in the EXR, and the plate is developed again."""
+    photo, depth = (DATA / "raw_stack" / name for name in ("view_0/slice_02.dng", "truth/view_0/depth.exr"))
+    cake = ("--object", DATA / "objects" / "cakeBirthday.glb", "--at-pixel", "190,265", "--height", "0.1", "--pitch", "10")
+    assert mrbokeh("composite", photo, "--depth", depth, *cake, "--out", tmp_path / "cake.exr").returncode == 0
+    document = found_by(tmp_path / "cake.exr", "--against", photo, expected=0)
+    assert document["measures"]["smallest light after over before"] < 0.9 and document["skipped"] == {}
 
 
 def test_pixels_changed_out_of_reach_are_counted_and_mapped(files: dict[str, Path]) -> None:
