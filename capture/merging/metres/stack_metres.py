@@ -2,7 +2,8 @@
 
 Its dioptres are known up to D' = p + q D, for blur in pixels is the same with px_per_dioptre / q. The rule: what the photographs state
 stays (a stated lens fixes q = 1, a stated focus distance counts as one more fact); the facts told fix the rest by least squares of their
-relative errors; and where facts lie at one depth only, the world is scaled as a whole (p = 0), which keeps proportions that are guessed.
+relative errors; and where there is one fact, or all lie at one depth, the world is scaled as a whole (p = 0), which keeps proportions that are
+guessed.
 The same holds where a slice is stated at infinity, which stays there: then one fact gives all.
 Blur looks alike on both sides of the focus: where merging had to guess which end of the sweep is near, facts at two depths tell (q < 0).
 """
@@ -141,7 +142,7 @@ def lines_of(done: ScaledStack) -> list[str]:
     """Return lines that tell people what was found."""
     distances_m = [each for each in done.stack.focus_distances_m if each is not None]
     facts = metres_facts(done.stack)
-    lines = [f"{done.stack.folder}: focused from {min(distances_m):.4g} m to {max(distances_m):.4g} m, {facts['why']}"]
+    lines = [f"{done.stack.folder}: focused from {min(distances_m):.4g} m to {max(distances_m):.4g} m from the lens, {facts['why']}"]
     guessed = guesses(done.stack)
     lines += [f"{done.stack.folder}: still guessed: {guessed}"] if guessed else []
     off = [f"{fact} by {100 * error:+.1f} %" for fact, error in done.errors if abs(error) > _CONTRADICTS]
@@ -179,7 +180,7 @@ def _solution(equations: Sequence[_Equation], stated: Float[np.ndarray, " slices
     alone = np.array([*(each.dioptres.mean() * each.metres(0.0, 1.0) / each.fact.metres for each in equations), *finite])
     deep = float(np.ptp(np.concatenate([seen, *(each.dioptres for each in equations)]))) * gauge["px_per_dioptre"]
     at_infinity, by_lens = len(finite) < len(stated), gauge["scale_from"] == "lens"
-    if not by_lens and (at_infinity or deep < _LEAST_SPREAD_PX):
+    if not by_lens and (at_infinity or deep < _LEAST_SPREAD_PX or len(seen) < 2):
         return _Solution(0.0, float(np.exp(np.mean(np.log(alone / seen)))), deep=at_infinity, directed=False)
     apart = float(np.ptp(seen)) * gauge["px_per_dioptre"] >= _LEAST_SPREAD_PX
     slope = float(np.polyfit(seen, alone, 1)[0]) if apart else 1.0
