@@ -13,7 +13,7 @@ import numpy as np
 from mrbokeh.commands._composite_options import LensOptions, ObjectOptions, PlateOptions, RenderingOptions, ResultOptions
 from mrbokeh.commands._insertion_options import ColourOptions, LookGroup, VirtualOptions
 from mrbokeh.compositing.near_and_far import nearer_than
-from mrbokeh.compositing.plate import Inserted, Plate, bundle_plate, open_plate, with_depth, with_matte, with_own_alpha
+from mrbokeh.compositing.plate import Inserted, Plate, bundle_plate, ended_shadow, open_plate, with_depth, with_matte, with_own_alpha
 from mrbokeh.depth.depth_map import DepthSettings, parse_near_far
 from mrbokeh.images.alpha_io import HOLDING_ALPHA, alpha_with
 from mrbokeh.images.color_management import NamedSpace
@@ -311,7 +311,16 @@ def _object_layers(glb: Path, options: ObjectOptions, rendering: RenderingOption
         light=light,
         shadow=options.shadow,
     )
-    return _filmed(one.described(), rendering, lambda plate: one.seen_by(plate.camera))
+    filmed = _filmed(one.described(), rendering, lambda plate: one.seen_by(plate.camera))
+    if not options.at_pixel:
+        return filmed
+    foot_px = pair_of(options.at_pixel)
+
+    def on_the_ground(plate: Plate) -> list[Layer]:
+        objects, *caught = filmed(plate)
+        return [objects, *(ended_shadow(plate, foot_px, objects, each) for each in caught)]
+
+    return on_the_ground
 
 
 def _height_m(text: str | None, plate: Plate, depth_m: float) -> float | None:

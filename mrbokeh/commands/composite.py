@@ -58,7 +58,7 @@ def composite(
         write_results,
     )
     from mrbokeh.compositing.choose import best_mode, insertion_of
-    from mrbokeh.compositing.plate import on_the_ground
+    from mrbokeh.compositing.plate import with_ground_behind
     from mrbokeh.compositing.plate_look.finishing import finished, finishing_of
     from mrbokeh.renderers.choose import lens_and_renderer
     from mrbokeh.stacks.capture_bundle import is_bundle, read_bundle
@@ -98,7 +98,7 @@ def composite(
     if not any((layer.alpha > 0).any() for layer in sharp):
         nothing_seen(standing, virtual)
     if standing.at_pixel:
-        plate, sharp = on_the_ground(plate, pair_of(standing.at_pixel), sharp)
+        plate = with_ground_behind(plate, pair_of(standing.at_pixel), sharp)
     if standing.object_ is not None and (warning := placing_warning(sharp, plate, mode, standing.height)):
         warn(warning)
     with working("blurring"):

@@ -81,7 +81,7 @@ def composite(
     from mrbokeh.commands._composite_parts import layers_by, standing_on_pixel
     from mrbokeh.commands._insertion_options import VirtualOptions
     from mrbokeh.compositing.choose import best_mode, insertion_of
-    from mrbokeh.compositing.plate import on_the_ground, open_plate, plate_of, with_depth
+    from mrbokeh.compositing.plate import open_plate, plate_of, with_depth, with_ground_behind
     from mrbokeh.depth.depth_map import DepthSettings
     from mrbokeh.images.image_io import read_layer
 
@@ -112,7 +112,7 @@ def composite(
         layers = [each if isinstance(each, Layer) else read_layer(each) for each in given]
         layers = layers if at_pixel is None else standing_on_pixel(layers, plate, *at_pixel)
     if at_pixel is not None:
-        plate, layers = on_the_ground(plate, at_pixel, layers)
+        plate = with_ground_behind(plate, at_pixel, layers)
     return insertion_of(mode or best_mode(plate)).insert(plate, layers, _renderer(renderer)).rgb
 
 
