@@ -175,8 +175,8 @@ def with_depth(plate: Plate, source: Path, settings: DepthSettings) -> Plate:
     return replace(plate, depth_m=depth.depth_m)
 
 
-_SAME_SURFACE = 0.02
-"""Largest share by which depth changes from pixel to pixel of one surface."""
+_SAME_SURFACE, _SURELY_SAME = 0.02, 0.01
+"""Largest shares by which depth changes from pixel to pixel of one surface: along a table, and where no edge may be missed."""
 _FARTHER = 0.05
 _FOUND = 2
 
@@ -191,7 +191,7 @@ def with_ground_behind(plate: Plate, foot_px: tuple[float, float], layers: Seque
         return plate
     covered_m = np.minimum.reduce([np.where(layer.alpha > 0.0, layer.depth_m, np.inf) for layer in layers])
     above = np.broadcast_to(np.arange(len(covered_m))[:, None] <= int(foot_px[1]), covered_m.shape)
-    ground = _same_surface(plate.depth_m, foot_px, above) & np.isfinite(covered_m)
+    ground = _same_surface(plate.depth_m, foot_px, above, _SAME_SURFACE) & np.isfinite(covered_m)
     return replace(plate, depth_m=np.where(ground, np.maximum(plate.depth_m, covered_m), plate.depth_m))
 
 
@@ -204,17 +204,21 @@ def ended_shadow(plate: Plate, foot_px: tuple[float, float], objects: Layer, sha
     covered = (objects.alpha > 0.0) | (shadow.alpha > 0.0)
     if plate.depth_m is None or not shadow.alpha.any():
         return shadow
-    beside = _same_surface(np.ones_like(plate.depth_m), foot_px, covered)
-    beyond = beside & ~_same_surface(plate.depth_m, foot_px, covered) & (plate.depth_m > shadow.depth_m * np.float32(1.0 + _FARTHER))
+    beside = _same_surface(np.ones_like(plate.depth_m), foot_px, covered, _SURELY_SAME)
+    beyond = (
+        beside
+        & ~_same_surface(plate.depth_m, foot_px, covered, _SURELY_SAME)
+        & (plate.depth_m > shadow.depth_m * np.float32(1.0 + _FARTHER))
+    )
     return replace(
         shadow, alpha=np.where(beyond, np.float32(0.0), shadow.alpha), rgb=np.where(beyond[..., None], np.float32(0.0), shadow.rgb)
     )
 
 
 def _same_surface(
-    depth_m: Float32[np.ndarray, "height width"], start_px: tuple[float, float], within: Bool[np.ndarray, "height width"]
+    depth_m: Float32[np.ndarray, "height width"], start_px: tuple[float, float], within: Bool[np.ndarray, "height width"], step: float
 ) -> Bool[np.ndarray, "height width"]:
-    """Return the pixels (H, W) that are reached from one of them without a jump of depth and without leaving a mask.
+    """Return the pixels (H, W) that are reached from one of them without a jump of depth by more than a share, and within a mask.
 
     Noise of single pixels is no jump: depth is that of the median of 5x5 pixels.
     """
@@ -224,7 +228,7 @@ def _same_surface(
     found = cv2.copyMakeBorder((~within).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
     found[y_px + 1, x_px + 1] = 0
     logs = cv2.medianBlur(np.log(np.minimum(depth_m, np.float32(1e6))), 5)
-    cv2.floodFill(logs, found, (x_px, y_px), 0.0, _SAME_SURFACE, _SAME_SURFACE, 4 | (_FOUND << 8) | cv2.FLOODFILL_MASK_ONLY)
+    cv2.floodFill(logs, found, (x_px, y_px), 0.0, step, step, 4 | (_FOUND << 8) | cv2.FLOODFILL_MASK_ONLY)
     return found[1:-1, 1:-1] == _FOUND
 
 
