@@ -6,10 +6,11 @@ import signal
 import sys
 import tempfile
 import traceback
-from contextlib import redirect_stderr, suppress
+from collections.abc import Callable
+from contextlib import ExitStack, redirect_stderr, suppress
 from importlib import import_module
 from pathlib import Path
-from threading import Timer
+from threading import Lock, Timer
 from types import FrameType
 from typing import Annotated, Any, NamedTuple
 
@@ -111,16 +112,23 @@ def _heard(command: Any, path: str) -> None:
     def run(quiet: bool, as_json: bool, log: Path | None, **given: Any) -> None:  # noqa: ARG001
         speaking = channel()
         paths: dict[str, Any] = {}
-        for name, value in ((name.rstrip("_"), value) for name, value in given.items()):
-            there = [each for each in (value if isinstance(value, list | tuple) else [value]) if isinstance(each, Path) and each.exists()]
-            paths |= {name: there if isinstance(value, list) else there[0]} if there else {}
-            if log is not None and log.exists() and any(each.exists() and each.samefile(log) for each in there):
-                raise InputError(f"--log {log} would be written into what --{name.replace('_', '-')} names: give it another name")
+        for parameter in (each for each in command.params if each.name in given):
+            value = given[parameter.name]
+            named = [each for each in (value if isinstance(value, list | tuple) else [value]) if isinstance(each, Path)]
+            if log is not None and os.path.realpath(log) in map(os.path.realpath, named):
+                option = parameter.opts[0] if parameter.opts[0].startswith("-") else parameter.name.upper()
+                raise InputError(f"--log {log} would be written into what {option} names: give it another name")
+            there = [each for each in named if each.exists() and parameter.name != "out"]
+            paths |= {parameter.name.rstrip("_"): there if isinstance(value, list) else there[0]} if there else {}
         speaking.command, speaking.inputs, speaking.quiet = path, paths, speaking.quiet or quiet
-        if log is not None:
-            speaking.log = log.open("a", encoding="utf-8", errors="backslashreplace")
+        if log is not None:  # which nobody else may read: it holds tokens and addresses with passwords
+            opened_log = os.open(log, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+            speaking.log = os.fdopen(opened_log, "a", encoding="utf-8", errors="backslashreplace")
             speaking.said(" ".join(["mrbokeh", *sys.argv[1:]]))
-        with writing_alone(_written_to(given)), open(os.devnull, "w") as nobody, redirect_stderr(nobody if quiet else sys.stderr):
+        with ExitStack() as held:
+            if speaking.quiet:
+                held.enter_context(redirect_stderr(held.enter_context(open(os.devnull, "w"))))
+            held.enter_context(writing_alone(_written_to(given)))
             callback(**given)
 
     command.callback = run
@@ -170,19 +178,25 @@ def _root(
 
 def main() -> None:
     """Run the console script: mistakes of the user end in one sentence and exit code 2, faults of ours in one and exit code 1."""
-    interrupted, wants_object = _noted_interrupts(), "--json" in sys.argv[1:]
+    wants_object, err, speaking = "--json" in sys.argv[1:], sys.stderr, Lock()
     with opened(), object_on_stdout(wants_object) as out:
-        code, error = _run(wants_object, interrupted)
-        interrupted.clear()
-        if error:
-            _complain(error)
-        try:
-            if wants_object:
-                write_object(out, code, error)
-            out.flush()
-        except OSError:  # a pipe that nobody reads any more, or a full disk
-            os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())
-            code = code or FAULT
+
+        def ended(code: int, error: str) -> int:
+            """Say the last words, unless another thread does, and return the exit code."""
+            if not speaking.acquire(timeout=0.5):
+                return code
+            if error:
+                _complain(error, err, stopped=code >= INTERRUPTED)
+            try:
+                if wants_object:
+                    write_object(out, code, error)
+                out.flush()
+            except OSError:  # a pipe that nobody reads any more, or a full disk
+                os.dup2(os.open(os.devnull, os.O_WRONLY), out.fileno())
+                code = code or FAULT
+            return code
+
+        code = ended(*_run(wants_object, _noted_interrupts(lambda: ended(INTERRUPTED, _stopped()))))
     sys.exit(code)
 
 
@@ -202,7 +216,7 @@ def _run(wants_object: bool, interrupted: list[int]) -> tuple[int, str]:
             return FAULT, _fault(error)
         code = INTERRUPTED
     code = code if isinstance(code, int) else int(code is not None)
-    return code, _stopped() if code >= INTERRUPTED and _is_first() else ""
+    return code, _stopped() if code >= INTERRUPTED else ""
 
 
 def _is_first() -> bool:
@@ -211,7 +225,9 @@ def _is_first() -> bool:
 
 
 def _stopped() -> str:
-    """Return what Ctrl-C left of the results."""
+    """Return what Ctrl-C left of the results, or "" where another process tells it."""
+    if not _is_first():
+        return ""
     written = ", ".join(map(str, channel().written()))
     return channel().kept or ("stopped: " + (f"finished before: {written}" if written else "nothing was written"))
 
@@ -249,17 +265,16 @@ def _fault(error: Exception) -> str:
     )
 
 
-def _noted_interrupts() -> list[int]:
+def _noted_interrupts(last_words: Callable[[], object]) -> list[int]:
     """Return a list that fills with interrupts. Ctrl-C raises KeyboardInterrupt, but compilers may turn that into another error.
 
-    A process whose threads still compute LATEST_S after it ends at once.
+    A process whose threads still compute LATEST_S after it ends at once, with its last words.
     """
     noted: list[int] = []
 
     def leave_now() -> None:
         if signal.getsignal(signal.SIGINT) is note:
-            if noted:
-                _complain(_stopped())
+            last_words()
             remove_unfinished()
             os._exit(INTERRUPTED)
 
@@ -288,11 +303,10 @@ def _refused(error: OSError) -> str:
     return f"{shown}: {(error.strerror or 'the system refused it').lower()}; check the name, the space left and who may write there"
 
 
-def _complain(message: str) -> None:
-    stopped = message.startswith("stopped")
+def _complain(message: str, file: Any, *, stopped: bool) -> None:
     channel().said(message if stopped else f"error: {message}")
     with suppress(OSError):
-        console = Console(stderr=True, soft_wrap=True)
+        console = Console(file=file, soft_wrap=True)
         if not stopped:
             console.print("error:", style="bold red", end=" ")
         console.print(message, markup=False, highlight=False)

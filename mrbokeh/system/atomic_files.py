@@ -75,8 +75,11 @@ def writing_alone(path: Path | None) -> Iterator[None]:
                 file = held.enter_context(lock.open("a+"))
                 if not _lock(file):
                     file.seek(0)
-                    raise InputError(f"another run (process {file.read()}) is writing {path}: wait for it, or give this one another name")
+                    process = f" (process {number})" if (number := file.read()) else ""
+                    raise InputError(f"another run{process} is writing {path}: wait for it, or give this one another name")
                 held.callback(_tried, lock.unlink)
+                if os.name == "nt":
+                    held.callback(file.close)  # an open file cannot be removed there
                 held.callback(finished, lock, None)
                 unfinished(lock)
                 file.truncate(0)

@@ -51,16 +51,20 @@ class Channel:
     def document(self, exit_code: int, error: str) -> dict[str, Any]:
         """Return what --json prints."""
         written = self.written()
-        inputs = {name: value for name, value in self.inputs.items() if value not in written}
-        parts: dict[str, Any] = {
-            "command": self.command,
-            "inputs": inputs,
-            "outputs": written,
-            "known": self.known,
-            "guessed": self.guessed,
-        }
-        parts |= {"figures": self.figures, "warnings": self.warnings, "seconds": round(time.monotonic() - self.started_s, 3)}
-        return _plain(({"error": error} if error else {}) | parts | {"exit_code": exit_code})
+        return _plain(
+            ({"error": error} if error else {})
+            | {
+                "command": self.command,
+                "inputs": {name: value for name, value in self.inputs.items() if value not in written},
+                "outputs": written,
+                "known": self.known,
+                "guessed": self.guessed,
+                "figures": self.figures,
+                "warnings": self.warnings,
+                "seconds": round(time.monotonic() - self.started_s, 3),
+                "exit_code": exit_code,
+            }
+        )
 
 
 class _Warnings(logging.Handler):
@@ -127,8 +131,11 @@ def show(renderable: Any, **figures: Any) -> None:
     from rich.console import Console
 
     _channel.figures |= figures
-    for console in (Console(highlight=False), *([Console(file=_channel.log, width=200)] if _channel.log else [])):
-        console.print(renderable, soft_wrap=not console.is_terminal)
+    console, logged = Console(highlight=False), Console(width=200, force_terminal=False)
+    console.print(renderable, soft_wrap=not console.is_terminal)
+    with logged.capture() as text:
+        logged.print(renderable, soft_wrap=True)
+    _channel.said(text.get())
 
 
 def warn(text: str) -> None:
@@ -152,7 +159,7 @@ def unfinished(temporary: Path) -> None:
 def finished(temporary: Path, path: Path | None) -> None:
     """Note that a temporary has become the result `path`, or nothing. Results in the temporary folder of another are not counted."""
     _UNFINISHED.discard(temporary)
-    if path is not None and not any(folder in path.parents for folder in _UNFINISHED):
+    if path is not None and not any(folder in path.parents for folder in tuple(_UNFINISHED)):
         _channel.outputs.append(path)
 
 

@@ -28,9 +28,25 @@ SLEEPING = (
     "from mrbokeh import cli; from mrbokeh.system.atomic_files import atomic_path\n"
     "def slow(path, lens):\n"
     "    with atomic_path(path) as temporary, ThreadPoolExecutor(1) as pool:\n"
-    "        temporary.touch(); print('begun', flush=True); pool.submit(time.sleep, 30).result()\n"
+    "        temporary.touch(); print('begun', file=sys.__stderr__, flush=True); pool.submit(time.sleep, 30).result()\n"
     "file.write_lens = slow; sys.argv[0] = 'mrbokeh'; cli.main()"
 )
+
+
+SPEAKING = (
+    "import sys; import mrbokeh.optics.lens_file as file\n"
+    "from mrbokeh import cli; from mrbokeh.system import channel; from rich.table import Table\n"
+    "def speak(path, lens):\n"
+    "    channel.say('a hint'); channel.warn('careful'); print('noise', file=sys.stderr); channel.tell('the result')\n"
+    "    table = Table('of two', box=None); channel.show(table); sys.exit()\n"
+    "file.write_lens = speak; sys.argv[0] = 'mrbokeh'; cli.main()"
+)
+
+
+def speaking(folder: Path, *options: str) -> "subprocess.CompletedProcess[str]":
+    """Run a command that says, warns, tells and shows."""
+    words = [sys.executable, "-c", SPEAKING, "lens", "new", str(folder / "lens.json"), *map(str, NEW), *options]
+    return subprocess.run(words, capture_output=True, text=True)
 
 
 def run_commands(command: object, path: str) -> dict[str, set[str]]:
@@ -53,6 +69,7 @@ def test_one_object_of_what_was_done_and_words_elsewhere(tmp_path: Path) -> None
     assert (told["command"], told["outputs"], told["exit_code"]) == ("lens new", [str(lens)], 0) and f"wrote {lens}" in done.stderr
     told = json.loads(mrbokeh("lens", "show", lens, "--out", figure, "--json").stdout)
     assert told["inputs"] == {"lens": str(lens)} and told["outputs"] == [str(figure)] and 0 < told["seconds"] < 60
+    assert json.loads(mrbokeh("lens", "show", lens, "--out", figure, "--json").stdout)["inputs"] == {"lens": str(lens)}  # refused
     assert json.loads(mrbokeh("lens", "coc", lens, 0.4, "inf", "--json").stdout)["figures"]["coc_px"][0] == pytest.approx(0.0, abs=1e-6)
     for words, said in ((("lens", "coc", tmp_path / "none.json", 1), "no such file"), (("lens", "new", "--nonsense"), "--nonsense")):
         done = mrbokeh(*words, "--json")
@@ -73,20 +90,30 @@ def test_only_the_folder_that_came_whole_is_an_output(tmp_path: Path) -> None:
 
 
 def test_quiet_leaves_the_result_and_errors(tmp_path: Path) -> None:
-    dark = tmp_path / "dark.exr"
-    mrbokeh("lens", "new", tmp_path / "lens.json", *NEW)
-    done = mrbokeh("lens", "coc", tmp_path / "lens.json", 0.4, "--quiet")
-    assert (done.stdout, done.stderr) == ("0.4 m: +0.00 px\n", "")
-    done = mrbokeh("lens", "show", dark, "--out", tmp_path / "a.png", "--quiet")
+    found = speaking(tmp_path, "--quiet")
+    assert (found.stdout, found.stderr) == ("the result\n of two \n", "")
+    done = mrbokeh("lens", "show", tmp_path / "dark.exr", "--out", tmp_path / "a.png", "--quiet")
     assert done.returncode == 2 and done.stdout == "" and done.stderr.startswith("error: ")
 
 
-def test_a_log_grows_by_all_that_is_said(tmp_path: Path) -> None:
+@pytest.mark.parametrize("quiet", [(), ("--quiet",)])
+def test_a_log_grows_by_all_that_is_said(tmp_path: Path, quiet: tuple[str, ...]) -> None:
+    """Each line with its time, tables too; only its owner may read it."""
     log = tmp_path / "log.txt"
-    mrbokeh("lens", "new", tmp_path / "lens.json", *NEW, "--log", log, "--quiet")
-    mrbokeh("lens", "new", tmp_path / "lens.json", *NEW, "--log", log)
-    lines = log.read_text().splitlines()
-    assert [line.split()[2] for line in lines] == ["mrbokeh", "wrote", "mrbokeh", "error:"] and lines[0][:2] == "20"
+    speaking(tmp_path, "--log", str(log), *quiet)
+    mrbokeh("lens", "new", tmp_path / "none.png", *NEW, "--log", log)
+    lines = [line.split(maxsplit=2) for line in log.read_text().splitlines()]
+    assert all(day[:2] == "20" for day, *_ in lines) and (os.name == "nt" or log.stat().st_mode & 0o777 == 0o600)
+    said = [rest[1].split()[0] for _, *rest in lines if len(rest) > 1]
+    assert said == ["mrbokeh", "a", "warning:", "the", "of", "mrbokeh", "error:"]
+
+
+def test_a_log_is_never_what_is_read_or_written(tmp_path: Path) -> None:
+    lens = tmp_path / "lens.json"
+    done = mrbokeh("lens", "new", lens, *NEW, "--log", lens)
+    assert done.returncode == 2 and f"--log {lens} would be written into what OUT names" in done.stderr and not list(tmp_path.iterdir())
+    done = mrbokeh("render", "--out", "a.png", "--rgb", lens, "--depth", 2, "--log", tmp_path / "." / "lens.json")
+    assert done.returncode == 2 and "into what --rgb names" in done.stderr and not list(tmp_path.iterdir())
 
 
 def test_a_pipe_that_nobody_reads_is_no_fault() -> None:
@@ -103,6 +130,8 @@ def test_two_runs_into_one_output(tmp_path: Path) -> None:
         assert other.stdout is not None and other.stdout.readline() == "held\n"
         done = mrbokeh("lens", "new", out, *NEW)
         assert done.returncode == 2 and f"another run (process {other.pid}) is writing {out}" in done.stderr
+        (tmp_path / ".lens.json.lock").write_text("")
+        refused(f"another run is writing {out}", raising_while_writing, out)
         other.kill()  # the lock goes with the process, the file that held it stays
     assert mrbokeh("lens", "new", out, *NEW).returncode == 0 and [each.name for each in tmp_path.iterdir()] == ["lens.json"]
 
@@ -124,15 +153,18 @@ def raising_while_writing(path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no such signals there")
-def test_an_interrupt_ends_within_two_seconds_with_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize("option", ["--overwrite", "--quiet", "--json"])
+def test_an_interrupt_ends_within_two_seconds_with_one_line(tmp_path: Path, option: str) -> None:
     """Even while a thread computes on, as compiled kernels do."""
-    words = [sys.executable, "-c", SLEEPING, "lens", "new", str(tmp_path / "lens.json"), *map(str, NEW)]
+    words = [sys.executable, "-c", SLEEPING, "lens", "new", str(tmp_path / "lens.json"), *map(str, NEW), option]
     with subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as run:
-        assert run.stdout is not None and run.stderr is not None and run.stdout.readline() == "begun\n"
+        assert run.stdout is not None and run.stderr is not None and run.stderr.readline() == "begun\n"
         asked_s = time.monotonic()
         run.send_signal(signal.SIGINT)
         assert run.wait(10) == 130 and time.monotonic() - asked_s < 2.5
         assert run.stderr.read() == "stopped: nothing was written\n"
+        told = json.loads(run.stdout.read() or "{}")
+        assert told.get("exit_code") == (130 if option == "--json" else None)
     assert not list(tmp_path.iterdir())
 
 
