@@ -15,6 +15,7 @@ import numpy as np
 
 from mrbokeh.optics.psf_bank import Axis, Grid, PsfBank, check_kernel, check_space, grid_over
 from mrbokeh.system.atomic_files import atomic_path, read_json, write_json
+from mrbokeh.system.channel import channel
 from mrbokeh.system.errors import InputError
 
 FORMAT = "mrbokeh-psf-bank"
@@ -81,6 +82,7 @@ def write_cell(folder: Path | str, cell: int, kernel: np.ndarray) -> None:
     check_kernel(kernel, f"cell {cell}")
     with atomic_path(cell_path(folder, cell)) as temporary, temporary.open("wb") as file:
         np.save(file, kernel)
+    channel().outputs.append(Path(folder))  # once, not cell by cell
 
 
 def missing_cells(folder: Path | str, head: BankHead) -> list[int]:

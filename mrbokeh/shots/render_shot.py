@@ -32,6 +32,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.shots.executors import Executor, Progress, SegmentTask
 from mrbokeh.shots.shot import MANIFEST, PartSink, Picture, Rgba, Segment, Shot
 from mrbokeh.system.atomic_files import read_json, refuse_existing, write_json
+from mrbokeh.system.channel import channel
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.encodings import encoding_for, encoding_name, with_alpha
 from mrbokeh.video.image_sequence import NumberedFiles, is_pattern, numbered
@@ -97,6 +98,7 @@ class SequenceTarget:
         write_json(self.part(folder, segment), {"frames": [segment.start, segment.stop]})
 
     def join(self, shot: Shot, folder: Path) -> str:  # noqa: ARG002
+        channel().outputs.extend(self.file(index) for index in range(shot.start, shot.stop))  # workers have channels of their own
         return "no audio"
 
     def file(self, index: int) -> Path:

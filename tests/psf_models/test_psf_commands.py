@@ -1,5 +1,6 @@
 """`mrbokeh lens psf`, `export` and `show` as a user meets them: real files, builds that stopped half way, and mistakes."""
 
+import json
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from mrbokeh.psf_models.simple_lens import SimpleLens
 from mrbokeh.renderers.bank.kernel_files import build_spreadlets, spreadlets_beside
 from mrbokeh.renderers.kernels.spreadlets import Sparsification, Spreadlet, sparsify
 from mrbokeh.system.errors import InputError
-from tests.support.command_line import printed_by
+from tests.support.command_line import mrbokeh, printed_by
 
 SMALL = ["--diameter", "12", "--counts", "4"]
 
@@ -35,7 +36,8 @@ def picture_file(path: Path) -> Path:
 
 def test_a_bank_of_the_disc_holds_the_disc(tmp_path: Path) -> None:
     """At the largest diameter of the last cell, 12 px, and below: every kernel lies between those of its cell's ends."""
-    assert "4 kernels" in run("psf", "simple", "--out", tmp_path / "bank", *SMALL)
+    told = json.loads(mrbokeh("lens", "psf", "simple", "--out", tmp_path / "bank", *SMALL, "--json").stdout)
+    assert told["figures"]["kernels"] == 4 and told["outputs"] == [str(tmp_path / "bank")]
     bank = read_bank(tmp_path / "bank")
     np.testing.assert_allclose(bank.boxes[:, 0], [[0, 0.75], [0.75, 3], [3, 6.75], [6.75, 12]])
     np.testing.assert_array_equal(bank.kernels[0], np.ones((1, 1, 1)))

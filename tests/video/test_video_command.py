@@ -1,5 +1,6 @@
 """`mrbokeh video` from end to end: a real command line, real codecs, and numbers from the compositing it stands on."""
 
+import json
 import os
 import signal
 import subprocess
@@ -27,6 +28,7 @@ from mrbokeh.video.clip import read_frames
 from mrbokeh.video.writer import VideoWriter
 from tests.compositing.test_plate_look_options import photo_with_exif
 from tests.stacks.test_exr_layers_cryptomatte import beauty, crypto_channels, header
+from tests.support.command_line import mrbokeh
 from tests.support.refusals import refused
 from tests.support.shot_makers import wait_for
 from tests.support.stage_scenes import HEIGHT, ONE_CARD, WIDTH, camera, scene_file
@@ -225,7 +227,9 @@ def test_a_scene_is_rendered_per_frame(tmp_path: Path) -> None:
 def test_the_virtual_layer_alone_and_pictures_out(clip: Path, settings: list[str], tmp_path: Path) -> None:
     run(clip, *settings, "--virtual-only", "--out", tmp_path / "virtual.%03d.exr", "--frames", "2:5")
     run(clip, *settings, "--virtual-only", "--out", tmp_path / "virtual.mov", "--frames", "2:5")
-    run(clip, *settings, "--out", tmp_path / "whole.%03d.png", "--frames", "2:5")
+    options = ("--out", tmp_path / "whole.%03d.png", "--frames", "2:5", "--segment", 0.04, "--workers", 2)
+    told = json.loads(mrbokeh("video", clip, *settings, *options, "--json").stdout)
+    assert told["outputs"] == [str(tmp_path / f"whole.{i:03d}.png") for i in (2, 3, 4)]
     assert sorted(file.name for file in tmp_path.glob("virtual.*")) == [*(f"virtual.{i:03d}.exr" for i in (2, 3, 4)), "virtual.mov"]
     virtual, frame = read_layer(tmp_path / "virtual.002.exr"), list(read_frames(clip))[2]
     whole = read_image(tmp_path / "whole.002.png")
