@@ -101,9 +101,8 @@ class Refocusing:
         rendered = self.rendered(focus_m)
         result, darkest, brightest = rendered.copy(), rendered.copy(), rendered.copy()
         for index, carry in self._carried(captured, focus_m).items():
-            plain, light = self.residuals_of(index)
+            beside, plain, light = self._residuals_of(index)
             result += _smoothed(carry.weight * plain + carry.light_weight * light, carry.sigma_px)
-            beside = self.stack.slice_rgb(index)
             np.minimum(darkest, beside, out=darkest)
             np.maximum(brightest, beside, out=brightest)
         # Beyond what the slices beside it and rendering show, a residual is of something that blurs otherwise: black specks in a dark bag.
@@ -115,8 +114,8 @@ class Refocusing:
     def rendered(self, focus_m: float) -> Rgb:
         return self.renderer.render([self._sharp()], self.lens_at(focus_m)).rgb
 
-    def residuals_of(self, index: int) -> tuple[Rgb, Rgb]:
-        """Return (residual of a captured slice against its rendering, residual at highlights); each 0 elsewhere, and without data."""
+    def _residuals_of(self, index: int) -> tuple[Rgb, Rgb, Rgb]:
+        """Return (captured slice, its residual against its rendering, residual at highlights); each 0 elsewhere, and without data."""
         masks, captured = self.stack.slice_masks(index), self.stack.slice_rgb(index)
         rendered = self.rendered(float(self._captured(None)[index]))
         residual = np.where(masks.valid[..., None], captured - rendered, np.float32(0.0))
@@ -124,7 +123,7 @@ class Refocusing:
         full = (masks.saturated | (peak >= RESIDUAL_WHITE))[..., None]
         light = (masks.saturated | (np.maximum(peak, rendered.max(axis=2)) >= RESIDUAL_LIGHT))[..., None]
         at_lights = np.where(full, np.maximum(residual, np.float32(0.0)), residual)
-        return np.where(light, np.float32(0.0), residual), np.where(light, at_lights, np.float32(0.0))
+        return captured, np.where(light, np.float32(0.0), residual), np.where(light, at_lights, np.float32(0.0))
 
     def _sharp(self) -> Layer:
         return opaque(self.stack.all_in_focus(), self.stack.depth_m())

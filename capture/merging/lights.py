@@ -170,7 +170,7 @@ def spread_light(codes: Codes) -> Bool[np.ndarray, "slices height width"]:
     codes: the square root of their light, 255 at white. Blur conserves light: a place that is full in all slices and brings more light
     where it is larger was clipped where it is small, and is sharpest there. White print brings no more light out of focus.
     """
-    full, light = codes >= _FULL_CODE, (codes / np.float32(255.0)) ** 2
+    full = codes >= _FULL_CODE
     result = np.zeros(codes.shape, bool)
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(np.asarray(full.any(axis=0), np.uint8), connectivity=8)
     for number, (x, y, width, height, area) in enumerate(boxes[1:].tolist(), 1):
@@ -179,11 +179,14 @@ def spread_light(codes: Codes) -> Bool[np.ndarray, "slices height width"]:
         around = max(width, height) // 2 + _RIM_PX
         box = (slice(max(y - around, 0), y + height + around), slice(max(x - around, 0), x + width + around))
         mine, alone = full[:, *box] & (labels[box] == number), (labels[box] == number) | (labels[box] == 0)
-        areas, sums = mine.sum(axis=(1, 2)), (light[:, *box] * alone).sum(axis=(1, 2))
+        areas = mine.sum(axis=(1, 2))
+        if areas.min() < _LEAST_FULL_PX:
+            continue
+        sums = ((codes[:, *box] / np.float32(255.0)) ** 2 * alone).sum(axis=(1, 2))
         least = int(sums.argmin())
         grown = areas - areas[least]
         spread = (areas > _LEAST_SPREAD * areas[least]) & (grown > _LEAST_FULL_PX) & (sums - sums[least] > _LEAST_NEW_LIGHT * grown)
-        if areas.min() >= _LEAST_FULL_PX and np.count_nonzero(spread) >= _FEWEST_SPREAD:
+        if np.count_nonzero(spread) >= _FEWEST_SPREAD:
             rim = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _RIM_PX + 1,) * 2)
             for index in np.flatnonzero(spread):
                 result[index, *box] |= cv2.dilate(mine[index].astype(np.uint8), rim) > 0

@@ -91,7 +91,7 @@ def filtered(radiance: Float32[np.ndarray, "height width 3"]) -> LightingMaps:
     """
     if (radiance == radiance[0, 0]).all():
         # Even light is the same for every surface, and filtering takes a fifth of a small composite's time.
-        even = [radiance] * (1 + len(_ROUGH_LEVELS))
+        even = [radiance[:8, :16]] * (1 + len(_ROUGH_LEVELS))
         return LightingMaps(np.zeros((0, 3, 3)), _joined(even[:1]), _joined(even), np.eye(3))
     smooth = np.zeros((_MATTE_SIZE_PX[0] * _MATTE_SIZE_PX[1], 3), np.float32)
     moments = _moments(radiance)

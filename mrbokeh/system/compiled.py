@@ -70,7 +70,8 @@ def _without_blas() -> Iterator[None]:
 
 
 # Only in the process of a command: elsewhere somebody else's kernels may multiply matrices.
-if "mrbokeh.cli" in sys.modules and "numba.np.arraymath" not in sys.modules:
+_started = getattr(sys.modules.get("__main__"), "__spec__", None)
+if ("mrbokeh.cli" in sys.modules or getattr(_started, "name", "") == "mrbokeh.cli") and "numba.np.arraymath" not in sys.modules:
     with _without_blas():
         importlib.import_module("numba.np.arraymath")
 

@@ -105,6 +105,7 @@ def test_a_lamp_keeps_its_energy_and_its_place(coc_px: float) -> None:
     np.testing.assert_allclose(place_px, [23.3, 25.1], atol=0.05 if coc_px == 0.0 else 0.01)
 
 
+@pytest.mark.slow
 def test_a_lamp_followed_from_its_side_is_the_disc_that_camera_rays_find() -> None:
     # Two independent ways, with a wire of another depth across the view: a lamp, and a card of the same shape and light.
     thin = flat_card(wire(GRID, [(-20.0, 18.0), (70.0, 31.0)], 2.0), 0.02, -8.0)
@@ -128,6 +129,7 @@ def test_a_ring_is_weighted_by_its_outlines_and_a_mirrored_picture_keeps_its_ene
     assert blurred.std() < 0.5 * sharp.std()
 
 
+@pytest.mark.slow
 def test_the_scene_is_what_it_says_and_its_layers_over_one_another_are_the_sharp_picture() -> None:
     scene = cards.card_scene(seed=3, width_px=144, height_px=96)
     layers = cards.layers(scene)

@@ -267,8 +267,7 @@ def test_focus_from_the_blur_of_the_board_follows_the_page(folder: Path) -> None
         controls = running.site.controls
         assert controls.state()["focus_from"] is None, "before the first picture"
         steps: list[tuple[float, Callable[[], None]]] = [
-            (2.8, lambda: None), (5.6, lambda: controls.set_f_number(5.6)), (2.8, lambda: controls.set_f_number(2.8)),
-            (5.6, lambda: controls.set_lens("stopped")),
+            (2.8, lambda: None), (5.6, lambda: controls.set_f_number(5.6)), (2.8, lambda: controls.set_lens("lens")),
         ]  # fmt: skip
         for f_number, tell in steps:
             tell()

@@ -2,8 +2,8 @@
 
 Its dioptres are known up to D' = p + q D, for blur in pixels is the same with px_per_dioptre / q. The rule: what the photographs state
 stays (a stated lens fixes q = 1, a stated focus distance counts as one more fact); the facts told fix the rest by least squares of their
-relative errors; and where there is one fact, or all lie at one depth, the world is scaled as a whole (p = 0), which keeps proportions that are
-guessed.
+relative errors; and where there is one fact, or all lie at one depth, the world is scaled as a whole (p = 0), which keeps the
+proportions that are guessed.
 The same holds where a slice is stated at infinity, which stays there: then one fact gives all.
 Blur looks alike on both sides of the focus: where merging had to guess which end of the sweep is near, facts at two depths tell (q < 0).
 """
