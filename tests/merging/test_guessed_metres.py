@@ -25,6 +25,7 @@ from mrbokeh.stacks.guessed_metres import (
     SLICE_POSITION,
     STATED_BEFORE,
     is_lens_guessed,
+    metres_line,
     metres_note,
     metres_notes,
 )
@@ -71,7 +72,7 @@ def test_blur_in_pixels_is_that_of_the_true_metres(known: FocalStack, guessed: F
 def test_the_note_names_what_is_guessed_and_the_way_out(known: FocalStack, guessed: FocalStack) -> None:
     assert metres_note(known) == ""
     assert "metres are guessed: no focus distance is stated;" in metres_note(guessed) and "--ruler" in metres_note(guessed)
-    assert "\n" not in metres_note(guessed) and metres_notes([known, guessed]) == metres_note(guessed)
+    assert "\n" not in metres_note(guessed) and metres_notes([known, guessed]) == metres_line(guessed)
     assert "in 2 of the stacks" in metres_notes([guessed, guessed])
 
 
@@ -108,7 +109,7 @@ def test_refocusing_needs_no_metres(known: FocalStack, guessed: FocalStack, tmp_
     places = f"#0.5,#1,@{ON_WALL}"
     run("refocus", known.folder, "--focus", places, "--out", tmp_path / "a", "--renderer", "scatter")
     told = run("refocus", guessed.folder, "--focus", places, "--out", tmp_path / "b", "--renderer", "scatter")
-    assert "metres are guessed" in told and "guessed metres)" in told
+    assert "metres are guessed" in told and "guessed metres from the lens)" in told
     truth, made = read_focal_stack(tmp_path / "a"), read_focal_stack(tmp_path / "b")
     for index in range(3):
         np.testing.assert_allclose(made.slice_rgb(index), truth.slice_rgb(index), atol=2e-4)
@@ -328,6 +329,13 @@ def test_one_length_with_a_stated_lens_gives_all_metres(known: FocalStack, tmp_p
     made = read_focal_stack(twin.folder)
     assert true_m(made, known) < 1e-3 and made.lens is not None and known.lens is not None
     assert made.lens.focal_length_mm == known.lens.focal_length_mm and metres_note(made) == ""
+
+
+def test_one_length_across_two_depths_scales_the_world_as_well(guessed: FocalStack, run: Run) -> None:
+    """One fact cannot tell two unknowns: a macro stack came out with all its slices within half a millimetre."""
+    run("capture", "scale", guessed.folder, "--ruler", "10,24,60,24,0.003")
+    distances_m = [each or 0.0 for each in read_focal_stack(guessed.folder).focus_distances_m]
+    assert distances_m[2] / distances_m[0] == pytest.approx(2.0, rel=1e-4) and distances_m[0] < 0.01
 
 
 def test_one_length_alone_scales_the_world_and_says_so(known: FocalStack, guessed: FocalStack, run: Run) -> None:
