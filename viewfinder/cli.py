@@ -144,7 +144,7 @@ def board_command(
     out: Annotated[Path, typer.Option(help="Where the page goes: BOARD.pdf; beside it BOARD.json, for --board.")],
     lens: Annotated[Path | None, typer.Option(help="The lens that will see it; chooses the size of the markers by its blur.")] = None,
     near: Annotated[float, typer.Option(min=0.01, help="How near the camera will come.")] = 0.4,
-    far: Annotated[float, typer.Option(help="How far away it will be.")] = 1.0,
+    far: Annotated[float, typer.Option(min=0.01, help="How far away it will be.")] = 1.0,
     image_width: Annotated[int, typer.Option(min=64, help="Width of the camera's picture.")] = 1280,
     paper: Annotated[str, typer.Option(help="a4, a3, letter, or board: a page of the board's own size.")] = "a4",
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")] = False,

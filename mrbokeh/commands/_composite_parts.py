@@ -11,10 +11,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mrbokeh.commands._composite_options import LensOptions, ObjectOptions, PlateOptions, RenderingOptions, ResultOptions
-from mrbokeh.commands._insertion_options import ColourOptions, LookGroup, VirtualOptions
+from mrbokeh.commands._insertion_options import ColourOptions, LookGroup, VirtualOptions, near_far_of
 from mrbokeh.compositing.near_and_far import nearer_than
 from mrbokeh.compositing.plate import Inserted, Plate, bundle_plate, ended_shadow, open_plate, with_depth, with_matte, with_own_alpha
 from mrbokeh.depth.depth_map import DepthSettings, parse_near_far
+from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.alpha_io import HOLDING_ALPHA, alpha_with
 from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.images.image_io import INTEGER_SUFFIXES, require_suffix
@@ -53,7 +54,8 @@ def plate_by(
         plate = bundle_plate(bundle, lens, focus_m)
     if colour.of_plate is not None:
         plate = _from_space(plate, photo, colour.of_plate)
-    near_far_m = None if options.disparity is None else parse_near_far(options.disparity)
+    own = photo if options.disparity and not photo.is_dir() and read_phone_photo(photo, parse_near_far(options.disparity)) else None
+    near_far_m = near_far_of(options.disparity, options.depth or own)
     if options.rgb is not None:
         sharp_rgb = read_photograph(options.rgb).rgb if colour.of_plate is None else colour.of_plate.to_rec709(read_numbers(options.rgb))
         plate = replace(plate, sharp_rgb=sharp_rgb)
@@ -122,7 +124,8 @@ def blur_told(plate: Plate, sharp: Sequence[Layer]) -> tuple[str, dict[str, Any]
     size = f", {_size_px(sharp)} px" if plate.metres_guessed else ""
     far = f"{nearest_m:.3g} to {farthest_m:.3g} {unit} from the lens"
     told = f"{told}; put in at {far}{size}, blurred by {coc_px.min():.1f} to {coc_px.max():.1f} px"
-    return told, known, {"depths_m": (nearest_m, farthest_m), "coc_px": (coc_px.min(), coc_px.max())}
+    figures = {} if plate.metres_guessed else {"depths_m": (nearest_m, farthest_m)}
+    return told, known, figures | {"coc_px": (coc_px.min(), coc_px.max())}
 
 
 def _size_px(sharp: Sequence[Layer]) -> str:

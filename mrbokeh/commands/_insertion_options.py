@@ -119,8 +119,29 @@ def focused_at_pixel(lens: "Lens", depth_m: "np.ndarray | None", place: str) -> 
     """Return the lens focused on what the depth has at a place, X,Y or X,Y,R as typed. Raises InputError without depth."""
     if depth_m is None:
         raise InputError("--focus-at looks up how far away the place is, but there is no depth: give --depth, or --focus METRES")
-    x_px, y_px, radius_px = (*numbers_in(place, "--focus-at: expected X,Y or X,Y,RADIUS in whole pixels", (2, 3), number=int), 0)[:3]
-    return lens.focused_on(depth_m, x_px + 0.5, y_px + 0.5, float(radius_px))
+    x_px, y_px, *radius_px = typed_place(place)
+    return lens.focused_on(depth_m, x_px + 0.5, y_px + 0.5, float(*radius_px))
+
+
+def typed_place(text: str) -> tuple[int, ...]:
+    """Return X,Y or X,Y,R of --focus-at."""
+    return numbers_in(text, "--focus-at: expected X,Y or X,Y,RADIUS in whole pixels", (2, 3), number=int)
+
+
+def near_far_of(disparity: str | None, depth: Path | None) -> tuple[float, float] | None:
+    """Return NEAR and FAR of --disparity in metres, or None. depth: the file whose numbers it explains; None is refused."""
+    from mrbokeh.depth.depth_map import parse_near_far
+
+    if disparity is not None and depth is None:
+        raise InputError(f"--disparity {disparity} says what the numbers of a --depth file mean: give that too, or leave --disparity out")
+    return None if disparity is None else parse_near_far(disparity)
+
+
+def in_degrees(shutter: float | None) -> float | None:
+    """Return a shutter angle. Raises InputError if it looks like the share of the frame's time."""
+    if shutter is not None and 0.0 < shutter <= 1.0:
+        raise InputError(f"--shutter counts degrees, not shares of a frame's time: for {shutter:g} of it give {360.0 * shutter:g}")
+    return shutter
 
 
 def require_one_focus(**given: object) -> None:

@@ -8,9 +8,7 @@ FEW = 9
 
 EVERYDAY = {
     "capture shoot": "plan source out target by-hand",
-    "capture ingest": "out group max-width overwrite",
     "capture process": "out max-width board prefer overwrite",
-    "capture merge": "overwrite prefer from-slice mask",
     "capture poses": "overwrite images out mapper",
     "capture plan": "near far image-width focal-length f-number sensor-width out",
     "capture matchmove": "out board overwrite",
@@ -37,28 +35,27 @@ EVERYDAY = {
 """Options of a command that most people need, which come first."""
 
 PANELS = {
-    "The plate": "all-slices behind depth depth-model-gives depth-scale disparity exact-depth first-number frames input-space matte "
-    "near-distance rate refine rgb slice srgb steady-depth stereo linear side light-distance images registration half-size sidecar group",
-    "What is put in": "at at-pixel camera catch height layer mode object objects paths pitch scene scene-begin scene-renderer time turn "
-    "keyframes",
+    "The plate": "all-slices behind depth-model-gives depth-scale disparity exact-depth first-number frames input-space matte "
+    "near-distance rate refine rgb srgb steady-depth stereo linear side light-distance sidecar",
+    "What is put in": "camera catch layer mode objects paths pitch scene scene-begin scene-renderer time turn keyframes",
     "Its light": "environment exposure shadow",
     "Its look": "grain grey-value light-wrap match-black match-exposure match-grey match-white plate-exposure vignetting seed",
     "The lens": "distortion f-number focal-length focus focus-at focus-pull lens petzval-radius psf readout same-view sensor-height "
     "sensor-width shutter tilt prescription",
-    "The opening": "axial-chromatic blades cat-eye curvature image inner lateral-chromatic levels path rotation shape "
+    "The opening": "axial-chromatic cat-eye curvature image inner lateral-chromatic levels path rotation shape "
     "spherical-aberration squeeze",
     "The blur": "alpha-out highlights motion renderer residuals samples slices",
-    "The kernels": "anisotropy cells counts density-per-m diameter diameters far focal-px image-width longest-motion near near-lights "
+    "The kernels": "anisotropy cells counts density-per-m diameters far focal-px image-width longest-motion near near-lights "
     "pixels psf-picture rays regions smoothness symmetric",
-    "Metres": "board dictionary distance distance-at ground lens-calibration marker metric nearest ruler square",
-    "The camera": "backlash by-hand check exposure-time far-steps focus-level focus-steps home iso live near-steps planned-distances "
-    "reverse-focus settle spot sweep-step target timeout white-balance",
+    "Metres": "dictionary distance distance-at ground lens-calibration marker metric ruler square",
+    "The camera": "backlash check exposure-time far-steps focus-level focus-steps home iso live near-steps planned-distances "
+    "reverse-focus settle spot sweep-step timeout white-balance",
     "Tracking": "camera-model cameras delay focus-from freed lens-table longest-gap map mapper max-image-size metres-per-unit opentrackio "
     "phone phone-camera pose rig smooth steadier",
     "The page": "captures interface lan max-rate port qr tls tls-key webcam",
-    "The result": "constant-rate encoding evidence format leaks no-distortion ocio out output-space overwrite save-deep save-depth "
+    "The result": "constant-rate encoding format leaks no-distortion ocio output-space overwrite save-deep save-depth "
     "save-layer sheet virtual-only allow-absent strict",
-    "The work": "cluster device epochs max-width minutes segment threads work workers",
+    "The work": "cluster device epochs max-width segment threads work workers",
 }
 """Subjects of the other options; a name that is on none of them comes with "More"."""
 
@@ -107,11 +104,13 @@ CHOICES = {
     "paper": "a4 a3 letter board",
     "shape": "disc polygon ring star heart image outline",
     "side": "behind front",
-    "source": "gphoto2 whip test simulated folder:",
-    "white-balance": "camera",
-    "model": "simple combined physical volume stylized",
+    "capture shoot source": "gphoto2 simulated folder:",
+    "viewfinder source": "gphoto2 whip test folder:",
+    "viewfinder calibrate-phone source": "gphoto2 whip test folder:",
+    "capture ingest white-balance": "camera",
+    "lens psf model": "simple combined physical volume stylized",
 }
-"""Values that the shell completes; where none fits, it completes files."""
+"""Values that the shell completes, of an option in all commands or in one; where none fits, it completes files."""
 
 
 def _by_name(table: dict[str, str]) -> dict[str, str]:
@@ -123,8 +122,9 @@ def with_words(command: Any, path: str) -> None:
     panels, metavars, first = _by_name(PANELS), _by_name(METAVARS), EVERYDAY.get(path, "").split()
     for parameter in command.params:
         name = parameter.opts[0].removeprefix("--") if parameter.param_type_name == "option" else parameter.name
-        if name in CHOICES and not parameter.type_descriptor.is_choice:
-            parameter.shell_complete = _completing(CHOICES[name].split())
+        choices = CHOICES.get(f"{path} {name}") or CHOICES.get(name)
+        if choices and not parameter.type_descriptor.is_choice:
+            parameter.shell_complete = _completing(choices.split())
         if parameter.param_type_name == "option":
             parameter.metavar = metavars.get(name, parameter.metavar)
             if len(command.params) > FEW and name not in first:

@@ -7,8 +7,7 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from mrbokeh.commands._insertion_options import DisparityOption, FocusAtOption, focused_at_pixel, require_one_focus
-from mrbokeh.depth.depth_map import parse_near_far
+from mrbokeh.commands._insertion_options import DisparityOption, FocusAtOption, focused_at_pixel, in_degrees, near_far_of, require_one_focus
 from mrbokeh.images.layer import Layer, flatten
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
@@ -32,7 +31,9 @@ class SharpOptions:
     motion: Annotated[
         Path | None, typer.Option(help="EXR with forward.u and forward.v: how far --rgb moves right and up, in pixels of one frame.")
     ] = None
-    shutter: Annotated[float, typer.Option(min=0.0, help="Shutter angle: 360 is open for the whole time of a frame.")] = 180.0
+    shutter: Annotated[float, typer.Option(min=0.0, max=360.0, callback=in_degrees, help="Shutter angle: 360 is open all the time.")] = (
+        180.0
+    )
     samples: Annotated[
         Path | None, typer.Option(help="Noisy light field samples (.npz, .exr) in place of pictures, for --renderer lrdm or laplacian.")
     ] = None
@@ -89,11 +90,12 @@ def read_sharp(sources: SharpOptions) -> dict[str, Layer]:
 
 def _read(sources: SharpOptions) -> dict[str, Layer]:
     rgb, depth = sources.rgb, sources.depth
+    near_far_m = near_far_of(sources.disparity, None if rgb is None or depth is None or _is_distance(depth) else depth)
     sharp = {str(path): _whole_layer(path) for path in sources.layer or ()}
     if (rgb is None) != (depth is None):
         raise InputError("--rgb and --depth belong together: give both, or only --layer")
     if rgb is not None and depth is not None:
-        sharp[str(rgb)] = _picture(rgb, depth, sources)
+        sharp[str(rgb)] = _picture(rgb, depth, near_far_m, sources.srgb)
     if sources.behind and rgb is None:
         raise InputError("--behind is for what lies behind --rgb: without a picture list all layers with --layer, front first")
     sharp |= {str(path): _whole_layer(path) for path in sources.behind or ()}
@@ -112,17 +114,15 @@ def _whole_layer(path: Path) -> Layer:
     return layer
 
 
-def _picture(rgb: Path, depth: Path, sources: SharpOptions) -> Layer:
+def _picture(rgb: Path, depth: Path, near_far_m: tuple[float, float] | None, is_srgb: bool) -> Layer:
     from mrbokeh.depth.open_depth import depth_of_file
     from mrbokeh.images.image_io import read_image, read_linear
     from mrbokeh.images.layer import opaque
 
     linear_or = "develop the RAW file to EXR first, or say with --srgb that it is sRGB if that is all there is"
-    colour = read_image(rgb) if sources.srgb else read_linear(rgb, linear_or)
-    if depth.exists() or not _is_distance(depth):
-        depth_m = depth_of_file(depth, None if sources.disparity is None else parse_near_far(sources.disparity))
-    else:
-        depth_m = np.full(colour.shape[:2], float(str(depth)), np.float32)
+    colour = read_image(rgb) if is_srgb else read_linear(rgb, linear_or)
+    distant = _is_distance(depth)
+    depth_m = np.full(colour.shape[:2], float(str(depth)), np.float32) if distant else depth_of_file(depth, near_far_m)
     if colour.shape[:2] != depth_m.shape:
         sizes = f"{rgb} is {colour.shape[1]}x{colour.shape[0]} px, {depth} {depth_m.shape[1]}x{depth_m.shape[0]} px"
         raise InputError(f"picture and depth must be of one size, but {sizes}: resize the depth with its nearest pixels, not between them")
@@ -132,7 +132,7 @@ def _picture(rgb: Path, depth: Path, sources: SharpOptions) -> Layer:
 def _is_distance(depth: Path) -> bool:
     """Return whether --depth is one distance for all, such as 4, and no file."""
     try:
-        return float(str(depth)) > 0.0
+        return not depth.exists() and float(str(depth)) > 0.0
     except ValueError:
         return False
 

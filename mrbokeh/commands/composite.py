@@ -113,12 +113,12 @@ def composite(
 def _tell_metres(photo: Path, virtual: VirtualOptions, standing: options.ObjectOptions, lens: "Lens | None") -> None:
     """Print which of a stack's metres are guessed, and what follows for layers and for another lens."""
     from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
-    from mrbokeh.stacks.guessed_metres import growth_note, metres_line, metres_note
+    from mrbokeh.stacks.guessed_metres import growth_note, guess_metres
 
     if not (photo / FILE_NAME).is_file():
         return
     stack = read_focal_stack(photo)
-    guess(metres_note(stack), metres_line(stack))
+    guess_metres(stack)
     guess(growth_note(stack, lens))
     if not stack.metres_known and virtual.layer and not standing.at_pixel:
         say("the layers' depth is taken for guessed metres: --at-pixel X,Y puts them onto the surface at a pixel")

@@ -270,8 +270,9 @@ def coc(
     if not min(depths) > 0:
         raise InputError(f"expected depths above 0 in metres, got {depths}")
     read = read_lens(lens)
-    for depth_m in depths:
-        tell(f"{depth_m:g} m: {float(read.coc_px(depth_m, width)):+.2f} px", coc_px=[float(read.coc_px(each, width)) for each in depths])
+    coc_px = [float(read.coc_px(depth_m, width)) for depth_m in depths]
+    for depth_m, each_px in zip(depths, coc_px, strict=True):
+        tell(f"{depth_m:g} m: {each_px:+.2f} px", coc_px=coc_px)
 
 
 def show(

@@ -1,6 +1,6 @@
 """`mrbokeh lens fit` and `mrbokeh lens match`: lenses measured in focal stacks, in pictures of points of light, and in one photograph."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -51,7 +51,7 @@ class MatchResultOptions:
 
 @grouped
 def match(
-    photo: Annotated[Path, typer.Argument(help="A photograph with out-of-focus lights: JPEG, TIFF, PNG, WebP, EXR or HDR.")],
+    photo: Annotated[Path, typer.Argument(help="A photograph with out-of-focus lights: RAW, JPEG, TIFF, PNG, WebP, EXR or HDR.")],
     out: Annotated[Path, typer.Option(help="The lens file to write, e.g. lens.json.")],
     result: MatchResultOptions,
     lights: LightOptions,
@@ -67,17 +67,24 @@ def match(
     from mrbokeh.images.image_io import ENCODED_SUFFIXES, read_image
     from mrbokeh.lens_measuring.matching.lens_match import match_lens
     from mrbokeh.lens_measuring.matching.match_report import as_text, draw_match, table_of
-    from mrbokeh.lens_measuring.matching.photo_facts import read_facts
+    from mrbokeh.lens_measuring.matching.photo_facts import PhotoFacts, read_facts
     from mrbokeh.optics.lens_file import write_lens
+    from mrbokeh.stacks.photograph import full_value, is_raw, read_photograph
     from mrbokeh.system.atomic_files import atomic_path, refuse_existing
 
     _check_match(lights, result)
     for path in (out, *([result.evidence] if result.evidence else [])):
         refuse_existing(path, result.overwrite)
-    rgb = read_image(photo, "linear" if lights.linear else "srgb")
-    facts = read_facts(photo, (rgb.shape[1], rgb.shape[0])).given(**vars(stated))
+    if is_raw(photo):
+        developed = read_photograph(photo)
+        rgb, largest = developed.rgb, full_value(photo)
+        facts = PhotoFacts(**{each.name: getattr(developed, each.name) for each in fields(PhotoFacts)})
+    else:
+        rgb = read_image(photo, "linear" if lights.linear else "srgb")
+        largest = 1.0 if photo.suffix.lower() in ENCODED_SUFFIXES else float("inf")
+        facts = read_facts(photo, (rgb.shape[1], rgb.shape[0]))
+    facts = facts.given(**vars(stated))
     facts.require(photo)
-    largest = 1.0 if photo.suffix.lower() in ENCODED_SUFFIXES else float("inf")
     found = match_lens(rgb, facts, side=_SIDES[lights.side], depth_m=lights.depth_m, largest_value=largest)
     write_lens(out, found.lens)
     tell(as_text(table_of(found)))

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.commands._insertion_options import FocusAtOption, LensFacts, focused_at_pixel, require_one_focus
+from mrbokeh.commands._insertion_options import FocusAtOption, LensFacts, require_one_focus, typed_place
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.refocus import Refocusing
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
@@ -72,12 +72,12 @@ def refocus(
     from mrbokeh.images.image_io import require_suffix
     from mrbokeh.stacks.focal_stack import read_focal_stack, write_focal_stack
     from mrbokeh.stacks.focus_places import FocusLookup, parse_focus
-    from mrbokeh.stacks.guessed_metres import growth_note, inherited_facts, metres_line, metres_note, unit_of
+    from mrbokeh.stacks.guessed_metres import growth_note, guess_metres, inherited_facts, unit_of
     from mrbokeh.system.atomic_files import require_safe_outputs
     from mrbokeh.system.console import kept_when_interrupted
 
     require_one_focus(focus=focus, focus_at=focus_at)
-    if focus is None and focus_at is None:
+    if focus_at is None and focus is None:
         raise InputError("where to focus? Give --focus, such as --focus 0.8,1.2 in metres, or --focus-at X,Y on what is seen at a pixel")
     if out.resolve() == stack.resolve():
         raise InputError("--out must be another folder than the stack's own")
@@ -86,12 +86,12 @@ def refocus(
         require_safe_outputs((result.sheet,), (blur.lens, out), result.overwrite)
     source = read_focal_stack(stack)
     way = _refocusing(source, blur, facts)
-    if focus is not None:
-        distances_m = parse_focus(focus, FocusLookup.of(source))
-    else:
-        lens = source.lens_of(source.reference) if way.lens is None else way.lens
-        distances_m = (focused_at_pixel(lens, source.depth_m(), focus_at or "").focus_distance_m,)
-    guess(metres_note(source), metres_line(source))
+    seen = FocusLookup.of(source)
+    if focus_at is not None:
+        x_px, y_px, *radius_px = typed_place(focus_at)
+        focus, seen = f"@{x_px},{y_px}", replace(seen, within_px=float(*radius_px)) if radius_px else seen
+    distances_m = parse_focus(str(focus), seen)
+    guess_metres(source)
     guess(growth_note(source, way.lens))
     _make_room(out, result.overwrite)
     settings = {"stack": str(stack.resolve()), **vars(blur), **facts.given, "lens": str(blur.lens)}
@@ -105,7 +105,8 @@ def refocus(
         _write_sheet(result.sheet, made)
     focused = ", ".join(f"{each:.3g}" for each in distances_m)
     told = f"wrote {out} ({len(slices)} slice{'' if len(slices) == 1 else 's'}, in focus at {focused} {unit_of(source)} from the lens)"
-    tell(told, known=way.lens_at(distances_m[0]).facts if source.metres_known else {}, slices=len(slices), focus_distances_m=distances_m)
+    lens_facts, figures = (way.lens_at(distances_m[0]).facts, {"focus_distances_m": distances_m}) if source.metres_known else ({}, {})
+    tell(told, known=lens_facts, slices=len(slices), **figures)
 
 
 def _write_sharp(source: FocalStack, made: FocalStack, distances_m: tuple[float, ...]) -> None:
@@ -141,7 +142,7 @@ def _refocusing(source: FocalStack, blur: BlurOptions, facts: LensFacts) -> Refo
 
     lens, renderer = lens_and_renderer(blur.lens, blur.renderer)
     if facts.given:
-        lens = (lens or source.lens_of(source.reference)).stating(facts.given)
+        lens = facts.on(lens or source.lens_of(source.reference), renderer)
     return Refocusing(source, renderer, lens, blur.residuals)
 
 

@@ -20,7 +20,7 @@ from mrbokeh.depth.depth_map import DepthSettings, parse_known, parse_near_far, 
 from mrbokeh.optics.lens import Lens
 from mrbokeh.refocus import SharpPhotograph
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
-from mrbokeh.system.channel import guess, tell, warn
+from mrbokeh.system.channel import tell, warn
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 
@@ -125,7 +125,7 @@ def transfer(
     """
     from mrbokeh.refocus import open_sharp, seen_like, with_recovered_highlights
     from mrbokeh.renderers.choose import lens_and_renderer
-    from mrbokeh.stacks.guessed_metres import metres_line, metres_note, stack_of_file
+    from mrbokeh.stacks.guessed_metres import guess_metres, stack_of_file
     from mrbokeh.stacks.photograph import lens_for_photograph
     from mrbokeh.video.picture_source import parse_rate
 
@@ -133,8 +133,9 @@ def transfer(
     settings = depth.settings
     given, blurs = lens_and_renderer(lens, blur.renderer)
     sharp = open_sharp(photo, depth.depth, settings)
-    for stack in filter(None, (sharp.stack, stack_of_file(depth.depth))):
-        guess(metres_note(stack), metres_line(stack))
+    stacks = [stack for stack in (sharp.stack, stack_of_file(depth.depth)) if stack is not None]
+    for stack in stacks:
+        guess_metres(stack)
     held = lens_for_photograph(facts.on(given, blurs), sharp.photograph, photo)
     chosen = seen_like(held, sharp.photograph, photo) if blur.same_view else held
     distances_m = _distances(chosen, sharp, focusing)
@@ -158,9 +159,10 @@ def transfer(
             f"hardly anything is blurred ({coc_px:.1f} px at most): a smaller --f-number blurs more; where the depth has no unit, "
             f"--disparity NEAR:FAR gives it one"
         )
+    focused = {"focus_distance_m": distances_m}
     tell(
         f"wrote {out} ({focus}depth: {sharp.depth.note}; largest circle of confusion {coc_px:.1f} px)",
-        known=chosen.facts | {"depth": sharp.depth.note, "focus_distance_m": distances_m},
+        known=chosen.facts | {"depth": sharp.depth.note} | (focused if all(stack.metres_known for stack in stacks) else {}),
         largest_coc_px=coc_px,
     )
 

@@ -10,13 +10,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mrbokeh.commands import _insertion_options as shared
-from mrbokeh.commands._insertion_options import ColourOptions, LensFacts, LookGroup, VirtualOptions, focused_at_pixel, require_one_focus
+from mrbokeh.commands._insertion_options import (
+    ColourOptions,
+    LensFacts,
+    LookGroup,
+    VirtualOptions,
+    focused_at_pixel,
+    near_far_of,
+    require_one_focus,
+)
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.compositing.choose import DEFAULT_MODE
 from mrbokeh.compositing.plate_look.finishing import LookOptions
-from mrbokeh.depth.depth_map import parse_near_far
-from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.choose import BY_NAME, DEFAULT
+from mrbokeh.renderers.choose import BY_NAME, DEFAULT, make_renderer
 from mrbokeh.shots.composite_recipe import CompositeRecipe
 from mrbokeh.shots.executors import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
 from mrbokeh.shots.frame_sources import CameraFile, ClipLook, DepthFiles, FocusPulled, MatteFiles
@@ -71,7 +77,8 @@ class RenderingOptions(shared.RenderingOptions):
 
     scene_begin: Annotated[float, typer.Option(help="Second of the clip at which the animations of --scene begin.")] = 0.0
     shutter: Annotated[
-        float | None, typer.Option(min=0.0, max=360.0, metavar="DEGREES", help="Shutter angle: --scene is blurred by its motion.")
+        float | None,
+        typer.Option(min=0.0, max=360.0, callback=shared.in_degrees, help="Shutter angle: --scene is blurred by its motion."),
     ] = None
     readout: Annotated[float, typer.Option(help="Seconds from the first to the last row of a rolling shutter, with --shutter.")] = 0.0
 
@@ -141,6 +148,8 @@ def recipe_of(
     """Return the recipe of every frame. Raises InputError if options do not go together."""
     _check_virtual(virtual, rendering)
     require_one_focus(focus=blur.focus, focus_at=blur.focus_at, focus_pull=blur.focus_pull)
+    facts.on(None, make_renderer(blur.renderer))  # refuses facts that a network cannot follow
+    holding = SensorOrientation((source.info.width_px, source.info.height_px), source.info.quarter_turns)
     objects = virtual.object_names
     files = tuple(LayerFiles(path.resolve(), objects) for path in virtual.layer or ())
     recipe = CompositeRecipe(
@@ -150,24 +159,25 @@ def recipe_of(
         mode=virtual.mode or (DEFAULT_MODE if taken.matte is None else "between"),
         camera=_camera(source, virtual),
         focus=None if blur.focus_pull is None else FocusPulled.of(blur.focus_pull),
-        depth=None if taken.depth is None else _depth(taken.depth, taken),
+        depth=_depth(taken),
         matte=None if taken.matte is None else MatteFiles(taken.matte.resolve()),
         near_m=taken.near_distance,
         look=_look(look, source, taken),
         first_number=_first_number(source, taken),
         virtual_only=virtual_only,
-        holding=SensorOrientation((source.info.width_px, source.info.height_px), source.info.quarter_turns),
+        holding=holding,
         facts=tuple((facts.given | ({} if blur.focus is None else {"focus_distance_m": blur.focus})).items()),
     )
     if blur.focus_at is not None:
-        focused = focused_at_pixel(_held(recipe), _first_depth_m(recipe, source, taken), blur.focus_at)
+        focused = focused_at_pixel(lens_for_orientation(recipe.stated_lens, holding), _first_depth_m(recipe, source, taken), blur.focus_at)
         recipe = replace(recipe, facts=(*recipe.facts, ("focus_distance_m", focused.focus_distance_m)))
-    _held(recipe, source.path)
+    lens_for_orientation(recipe.stated_lens, holding, source.path)  # tells once how the lens is turned, for every worker turns it alike
     return recipe
 
 
-def _depth(path: Path, taken: ClipOptions) -> DepthFiles:
-    return DepthFiles(path.resolve(), taken.steady_depth, None if taken.disparity is None else parse_near_far(taken.disparity))
+def _depth(taken: ClipOptions) -> DepthFiles | None:
+    near_far_m = near_far_of(taken.disparity, taken.depth)
+    return None if taken.depth is None else DepthFiles(taken.depth.resolve(), taken.steady_depth, near_far_m)
 
 
 def _first_depth_m(recipe: CompositeRecipe, source: PictureSource, taken: ClipOptions) -> "np.ndarray | None":
@@ -246,12 +256,6 @@ def _look(look: LookGroup, source: PictureSource, taken: ClipOptions) -> ClipLoo
     return ClipLook(
         options=look.wanted, clip=source.path, rate=taken.rate, start=start, first_number=_first_number(source, taken), space=source.space
     )
-
-
-def _held(recipe: CompositeRecipe, told_of: Path | None = None) -> Lens:
-    """Return the lens for the orientation of the camera, of which a line tells once, for every worker turns the lens alike."""
-    assert recipe.holding is not None
-    return lens_for_orientation(recipe.stated_lens, recipe.holding, told_of)
 
 
 def _first_number(source: PictureSource, taken: ClipOptions) -> int:

@@ -12,7 +12,6 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.system.errors import InputError
 
-_NEAR_PIXEL_PX = 2.0
 _PLACE = r"@[^,:@#]+,[^,:@#]+|#[^,:@#]+|[^,:@#]+"
 _EXPECTED = (
     "expected different places such as 0.8,1.2,inf (metres), @300,200 (what is seen at that pixel), #2.5 (between slices 2 and 3, "
@@ -22,11 +21,15 @@ _EXPECTED = (
 
 @dataclass(frozen=True)
 class FocusLookup:
-    """Lookup of focus places. depth_m: of the picture, or None. slices_m: focus distances of the slices, in their order."""
+    """Lookup of focus places.
+
+    depth_m: of the picture, or None. slices_m: focus distances of the slices, in their order. within_px: how far around a pixel counts.
+    """
 
     lens: Lens
     depth_m: Float32[np.ndarray, "height width"] | None = None
     slices_m: tuple[float, ...] = ()
+    within_px: float = 2.0
 
     @classmethod
     def of(cls, stack: FocalStack) -> "FocusLookup":
@@ -37,7 +40,7 @@ class FocusLookup:
         """Return the focus distance at which what is seen at a pixel is sharp."""
         if self.depth_m is None:
             raise InputError(f"--focus @{x_px:g},{y_px:g} needs the depth of the picture: give metres, or a stack")
-        return self.lens.focused_on(self.depth_m, x_px + 0.5, y_px + 0.5, _NEAR_PIXEL_PX).focus_distance_m
+        return self.lens.focused_on(self.depth_m, x_px + 0.5, y_px + 0.5, self.within_px).focus_distance_m
 
     def at_slice(self, position: float) -> float:
         """Return the focus distance at a place between slices, evenly in dioptres."""

@@ -10,6 +10,7 @@ from typing import Any
 
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FILE_NAME, METRES, FocalStack, read_focal_stack
+from mrbokeh.system.channel import guess
 
 GUESSED = "guessed metres"
 STATED_BEFORE = "stated_before_guessing"
@@ -87,6 +88,11 @@ def metres_line(stack: FocalStack) -> str:
     if stack.metres_known:
         return f"{stack.folder}: still guessed: {guesses(stack)} ({more})"
     return f"{stack.folder}: metres are guessed; `mrbokeh capture scale --ruler` makes them known ({more})"
+
+
+def guess_metres(stack: FocalStack) -> None:
+    """Say which metres are guessed, in a few words; --json holds the reasons."""
+    guess(metres_note(stack), metres_line(stack))
 
 
 def growth_note(stack: FocalStack, lens: Lens | None) -> str:

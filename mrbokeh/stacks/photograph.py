@@ -99,6 +99,11 @@ def is_raw(path: Path) -> bool:
     return bool(import_module(_READER).is_raw(path))
 
 
+def full_value(path: Path) -> float:
+    """Return what a white light that filled all photosites of a RAW file reads: the largest multiplier of the white balance."""
+    return float(max(import_module("capture.photos.raw").camera_white_balance(path)))
+
+
 def read_photograph(path: Path | str) -> Photograph:
     """Read a RAW file, JPEG, TIFF, PNG, WebP, EXR or HDR.
 

@@ -128,13 +128,24 @@ def test_a_name_means_the_same_everywhere(every: dict[str, Any]) -> None:
 def test_words_are_of_options_that_exist(every: dict[str, Any]) -> None:
     """In the tables of panels, units, choices and everyday options; every option of a long list has a subject."""
     options = {name.removeprefix("--") for name in options_of_all(every)} | {"model"}
-    named = {name for table in (PANELS, METAVARS) for names in table.values() for name in names.split()} | set(CHOICES)
+    named = {name for table in (PANELS, METAVARS) for names in table.values() for name in names.split()} | {
+        name.split()[-1] for name in CHOICES
+    }
     assert named <= options, named - options
     for path, names in EVERYDAY.items():
         own = {parameter.opts[0].removeprefix("--") for parameter in every[path].params}
         assert set(names.split()) <= own and len(names.split()) <= 8, path
     for path, command in every.items():
         assert sum(parameter.rich_help_panel == "More" for parameter in command.params) <= 6, path
+
+
+def test_the_shell_offers_cameras_where_one_is_taken(every: dict[str, Any]) -> None:
+    def offered(command: str, name: str) -> list[str]:
+        parameter = next(each for each in every[command].params if each.name == name)
+        return [each.value for each in parameter.shell_complete(None, "")]
+
+    assert "whip" in offered("viewfinder", "source") and "whip" not in offered("capture shoot", "source")
+    assert "gphoto2" not in offered("track convert", "source")
 
 
 def test_choices_that_the_shell_offers_are_those_that_commands_take() -> None:

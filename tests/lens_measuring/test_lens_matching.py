@@ -11,6 +11,7 @@ from PIL import Image
 from shapely import Polygon
 from typer.testing import CliRunner
 
+from datasets_scripts.made_sets.simulated_camera import SensorModel, ShotMetadata, write_dng
 from mrbokeh.cli import main
 from mrbokeh.commands.lens import app
 from mrbokeh.images.color import linear_to_srgb, srgb_to_linear
@@ -26,6 +27,7 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
+from mrbokeh.stacks.photograph import full_value, read_photograph
 from mrbokeh.system.errors import InputError
 from tests.support.refusals import refused
 
@@ -349,6 +351,21 @@ def test_the_command_writes_a_lens_and_its_evidence(tmp_path: Path) -> None:
     assert picture is not None and picture.std() > 10.0
     again = CliRunner().invoke(app, [*given, "--sensor-width", "14"])
     assert isinstance(again.exception, InputError) and "--overwrite" in str(again.exception)
+
+
+def test_a_raw_file_tells_its_lens_and_which_lights_are_full(tmp_path: Path) -> None:
+    sensor, lens = SensorModel(full_well_electrons=0.0, read_noise_electrons=0.0), replace(LENS, sensor_width_mm=14.0)
+    light = linear(photograph(HEPTAGON)) * np.float32(4.0)
+    write_dng(tmp_path / "night.dng", sensor.quantise(sensor.linear_mosaic(light)), sensor, ShotMetadata(lens))
+    result = CliRunner().invoke(app, ["match", str(tmp_path / "night.dng"), "--out", str(tmp_path / "lens.json")])
+    assert result.exit_code == 0, result.exception
+    found = read_lens(tmp_path / "lens.json")
+    opening, truth = (Polygon(each.outlines[0]) for each in (found.aperture, HEPTAGON))
+    assert (found.focal_length_mm, found.f_number) == (50.0, 1.8) and opening.intersection(truth).area / opening.union(truth).area > 0.94
+    full = full_value(tmp_path / "night.dng")
+    discs = find_discs(read_photograph(tmp_path / "night.dng").rgb.max(axis=2), full)
+    levels = [each.level for each in discs if each.full]
+    assert 2 * len(levels) > len(discs) > len(levels) and levels == pytest.approx([full] * len(levels), rel=1e-3)
 
 
 def test_mistakes_of_the_user_end_in_one_sentence(

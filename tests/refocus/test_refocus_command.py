@@ -17,6 +17,7 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.refocus import Refocusing, leave_one_out, lens_at
+from mrbokeh.renderers.onnx_network import OnnxNetwork
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
@@ -50,7 +51,7 @@ def test_a_captured_focus_gives_the_captured_slice_and_others_what_the_lens_give
     np.testing.assert_array_equal(way.slice_at(0.5), way.rendered(0.5))
 
 
-def test_the_lens_and_the_focus_may_be_told_by_facts_and_by_a_pixel(tmp_path: Path) -> None:
+def test_the_lens_and_the_focus_may_be_told_by_facts_and_by_a_pixel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stack = card_stack(tmp_path / "stack")
     wide = replace(stack.lens_of(stack.reference), f_number=LENS.f_number / 2, sensor_width_mm=2 * LENS.sensor_width_mm)
     write_lens(tmp_path / "wide.json", wide)
@@ -61,6 +62,8 @@ def test_the_lens_and_the_focus_may_be_told_by_facts_and_by_a_pixel(tmp_path: Pa
     assert by_facts.focus_distances_m == pytest.approx(by_file.focus_distances_m)
     np.testing.assert_allclose(by_facts.slice_rgb(0), by_file.slice_rgb(0), atol=1e-5)
     refused("where to focus", run, stack.folder, "--out", tmp_path / "no")
+    monkeypatch.setattr("mrbokeh.renderers.choose.make_renderer", lambda _: object.__new__(OnnxNetwork))
+    refused("a network blurs as the lens", run, stack.folder, "--focus", "1", *facts, "--renderer", "my.onnx", "--out", tmp_path / "no")
 
 
 def test_nothing_pops_where_a_focus_pull_passes_a_captured_slice(tmp_path: Path) -> None:

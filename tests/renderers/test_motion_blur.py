@@ -154,7 +154,7 @@ def test_the_command_blurs_by_motion(tmp_path: Path) -> None:
     np.testing.assert_allclose(written, expected, atol=2e-3)
 
 
-@pytest.mark.parametrize("shutter", ["180", "540"])
+@pytest.mark.parametrize("shutter", ["180", "360"])
 def test_the_command_blurs_by_a_bank_that_holds_motion(tmp_path: Path, combined: Path, shutter: str) -> None:
     """Picture, depth and motion in files, a layer with its own motion in front; as the exact renderer draws it out."""
     card = object_layer(40, -6.0)

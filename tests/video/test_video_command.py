@@ -20,6 +20,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.camera import camera_to_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.renderers.onnx_network import OnnxNetwork
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.errors import InputError
@@ -154,7 +155,7 @@ def test_ctrl_c_keeps_finished_segments_and_the_same_command_goes_on(clip: Path,
     assert [file.name for file in out.parent.iterdir()] == ["out.mp4"] and len(list(read_frames(out))) == 12
 
 
-def test_facts_of_the_lens_may_stand_in_options(clip: Path, settings: list[str], tmp_path: Path) -> None:
+def test_facts_of_the_lens_may_stand_in_options(clip: Path, settings: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All of them in place of a file; the focus also by a pixel, on depth that is even in 1/distance."""
     facts = ["--focal-length", "50", "--f-number", "2", "--sensor-width", "6", "--layer", tmp_path / "layer.exr", "--renderer", "scatter"]
     write_image(tmp_path / "near.png", np.full((64, 96, 3), 0.5, np.float32), "linear")  # 2 m
@@ -166,7 +167,10 @@ def test_facts_of_the_lens_may_stand_in_options(clip: Path, settings: list[str],
     np.testing.assert_array_equal(by_file[5].rgb, by_options[5].rgb)
     np.testing.assert_allclose(by_pixel[5].rgb, by_file[5].rgb, atol=2e-3)  # the picture of disparity has 65536 steps
     refused("not both", run, clip, *facts, "--focus", "2", "--focus-pull", "0:1", "--out", tmp_path / "no.mkv")
+    refused("--disparity 1:9 says what the numbers", run, clip, *facts, "--disparity", "1:9", "--out", tmp_path / "no.mkv")
     refused("there is no depth", run, clip, *facts, "--focus-at", "1,1", "--out", tmp_path / "no.mkv")
+    monkeypatch.setattr("mrbokeh.commands.video.make_renderer", lambda _: object.__new__(OnnxNetwork))
+    refused("a network blurs as the lens", run, clip, *facts, "--renderer", "my.onnx", "--out", tmp_path / "no.mkv")
 
 
 def test_the_focus_is_pulled(clip: Path, settings: list[str], tmp_path: Path) -> None:
