@@ -28,8 +28,9 @@ from mrbokeh.renderers.onnx_sessions import open_session
 from mrbokeh.scene.gltf.gltf_loader import load_glb
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.writer import VideoWriter
-from tests.support.command_line import mrbokeh
+from tests.support.command_line import mrbokeh, printed_by
 from tests.support.refusals import refused
+from viewfinder.cli import board_command
 
 RNG = np.random.default_rng(0)
 
@@ -84,6 +85,14 @@ def test_what_is_read_is_never_written_over(card: Path) -> None:
     assert "--leaks: expected a name that ends in .png" in refusal("check", card, "--against", card, "--leaks", card)
     assert "--log" in refusal("lens", "coc", lens, 1, "--log", lens)
     assert {path: path.read_bytes() for path in before} == before
+
+
+def test_numbers_that_say_nothing_are_refused(card: Path) -> None:
+    photo, out = card.with_name("photo.png"), card.with_name("out.png")
+    write_image(photo, RNG.random((24, 32, 3)).astype(np.float32))
+    alone = refusal("composite", photo, "--layer", card, "--lens", card.with_name("lens.json"), "--disparity", "1:9", "--out", out)
+    assert "--disparity 1:9 says what the numbers of a --depth file mean" in alone
+    assert "--far" in printed_by(board_command, "--far", 0, "--out", card.with_name("board.pdf"), exit_code=2)
 
 
 def test_two_results_need_two_names(card: Path) -> None:
