@@ -38,7 +38,7 @@ def report_command(
     overwrite: Annotated[bool, typer.Option("--overwrite", help="examine again what was examined already")] = False,
 ) -> None:
     from capture.report import HTML_NAME
-    from capture.report.gates import PICTURES, by_use, tally, verdict_line, verdict_lines
+    from capture.report.gates import PICTURES, by_use, failed, tally, verdict_line, verdict_lines
     from capture.report.scene_report import report_scene, require_gates, unmet
     from capture.report.stack_view import reblur_by
     from mrbokeh.system.console import kept_when_interrupted
@@ -57,6 +57,8 @@ def report_command(
     say(f"{scene / HTML_NAME} shows the worst places and what to do: {tally(report.gates)}{before}")
     if report.failures and not strict:
         count = "1 gate failed" if len(report.failures) == 1 else f"{len(report.failures)} gates failed"
+        if not failed(by_use(report.gates).get(PICTURES, [])):
+            count = f"the pictures are good; {count} that only refocusing and training need"
         say(f"{count}: --strict would make this an error (exit code 1)")
     short_of = unmet(report, allowed) if strict else []
     if any(not each.failed for each in short_of):

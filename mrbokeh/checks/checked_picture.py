@@ -162,7 +162,9 @@ class Shot:
 
 
 def open_shot(path: Path) -> Shot:
-    """Open a shot. Raises InputError if there is nothing to check."""
+    """Open a shot; shot.%04d.exr is all of its folder. Raises InputError if there is nothing to check."""
+    if "%" in path.name and path.parent.is_dir():
+        return _numbered(path.parent)
     if not path.exists():
         raise InputError(f"expected a picture, a folder of pictures, a focal stack or a film at {path}, but there is nothing")
     if path.is_dir():

@@ -13,7 +13,17 @@ import numpy as np
 from mrbokeh.commands._composite_options import LensOptions, ObjectOptions, PlateOptions, RenderingOptions, ResultOptions
 from mrbokeh.commands._insertion_options import ColourOptions, LookGroup, VirtualOptions, near_far_of
 from mrbokeh.compositing.near_and_far import nearer_than
-from mrbokeh.compositing.plate import Inserted, Plate, bundle_plate, ended_shadow, open_plate, with_depth, with_matte, with_own_alpha
+from mrbokeh.compositing.plate import (
+    Inserted,
+    Plate,
+    bundle_plate,
+    ended_shadow,
+    open_plate,
+    with_blur_in_metres,
+    with_depth,
+    with_matte,
+    with_own_alpha,
+)
 from mrbokeh.depth.depth_map import DepthSettings, parse_near_far
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.alpha_io import HOLDING_ALPHA, alpha_with
@@ -61,7 +71,9 @@ def plate_by(
         plate = replace(plate, sharp_rgb=sharp_rgb)
     source = options.depth or (photo if near_far_m or options.depth_scale else None)
     if source is not None:
-        plate = with_depth(plate, source, DepthSettings(near_far_m, options.depth_scale))
+        before_m, plate = plate.depth_m, with_depth(plate, source, DepthSettings(near_far_m, options.depth_scale))
+        if own is not None and plate.blur_from and before_m is not None:
+            plate = with_blur_in_metres(plate, before_m, focus_m)
     return plate if options.matte is None else with_matte(plate, options.matte)
 
 

@@ -68,6 +68,7 @@ WORK = (
             for method in ("polygon", "laplacian", "low-rank", "scatter")
         ),
         ("transfer", str(_TRUTH / "all_in_focus.exr"), *_BLUR, "--focus", "0.8", "--out", "transferred.png"),
+        ("render", "--rgb", str(DATA / "pcb_oblique" / "04.jpg"), "--srgb", "--depth", "4", "--focus", "0.8", "--out", "larger.exr"),
     ),
     (
         ("capture", "process", str(DATA / "pcb_oblique"), "--max-width", "320", "--out", "scene"),
@@ -77,7 +78,8 @@ WORK = (
     ),
     (("viewfinder", "--demo", "--port", "0"),),
 )
-"""Commands that need nearly all kernels: rows that run side by side, the last only where its extra is installed."""
+"""Commands that need nearly all kernels: rows that run side by side, the last only where its extra is installed. A larger picture takes
+single precision."""
 SHOWN = "the scene is shown"
 _MOST_TOLD, _LONGEST_S = 500, 900.0
 OPENCV = "opencv-contrib-python-headless"

@@ -78,9 +78,10 @@ def render(
     sharp = {} if given.samples is not None else read_sharp(given)
     if given.samples is not None and facts.given:
         raise InputError("--samples hold the blur of their own lens: leave --focal-length, --f-number and --sensor-width out")
-    used = focused(facts.on(None if lens is None else read_lens(lens)), sharp, focus)
+    renderer = chosen_renderer(blur.method, blur.psf, threads=blur.threads, layering=Layering(slices=blur.slices), device=blur.device)
+    # A network brings its lens.
+    used = focused(facts.on(getattr(renderer, "lens", None) if lens is None else read_lens(lens)), sharp, focus)
     with working("rendering"):
-        renderer = chosen_renderer(blur.method, blur.psf, threads=blur.threads, layering=Layering(slices=blur.slices), device=blur.device)
         if given.samples is None:
             blurred = renderer.render(list(sharp.values()), used)
         else:

@@ -149,6 +149,21 @@ def _with_the_phones_blur(photograph: Photograph, focus: PhoneFocus, photo: Path
     return replace(photograph, **facts, f_number=f_number, focus_distance_m=wide_open.focus_distance_m)  # type: ignore[arg-type]
 
 
+def with_blur_in_metres(plate: Plate, before_m: Float32[np.ndarray, "height width"], focus_m: float | None) -> Plate:
+    """Return the plate with the same blur in pixels by a lens that fits its depth, which was in another unit before.
+
+    Dioptres of both are a + b times one another, so that the focus follows, and the lens has 1 / b of the blur per dioptre. focus_m: given.
+    """
+    assert plate.depth_m is not None
+    ends = [np.unravel_index(int(each), before_m.shape) for each in (before_m.argmax(), before_m.argmin())]
+    old, new = ([1.0 / float(depth[place]) for place in ends] for depth in (before_m, plate.depth_m))
+    factor, lens, width_px = (new[1] - new[0]) / max(old[1] - old[0], 1e-9), plate.lens, plate.rgb.shape[1]
+    dioptres = new[0] + factor * (1.0 / lens.focus_distance_m - old[0])
+    focused = lens.focused_at(focus_m or (1.0 / dioptres if dioptres > 0 else float("inf")))
+    wanted = lens.coc_px_per_dioptre(width_px) / factor
+    return replace(plate, lens=replace(focused, f_number=focused.f_number * focused.coc_px_per_dioptre(width_px) / wanted))
+
+
 def plate_of(rgb: Float32[np.ndarray, "height width 3"], lens: Lens, depth_m: Float32[np.ndarray, "height width"] | None = None) -> Plate:
     """A picture through the pinhole of its lens, which looks at its middle."""
     return Plate(rgb, depth_m, lens, camera_of_lens(lens, rgb.shape[1], rgb.shape[0]))

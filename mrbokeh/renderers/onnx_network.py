@@ -108,7 +108,8 @@ def window_around(reached: Bool[np.ndarray, "height width"], margin_px: int) -> 
 
 __all__ = ["FORMAT", "METADATA_KEY", "NetworkFacts", "OnnxNetwork"]
 
-_SAME_LENS = 5e-3
+_SAME_LENS = 0.05
+"""Share by which a lens may differ: registered slices of a lens that breathes state a sensor up to 3 % narrower, and f-numbers alike."""
 _COC_SLACK = 1.02
 _SENSOR_BLUR_PX = 1  # a photograph is never sharper than its sensor, so light learned from it reaches a little beyond its disc
 

@@ -53,13 +53,19 @@ class FocusLookup:
         return _distance(float(np.interp(position, np.arange(len(self.slices_m)), [1.0 / each for each in self.slices_m])))
 
 
-MOST_PLACES = 1000
+MOST_PLACES, _BEYOND = 1000, 100.0
 
 
 def parse_focus(text: str, seen: FocusLookup) -> tuple[float, ...]:
     """Return focus distances in metres, all different."""
     if not (places := _places(text, seen)) or not all(each > 0 for each in places) or len(set(places)) < len(places):
         raise InputError(f"--focus: {_EXPECTED}, got {text!r}")
+    farthest_m = max((each for each in seen.slices_m if each < float("inf")), default=float("inf"))
+    if beyond := [each for each in places if _BEYOND * farthest_m < each < float("inf")]:
+        raise InputError(
+            f"--focus: {beyond[0]:g} m is {beyond[0] / farthest_m:.0f} times as far as the farthest slice: a pixel is written @X,Y "
+            f"(or --focus-at X,Y), and far away is inf"
+        )
     return places
 
 

@@ -14,7 +14,7 @@ from mrbokeh.commands._composite_parts import plate_by
 from mrbokeh.commands._insertion_options import ColourOptions
 from mrbokeh.commands.composite import app
 from mrbokeh.compositing.choose import best_mode, insertion_of
-from mrbokeh.compositing.plate import ended_shadow, plate_of, with_ground_behind
+from mrbokeh.compositing.plate import ended_shadow, plate_of, with_blur_in_metres, with_ground_behind
 from mrbokeh.demo.plan import DATA
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.exr_io import read_exr
@@ -127,6 +127,18 @@ def test_the_ground_never_hides_what_stands_on_it_and_a_post_before_it_does() ->
     assert hidden[40, 120].max() < 0.5 < 0.95 < whole[40, 120].min(), "where depth is wrong"
     assert whole[60, 30].max() < 0.5, "the post, whose own foot is nearer"
     np.testing.assert_array_equal(hidden[80:], whole[80:])
+
+
+def test_blur_stays_when_depth_is_told_in_metres() -> None:
+    """A phone's depth of 10 to 40 units, focused at 16, is told to be 1 to 20 m: dioptres go from 0.1..0.025 to 1..0.05."""
+    units = np.linspace(10.0, 40.0, HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH)
+    told_m = (1.0 / (0.05 + (1.0 / units - 0.025) * 0.95 / 0.075)).astype(np.float32)
+    lens = replace(LENS, focus_distance_m=16.0, f_number=0.05)
+    plate = with_blur_in_metres(plate_of(plate_rgb(), lens, told_m), units, None)
+    assert plate.depth_m is not None and plate.lens.focus_distance_m == pytest.approx(1 / (0.05 + 0.0375 * 0.95 / 0.075), rel=1e-4)
+    np.testing.assert_allclose(
+        plate.lens.coc_px(plate.depth_m, WIDTH), lens.coc_px(units, WIDTH), atol=0.02 * np.abs(lens.coc_px(units, WIDTH)).max()
+    )
 
 
 def test_a_shadow_ends_where_the_table_ends() -> None:

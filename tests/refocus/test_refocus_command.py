@@ -193,6 +193,7 @@ def test_distances_evenly_in_dioptres() -> None:
     """From 0.5 m to infinity in five: 2, 1.5, 1, 0.5 and 0 dioptres."""
     assert parse_focus("0.5:inf:5", FocusLookup(LENS)) == pytest.approx((0.5, 2 / 3, 1.0, 2.0, float("inf")))
     assert parse_focus("0.8,inf", FocusLookup(LENS)) == (0.8, float("inf"))
+    refused("270 times as far as the farthest slice: a pixel is written @X,Y", parse_focus, "540,600", FocusLookup(LENS, None, (1.0, 2.0)))
 
 
 # ---- one virtual scene in all slices

@@ -14,7 +14,9 @@ Munkberg et al. 2014 with the improvements of Hasselgren et al. 2015; docs/metho
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float32
@@ -41,6 +43,22 @@ class PartitionCounts:
 
     before: float
     after: float
+
+
+_BYTES_PER_SAMPLE = 180
+"""Measured: 4.3 GB at 750x500 pixels with 64 samples each."""
+
+
+def _require_memory(size_px: tuple[int, ...], per_pixel: int) -> None:
+    """Raise InputError where samples of a picture (height, width) do not fit into the memory that is free, as far as the system tells."""
+    needed_gb, free_gb = size_px[0] * size_px[1] * per_pixel * _BYTES_PER_SAMPLE / 1e9, float("inf")
+    with suppress(OSError, ValueError, IndexError):
+        free_gb = int(Path("/proc/meminfo").read_text().split("MemAvailable:")[1].split()[0]) / 1e6
+    if needed_gb > free_gb:
+        raise InputError(
+            f"layered reconstruction of {size_px[1]}x{size_px[0]} px takes about {needed_gb:.0f} GB of memory, {free_gb:.0f} GB are free: "
+            f"render a smaller picture, or take another renderer"
+        )
 
 
 @dataclass(frozen=True)
@@ -70,6 +88,7 @@ class LayeredReconstruction:
         Takes openings that are the same over the frame and for all colours; InputError for cat-eyes and chromatic errors.
         """
         flat, aperture = flatten(layers), lens.aperture
+        _require_memory(flat.alpha.shape, self.per_pixel)
         if aperture.varies_over_field or aperture.is_chromatic:
             raise InputError(
                 "layered reconstruction takes openings that are the same over the frame and for all colours: set cat_eye, "
