@@ -138,6 +138,11 @@ def test_another_lens_is_refused(network: OnnxNetwork, name: str, value: float) 
         network.render([card(1.0)], replace(LENS, **{name: value}))
 
 
+def test_a_slice_of_a_breathing_lens_is_taken(network: OnnxNetwork) -> None:
+    """Its registered slices state a sensor narrower by up to 3 %, and their f-numbers differ by 1.5 %: all blur that it saw in training."""
+    network.render([card(1.0)], replace(LENS, sensor_width_mm=0.97 * LENS.sensor_width_mm, f_number=0.985 * LENS.f_number))
+
+
 def test_the_trained_lens_may_be_held_upright(network: OnnxNetwork) -> None:
     """Two thirds of the sensor over two thirds of the pixels: the same circles of confusion."""
     long_mm = LENS.sensor_width_mm
