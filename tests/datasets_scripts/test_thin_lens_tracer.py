@@ -66,6 +66,7 @@ def test_bokeh_is_the_outline_behind_focus_and_its_mirror_image_in_front(z_m: fl
     assert np.abs(picture - np.pad(mirrored, border)).sum() > 0.5
 
 
+@pytest.mark.slow
 def test_many_lens_rays_and_light_sampling_give_the_same_lamp() -> None:
     """A lamp is sampled on itself, a bright emissive quad of the same outline by lens rays: two ways to one integral."""
     side_m, z_m = 0.0006, 1.25
@@ -102,6 +103,7 @@ def test_profile_of_a_straight_occluder(shape: str) -> None:
     assert np.abs(picture - expected).max() < 0.04
 
 
+@pytest.mark.slow
 def test_focus_breathing_scales_the_picture_by_the_image_distance() -> None:
     """A lamp off the axis, blurred in front of and behind the focus: its centre moves as d_s = f d_f / (d_f - f), 4.3 % in all."""
     scene = lamp(0.002, 0.001, 0.8, 0.0003)
@@ -114,6 +116,7 @@ def test_focus_breathing_scales_the_picture_by_the_image_distance() -> None:
     assert offsets[0] == pytest.approx(np.array([0.002, 0.001]) / 0.8 * near.focal_px(SIZE_PX), abs=0.03)
 
 
+@pytest.mark.slow
 def test_what_lies_in_the_focus_plane_is_as_sharp_as_a_pinhole_sees_it() -> None:
     texture = np.random.default_rng(0).random((64, 64, 3)).astype(np.float32)
     scene = wall(1.0, texture, half_m=0.008)

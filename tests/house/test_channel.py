@@ -117,7 +117,7 @@ def test_a_log_is_never_what_is_read_or_written(tmp_path: Path) -> None:
 
 
 def test_a_pipe_that_nobody_reads_is_no_fault() -> None:
-    for words in ("doctor", "--help", "lens coc --help"):
+    for words in ("--help", "lens coc --help"):
         line = f"{sys.executable} -m mrbokeh.cli {words} 2>&1 | head -c 1"
         assert len(subprocess.run(["bash", "-c", line], capture_output=True, text=True).stdout) == 1
         unread = f"({sys.executable} -m mrbokeh.cli {words} --json) 2>&1 >/dev/full | grep -c Traceback"
@@ -153,7 +153,7 @@ def raising_while_writing(path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="no such signals there")
-@pytest.mark.parametrize("option", ["--overwrite", "--quiet", "--json"])
+@pytest.mark.parametrize("option", ["--quiet", "--json"])
 def test_an_interrupt_ends_within_two_seconds_with_one_line(tmp_path: Path, option: str) -> None:
     """Even while a thread computes on, as compiled kernels do."""
     words = [sys.executable, "-c", SLEEPING, "lens", "new", str(tmp_path / "lens.json"), *map(str, NEW), option]

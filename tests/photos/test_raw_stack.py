@@ -169,6 +169,7 @@ def test_a_traced_slice_survives_the_camera(tmp_path: Path, desk: Scene) -> None
     assert psnr_db(decoded[4:-4, 4:-4], traced[4:-4, 4:-4]) > 38.0
 
 
+@pytest.mark.slow
 def test_a_stack_is_resumed_and_never_overwritten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With a plain wall instead of the still life, since what is in the picture does not matter here."""
     wall = emissive_quad((-1.0, -1.0, 1.0), (2.0, 0.0, 0.0), (0.0, 2.0, 0.0), random_rgb())
