@@ -19,6 +19,7 @@ from mrbokeh.images.picture_codec import stored_pixels
 from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
 from mrbokeh.stacks.photograph import is_raw, read_photograph
 from mrbokeh.system.errors import InputError
+from mrbokeh.video.image_sequence import is_pattern, numbered, numbers_of
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -162,9 +163,9 @@ class Shot:
 
 
 def open_shot(path: Path) -> Shot:
-    """Open a shot; shot.%04d.exr is all of its folder. Raises InputError if there is nothing to check."""
-    if "%" in path.name and path.parent.is_dir():
-        return _numbered(path.parent)
+    """Open a shot, named shot.%04d.exr too. Raises InputError if there is nothing to check."""
+    if is_pattern(path) and not path.exists():
+        return _sequence(path, {number: numbered(path, number) for number in numbers_of(path)})
     if not path.exists():
         raise InputError(f"expected a picture, a folder of pictures, a focal stack or a film at {path}, but there is nothing")
     if path.is_dir():
@@ -186,8 +187,12 @@ def _numbered(folder: Path) -> Shot:
     by_number = dict(sorted((int(match.group()), file) for match, file in zip(found, files, strict=True) if match))
     if len(by_number) < len(files):
         raise InputError(f"{folder}: {len(files)} pictures share {len(by_number)} numbers: keep one sequence per folder")
+    return _sequence(folder, by_number)
+
+
+def _sequence(path: Path, by_number: dict[int, Path]) -> Shot:
     missing = tuple(sorted(set(range(min(by_number), max(by_number) + 1)) - set(by_number)))
-    return Shot(path=folder, numbers=tuple(by_number), missing=missing, is_sequence=True, pictures=lambda: _read(list(by_number.values())))
+    return Shot(path=path, numbers=tuple(by_number), missing=missing, is_sequence=True, pictures=lambda: _read(list(by_number.values())))
 
 
 def _stack(folder: Path) -> Shot:

@@ -44,17 +44,7 @@ class NumberedFiles:
     @classmethod
     def found(cls, pattern: Path) -> "NumberedFiles":
         """Find the files of a pattern. Raises InputError if there is none, or a number is missing."""
-        place = _NUMBER.search(pattern.name)
-        if place is None:
-            raise InputError(f"expected a pattern such as frames.%04d.exr, got {pattern}")
-        before, after = re.escape(pattern.name[: place.start()]), re.escape(pattern.name[place.end() :])
-        digits = rf"\d{{{_width(place)},}}"
-        named = re.compile(f"{before}({digits}){after}")
-        folder = pattern.parent
-        matches = (named.fullmatch(file.name) for file in folder.iterdir()) if folder.is_dir() else ()
-        numbers = sorted({int(match.group(1)) for match in matches if match})
-        if not numbers:
-            raise InputError(f"expected files named {pattern}, but there is none: check the folder and the number of digits")
+        numbers = numbers_of(pattern)
         files = cls(pattern, numbers[0], numbers[-1] - numbers[0] + 1)
         missing = sorted(set(range(numbers[0], numbers[-1] + 1)) - set(numbers))
         if missing:
@@ -74,6 +64,22 @@ class NumberedFiles:
     @property
     def files(self) -> list[Path]:
         return [self.file(index) for index in range(self.count)]
+
+
+def numbers_of(pattern: Path) -> list[int]:
+    """Return the numbers of the files of a pattern, in order. Raises InputError if there is none."""
+    place = _NUMBER.search(pattern.name)
+    if place is None:
+        raise InputError(f"expected a pattern such as frames.%04d.exr, got {pattern}")
+    before, after = re.escape(pattern.name[: place.start()]), re.escape(pattern.name[place.end() :])
+    digits = rf"\d{{{_width(place)},}}"
+    named = re.compile(f"{before}({digits}){after}")
+    folder = pattern.parent
+    matches = (named.fullmatch(file.name) for file in folder.iterdir()) if folder.is_dir() else ()
+    numbers = sorted({int(match.group(1)) for match in matches if match})
+    if not numbers:
+        raise InputError(f"expected files named {pattern}, but there is none: check the folder and the number of digits")
+    return numbers
 
 
 def numbered(pattern: Path, number: int) -> Path:

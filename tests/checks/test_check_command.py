@@ -256,7 +256,7 @@ def test_a_steady_sequence_passes_and_a_flickering_one_does_not(tmp_path: Path) 
     found = report_of(sequence(tmp_path / "shaken", shaken), plate, 1)
     assert kinds(found) == {"flicker"}
     # As `video` names what it wrote.
-    report_of(tmp_path / "shaken" / "shaken.%04d.exr", plate, 0, "--flicker-limit", 0.5)
+    report_of(tmp_path / "shaken" / "shot.%04d.exr", plate, 0, "--flicker-limit", 0.5)
 
 
 def test_layers_may_come_one_for_each_picture(tmp_path: Path) -> None:
