@@ -130,11 +130,14 @@ def _picture(rgb: Path, depth: Path, near_far_m: tuple[float, float] | None, is_
 
 
 def _is_distance(depth: Path) -> bool:
-    """Return whether --depth is one distance for all, such as 4, and no file."""
+    """Return whether --depth is one distance for all, such as 4, and no file. Raises InputError for one that is not above 0."""
     try:
-        return not depth.exists() and float(str(depth)) > 0.0
+        distance_m = float(str(depth))
     except ValueError:
         return False
+    if not depth.exists() and not distance_m > 0.0:
+        raise InputError(f"--depth: expected a file, or metres above 0 such as 4, got {depth}")
+    return not depth.exists()
 
 
 def _moving(sharp: dict[str, Layer], sources: SharpOptions) -> dict[str, Layer]:

@@ -215,6 +215,7 @@ def test_half_a_picture_alpha_in_a_png_and_existing_files_are_refused(folder: Pa
     for words, out, said in (
         (("--rgb", "aif.exr", "--lens", "lens.json"), "new.exr", "belong together"),
         (("--lens", "lens.json"), "new.exr", "nothing to blur"),
+        (("--rgb", "aif.exr", "--depth", "-2", "--lens", "lens.json"), "new.exr", "metres above 0 such as 4, got -2"),
         (("--rgb", "aif.exr", "--depth", "2", "--disparity", "1:9", "--lens", "lens.json"), "new.exr", "--disparity 1:9 says"),
         ((*PICTURE, "--shutter", "0.5"), "new.exr", "for 0.5 of it give 180"),
         ((*PICTURE, "--alpha-out"), "out.png", "needs an \\.exr"),
