@@ -9,12 +9,14 @@ pictures of all methods kept their bits.
 import gc
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import llvmlite.binding as llvm
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.environment import lookup_environment
+from numba.core.targetconfig import TargetConfig
 
 
 def link_once(kernel: Any) -> None:
@@ -48,6 +50,10 @@ class _LinkedOnce(JITCodeLibrary):  # type: ignore[misc]
     @property
     def codegen(self) -> Any:
         return self._codegen if self._finalized else _NoEnvironmentYet(self._codegen)
+
+    def _optimize_functions(self, ll_module: Any) -> None:
+        """Leave it to the passes over the whole module: with these, each function would be optimised once for every module it is in."""
+        ll_module.data_layout = self._codegen._data_layout
 
     def add_linking_library(self, library: Any) -> None:
         self._linking_libraries.append(library)
@@ -88,6 +94,24 @@ class _LinkedOnce(JITCodeLibrary):  # type: ignore[misc]
                 if not function.is_declaration and function.linkage == llvm.Linkage.external:
                     function.linkage = "linkonce_odr"
         return self._shared_module
+
+
+@cache
+def _hash_of(options: type) -> int:
+    return hash(tuple(sorted(options.options)))  # type: ignore[attr-defined]
+
+
+def _are_alike(self: Any, other: Any) -> bool:
+    if type(other) is not type(self):
+        return bool(_compare(self, other))
+    return all(getattr(self, name) == getattr(other, name) for name in self._values.keys() | other._values.keys())
+
+
+# numba's options all have one hash, for which it reads and sorts all of them, and each look into its caches compares all of them:
+# a thirteenth of the time of compiling. These give the same answers from what is set.
+_compare = TargetConfig.__eq__
+TargetConfig.__hash__ = lambda self: _hash_of(type(self))  # type: ignore[method-assign]
+TargetConfig.__eq__ = _are_alike  # type: ignore[method-assign, assignment]
 
 
 class _NoEnvironmentYet:

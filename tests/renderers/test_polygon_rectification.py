@@ -8,8 +8,15 @@ import shapely
 from shapely import Polygon, affinity
 
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.renderers.polygon.outlines import Outline, area
-from mrbokeh.renderers.polygon.rectification import PAPER_DIRECTIONS, rectify, rectify_aperture, same_area_and_centroid
+from mrbokeh.renderers.polygon.outlines import Outline, area, centroid
+from mrbokeh.renderers.polygon.rectification import (
+    PAPER_DIRECTIONS,
+    _unit_steps,
+    rectify,
+    rectify_aperture,
+    same_area_and_centroid,
+    smallest_polygon,
+)
 from mrbokeh.system.errors import InputError
 
 
@@ -165,6 +172,18 @@ def test_a_convex_outline_gets_all_supporting_half_planes(sides: int) -> None:
     for max_edges in (2 * len(PAPER_DIRECTIONS), 40):
         polygon = Polygon(rectify(outline, max_edges=max_edges, symmetry_cost=-1.0))
         assert polygon.symmetric_difference(expected).area < 1e-9
+
+
+@pytest.mark.parametrize("cost", [-1.0, 0.05])
+@pytest.mark.parametrize("sides", [3, 6, 9, 64, "any"])
+def test_the_tangents_of_a_convex_outline_are_what_the_walk_finds(sides: int | str, cost: float) -> None:
+    points = np.random.default_rng(5).standard_normal((20, 2)) if isinstance(sides, str) else polar(np.ones(sides))
+    outline = np.array(shapely.MultiPoint(points).convex_hull.exterior.coords[:-1])
+    shape = outline - centroid(outline)
+    shape = (shape if area(shape) > 0.0 else shape[::-1]) / np.abs(shape).max()
+    walked = smallest_polygon(shape, _unit_steps(PAPER_DIRECTIONS, 16), 16, cost)
+    assert walked is not None
+    assert Polygon(walked).symmetric_difference(Polygon(rectify(shape, symmetry_cost=cost))).area < 1e-9
 
 
 def test_the_circle_is_circumscribed_and_symmetry_kept_without_mirrors() -> None:

@@ -68,7 +68,8 @@ def rectify(
     middle = centroid(outline)
     extent = float(np.abs(outline - middle).max())
     shape = without_flat_vertices((outline[::-1] if clockwise else outline) - middle) / extent
-    polygon = smallest_polygon(shape, steps, max_edges, symmetry_cost)
+    tangent = len(steps) <= max_edges and _is_convex(shape)
+    polygon = _tangent_polygon(shape, steps) if tangent else smallest_polygon(shape, steps, max_edges, symmetry_cost)
     if polygon is None:
         raise InputError(f"no polygon of at most {max_edges} edges along {tuple(directions)} encloses the outline: allow more of either")
     polygon = middle + extent * (polygon[::-1] if clockwise else polygon)
@@ -118,7 +119,8 @@ def _check(outline: Outline) -> None:
     extent = np.ptp(outline, axis=0).max()
     if abs(area(outline)) <= EXACT * extent**2:
         raise InputError("an outline must enclose an area, but its vertices lie on a line")
-    if crosses_itself(without_flat_vertices(outline - outline[0]) / extent):
+    shape = without_flat_vertices(outline - outline[0]) / extent
+    if not (_is_convex(shape) or _is_convex(shape[::-1])) and crosses_itself(shape):
         raise InputError("an outline must not cross itself; split it into simple outlines first")
 
 
@@ -133,6 +135,24 @@ def _already_rectified(outline: Outline, steps: Outline, max_edges: int) -> Outl
         if (sines.min(axis=1) <= EXACT).all():
             return candidate.copy()
     return None
+
+
+def _is_convex(shape: Outline) -> bool:
+    """Return whether an outline of positive area turns one way at all vertices, and once around."""
+    edges = np.roll(shape, -1, axis=0) - shape
+    following = np.roll(edges, -1, axis=0)
+    turns = np.arctan2(edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0], (edges * following).sum(axis=1))
+    return bool((turns > 0.0).all() and turns.sum() < 3.0 * np.pi)
+
+
+def _tangent_polygon(shape: Outline, steps: Outline) -> Outline:
+    """Return the smallest polygon around a convex outline: what the lines along all the steps that touch it enclose.
+
+    It is as symmetric as the outline, not more. Nothing here is compiled: most openings are convex, and the walks take 3 s to compile.
+    """
+    in_turn = steps[np.argsort(np.arctan2(steps[:, 1], steps[:, 0]))]
+    touched = shape[(shape @ (in_turn[:, ::-1] * [1.0, -1.0]).T).argmax(axis=0)]
+    return without_flat_vertices(corner_points(np.column_stack([touched, in_turn]), 0.0))
 
 
 def smallest_polygon(shape: Outline, steps: Outline, max_edges: int, symmetry_cost: float) -> Outline | None:
