@@ -241,7 +241,7 @@ RESIDUAL = Rule(
 
 
 FOCUS = Rule(
-    "focus distances are right",
+    "focus is right",
     f"circles of confusion within {LARGEST_FOCUS_PX:g} px in every slice",
     "A focus distance that is off, or a slice at another's place, gives the network blur of the wrong size.",
     "Correct focus_distances_m (or the order of the slices); `mrbokeh capture depth` calibrates them.",
