@@ -74,10 +74,26 @@ class ObjectOptions:
         ),
     ] = None
     turn: Annotated[float, typer.Option(help="Turn of the object about the vertical in degrees.")] = 0.0
-    pitch: Annotated[float, typer.Option(help="How far the camera looks down, in degrees.")] = 0.0
-    environment: Annotated[Path | None, typer.Option(help="Panorama (.hdr, .exr) that lights the --object.")] = None
+    pitch: Annotated[
+        float | None,
+        typer.Option(help="How far the camera looks down, in degrees. Default: by the slope of the ground at --at-pixel, else 0."),
+    ] = None
+    environment: Annotated[
+        Path | None, typer.Option(help="Panorama (.hdr, .exr) that lights the --object. Default: one made of the photograph.")
+    ] = None
+    sun: Annotated[
+        str | None,
+        typer.Option(
+            metavar="RIGHT,ABOVE",
+            help="Where the main light comes from: degrees to the right of the view (180: from behind the camera) and above the horizon, "
+            "such as -60,40.",
+        ),
+    ] = None
     exposure: Annotated[float, typer.Option(min=0.0, help="Factor on the object's light.")] = 1.0
-    shadow: Annotated[float, typer.Option(min=0.0, max=1.0, help="Darkness of the object's shadow.")] = 0.0
+    shadow: Annotated[
+        float | None, typer.Option(min=0.0, max=1.0, help="Darkness of the object's shadow; 1, the default, is what its light gives.")
+    ] = None
+    plain: Annotated[bool, typer.Option("--plain", help="Guess neither light nor ground: even light, no shadow, a level camera.")] = False
 
 
 @dataclass(frozen=True)

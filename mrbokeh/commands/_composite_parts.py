@@ -12,12 +12,12 @@ import numpy as np
 
 from mrbokeh.commands._composite_options import LensOptions, ObjectOptions, PlateOptions, RenderingOptions, ResultOptions
 from mrbokeh.commands._insertion_options import ColourOptions, LookGroup, VirtualOptions, near_far_of
+from mrbokeh.compositing.ground import ended_shadow, ground_under
 from mrbokeh.compositing.near_and_far import nearer_than
 from mrbokeh.compositing.plate import (
     Inserted,
     Plate,
     bundle_plate,
-    ended_shadow,
     open_plate,
     with_blur_in_metres,
     with_depth,
@@ -37,7 +37,7 @@ from mrbokeh.stacks.capture_bundle import CaptureBundle
 from mrbokeh.stacks.guessed_metres import GUESSED
 from mrbokeh.stacks.photograph import read_photograph
 from mrbokeh.system.atomic_files import require_safe_outputs
-from mrbokeh.system.channel import warn
+from mrbokeh.system.channel import guess, warn
 from mrbokeh.system.console import flag
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.typed_numbers import numbers_in
@@ -170,7 +170,7 @@ def placing_warning(sharp: Sequence[Layer], plate: Plate, mode: str, height: str
     mend = f"--height {height} may be wrong" if height else unit
     if not alpha.any():
         return None
-    if float(alpha.sum()) < 1.0:
+    if float(alpha[alpha > 0.5].sum()) < 1.0:
         return f"what is put in is smaller than a pixel; {mend}"
     whole = len(rows) and (np.ptp(rows) + 1, np.ptp(columns) + 1) == alpha.shape
     if whole:
@@ -234,6 +234,8 @@ def _bare(layer: Layer) -> Layer:
 
 
 if TYPE_CHECKING:
+    from mrbokeh.scene.staging.filming import Filming
+    from mrbokeh.scene.staging.scene_description import Lighting
     from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples
 
 _COVERED = 0.5
@@ -310,32 +312,82 @@ class _FileLayers:
 
 
 def _object_layers(glb: Path, options: ObjectOptions, rendering: RenderingOptions, first: Plate) -> LayersFor:
-    from mrbokeh.scene.staging.scene_description import Lighting, OneObject
+    from mrbokeh.scene.staging.scene_description import OneObject
 
     if options.at and options.at_pixel:
         raise InputError("--at and --at-pixel both say where the object stands: give one of them")
     stands_at_m = _triple(options.at) if options.at else first.point_under_pixel_m(*pair_of(options.at_pixel))
-    light = Lighting(options.environment, exposure=options.exposure)
-    turn, tilt = math.radians(options.turn), math.radians(options.pitch)
+    foot_px = pair_of(options.at_pixel) if options.at_pixel else _pixel_of(first.camera, stands_at_m)
+    world_from_camera = _upright(options, first, foot_px)
+    catches = rendering.catch or ("shadow" if options.plain else "light")
+    shadow = options.shadow if options.shadow is not None else float(not options.plain)
     one = OneObject(
         glb=glb,
         stands_at_m=stands_at_m,
         height_m=_height_m(options.height, first, stands_at_m[2]),
-        turn_rad=turn,
-        tilt_rad=tilt,
-        light=light,
-        shadow=options.shadow,
+        turn_rad=math.radians(options.turn),
+        world_from_camera=world_from_camera,
+        light=_light(options, first, foot_px, world_from_camera),
+        shadow=shadow,
     )
-    filmed = _filmed(one.described(), rendering, lambda plate: one.seen_by(plate.camera))
+    filming = replace(rendering.of_photograph.filming(), catches=catches, caught_share=shadow)
+    filmed = _filmed(one.described(), filming, rendering.time, lambda plate: one.seen_by(plate.camera))
     if not options.at_pixel:
         return filmed
-    foot_px = pair_of(options.at_pixel)
 
     def on_the_ground(plate: Plate) -> list[Layer]:
         objects, *caught = filmed(plate)
         return [objects, *(ended_shadow(plate, foot_px, objects, each) for each in caught)]
 
     return on_the_ground
+
+
+def _pixel_of(camera: Camera, place_m: tuple[float, float, float]) -> tuple[float, float]:
+    """Return the pixel that shows a place, or the nearest of the frame."""
+    xy_px, _ = camera.project(np.array(place_m)[None])
+    x_px, y_px = np.clip(xy_px[0], 0, [camera.width_px - 1, camera.height_px - 1]).tolist()
+    return x_px, y_px
+
+
+def _upright(options: ObjectOptions, plate: Plate, foot_px: tuple[float, float]) -> np.ndarray:
+    """Return the rotation from camera axes to upright ones: as told, by the ground at the foot, or none."""
+    from mrbokeh.scene.staging.scene_description import looking_down
+
+    if options.pitch is not None or options.plain or not options.at_pixel:
+        return looking_down(math.radians(options.pitch or 0.0))
+    found = ground_under(plate, foot_px)
+    if found is None:
+        guess("the depth around the foot is no ground with a slope: a level camera is taken (--pitch DEGREES says how far it looks down)")
+        return looking_down(0.0)
+    down_deg = math.degrees(math.asin(float(np.clip(found[1, 2], -1.0, 1.0))))
+    guess(f"by the depth around the foot the camera looks down by {down_deg:.0f} degrees (else --pitch DEGREES)")
+    return found
+
+
+def _light(options: ObjectOptions, plate: Plate, foot_px: tuple[float, float], world_from_camera: np.ndarray) -> "Lighting":
+    """Return the light of an object: its panorama, even light, or what the photograph tells of it."""
+    from mrbokeh.compositing.plate_light import picture_light
+    from mrbokeh.scene.staging.scene_description import Lighting
+
+    if options.sun and (options.environment or options.plain):
+        raise InputError(
+            f"--sun {options.sun} adds a main light to what the photograph tells of light: leave --environment and --plain out, or --sun"
+        )
+    if options.environment or options.plain:
+        return Lighting(options.environment, exposure=options.exposure)
+    made = picture_light(plate, foot_px, world_from_camera, None if options.sun is None else _sun_degrees(options.sun))
+    guess(
+        "the object's light is guessed from the photograph (--exposure makes it brighter or darker, --sun RIGHT,ABOVE says where most "
+        "of it comes from, --environment PANORAMA replaces it, --plain leaves it even and without a shadow)"
+    )
+    return Lighting(exposure=options.exposure, made=made)
+
+
+def _sun_degrees(text: str) -> tuple[float, float]:
+    right_deg, above_deg = numbers_in(text, "--sun expects degrees to the right and above the horizon, such as -60,40", (2,))
+    if not 0.0 < above_deg <= 90.0:
+        raise InputError(f"--sun: expected a light above 0 and up to 90 degrees over the horizon, got {text!r}")
+    return right_deg, above_deg
 
 
 def _height_m(text: str | None, plate: Plate, depth_m: float) -> float | None:
@@ -368,17 +420,17 @@ def _scene_layers(path: Path, camera: Path | None, rendering: RenderingOptions) 
         size_px = (plate.rgb.shape[1], plate.rgb.shape[0])
         return plate.camera if camera is None else scene_track(camera, size_px, description.up).at(0).camera.resized(*size_px)
 
-    return _filmed(description, rendering, seen_by)
+    return _filmed(description, rendering.of_photograph.filming(), rendering.time, seen_by)
 
 
-def _filmed(description: SceneDescription, rendering: RenderingOptions, seen_by: Callable[[Plate], Camera]) -> LayersFor:
+def _filmed(description: SceneDescription, filming: "Filming", time_s: float, seen_by: Callable[[Plate], Camera]) -> LayersFor:
     from mrbokeh.scene.staging.filming import FilmedLayers
 
-    filmed = FilmedLayers(rendering.of_photograph.filming(), description)
+    filmed = FilmedLayers(filming, description)
 
     def layers(plate: Plate) -> list[Layer]:
         sharp_rgb = plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb
-        return filmed.at(lambda _: seen_by(plate), rendering.time, sharp_rgb)
+        return filmed.at(lambda _: seen_by(plate), time_s, sharp_rgb)
 
     return layers
 

@@ -92,9 +92,13 @@ class RenderingOptions:
         typer.Option(help="Who renders objects and scenes: embree, wgpu, mitsuba, or auto (embree in a photograph, else a graphics card)."),
     ] = "auto"
     paths: Annotated[int, typer.Option(min=1, help="Paths per pixel of mitsuba.")] = 64
-    catch: Annotated[str, typer.Option(help="What the ground under them catches: shadow, or light (also reflections, with mitsuba).")] = (
-        "shadow"
-    )
+    catch: Annotated[
+        str | None,
+        typer.Option(
+            help="What the ground under them catches: shadow, of lights and as dark as is told, or light, all that they change there (also "
+            "reflections, with mitsuba). Default: light of an --object, else shadow."
+        ),
+    ] = None
     distortion: Annotated[
         Path | None,
         typer.Option(metavar="DISTORTION.json", help="How the lens bends straight lines: what is rendered is bent alike."),
@@ -106,7 +110,7 @@ class RenderingOptions:
         from mrbokeh.scene.staging.filming import Filming
 
         distortion = read_distortion(self.distortion)
-        return Filming(self.scene_renderer, self.paths, catches=self.catch, distortion=distortion, shutter=shutter)
+        return Filming(self.scene_renderer, self.paths, catches=self.catch or "shadow", distortion=distortion, shutter=shutter)
 
 
 DisparityOption = Annotated[

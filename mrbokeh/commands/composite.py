@@ -58,7 +58,7 @@ def composite(
         write_results,
     )
     from mrbokeh.compositing.choose import best_mode, insertion_of
-    from mrbokeh.compositing.plate import with_ground_behind
+    from mrbokeh.compositing.ground import with_ground_behind
     from mrbokeh.compositing.plate_look.finishing import finished, finishing_of
     from mrbokeh.renderers.choose import lens_and_renderer
     from mrbokeh.stacks.capture_bundle import is_bundle, read_bundle

@@ -81,7 +81,8 @@ def composite(
     from mrbokeh.commands._composite_parts import layers_by, standing_on_pixel
     from mrbokeh.commands._insertion_options import VirtualOptions
     from mrbokeh.compositing.choose import best_mode, insertion_of
-    from mrbokeh.compositing.plate import open_plate, plate_of, with_depth, with_ground_behind
+    from mrbokeh.compositing.ground import with_ground_behind
+    from mrbokeh.compositing.plate import open_plate, plate_of, with_depth
     from mrbokeh.depth.depth_map import DepthSettings
     from mrbokeh.images.image_io import read_layer
 

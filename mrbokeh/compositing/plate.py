@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float32
+from jaxtyping import Float32
 
 from mrbokeh.depth.depth_map import DepthSettings
 from mrbokeh.depth.open_depth import open_depth
@@ -188,63 +188,6 @@ def with_depth(plate: Plate, source: Path, settings: DepthSettings) -> Plate:
     """The plate with depth from a file, or from a network that looks at its sharpest picture."""
     depth = open_depth(source, plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb, settings)
     return replace(plate, depth_m=depth.depth_m)
-
-
-_SAME_SURFACE, _SURELY_SAME = 0.02, 0.01
-"""Largest shares by which depth changes from pixel to pixel of one surface: along a table, and where no edge may be missed."""
-_FARTHER = 0.05
-_FOUND = 2
-
-
-def with_ground_behind(plate: Plate, foot_px: tuple[float, float], layers: Sequence[Layer]) -> Plate:
-    """Return the plate with the ground on which something stands no nearer than that, where it is seen above the foot.
-
-    A floor or a table is the farther the higher it is in the picture, so that it never hides what stands on it; depth that says otherwise
-    is wrong. The ground is what goes on from the foot without a jump of depth, but not below the foot, where near things stand.
-    """
-    if plate.depth_m is None:
-        return plate
-    covered_m = np.minimum.reduce([np.where(layer.alpha > 0.0, layer.depth_m, np.inf) for layer in layers])
-    above = np.broadcast_to(np.arange(len(covered_m))[:, None] <= int(foot_px[1]), covered_m.shape)
-    ground = _same_surface(plate.depth_m, foot_px, above, _SAME_SURFACE) & np.isfinite(covered_m)
-    return replace(plate, depth_m=np.where(ground, np.maximum(plate.depth_m, covered_m), plate.depth_m))
-
-
-def ended_shadow(plate: Plate, foot_px: tuple[float, float], objects: Layer, shadow: Layer) -> Layer:
-    """Return the shadow of objects as far as the ground goes on which they stand at a pixel.
-
-    It was drawn on a plane without end, and would hang sharp in the air over what lies blurred beyond a table's edge: past a jump of depth,
-    and clearly farther than the plane. A shadow apart from the foot, as of a thing in the air, stays.
-    """
-    covered = (objects.alpha > 0.0) | (shadow.alpha > 0.0)
-    if plate.depth_m is None or not shadow.alpha.any():
-        return shadow
-    beside = _same_surface(np.ones_like(plate.depth_m), foot_px, covered, _SURELY_SAME)
-    beyond = (
-        beside
-        & ~_same_surface(plate.depth_m, foot_px, covered, _SURELY_SAME)
-        & (plate.depth_m > shadow.depth_m * np.float32(1.0 + _FARTHER))
-    )
-    return replace(
-        shadow, alpha=np.where(beyond, np.float32(0.0), shadow.alpha), rgb=np.where(beyond[..., None], np.float32(0.0), shadow.rgb)
-    )
-
-
-def _same_surface(
-    depth_m: Float32[np.ndarray, "height width"], start_px: tuple[float, float], within: Bool[np.ndarray, "height width"], step: float
-) -> Bool[np.ndarray, "height width"]:
-    """Return the pixels (H, W) that are reached from one of them without a jump of depth by more than a share, and within a mask.
-
-    Noise of single pixels is no jump: depth is that of the median of 5x5 pixels.
-    """
-    import cv2
-
-    x_px, y_px = (int(each) for each in start_px)
-    found = cv2.copyMakeBorder((~within).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
-    found[y_px + 1, x_px + 1] = 0
-    logs = cv2.medianBlur(np.log(np.minimum(depth_m, np.float32(1e6))), 5)
-    cv2.floodFill(logs, found, (x_px, y_px), 0.0, step, step, 4 | (_FOUND << 8) | cv2.FLOODFILL_MASK_ONLY)
-    return found[1:-1, 1:-1] == _FOUND
 
 
 def with_matte(plate: Plate, path: Path) -> Plate:

@@ -36,6 +36,24 @@ class LightChange:
         share = np.where((self.ratio == 1.0).all(-1), 1.0, luminance(self.ratio)).astype(np.float32)
         return replace(self, ratio=np.repeat(share[..., None], 3, axis=2))
 
+    def weakened(self, share: float) -> "LightChange":
+        """Return a share of the change, 0 to 1."""
+        if share == 1.0:
+            return self
+        factor = np.float32(share)
+        return replace(self, ratio=1 - factor * (1 - self.ratio), added=factor * self.added)
+
+    def enlarged(self, height_px: int, width_px: int) -> "LightChange":
+        """Return the same change with more pixels; depth of a plane stays exact."""
+        import cv2
+
+        if self.alpha.shape == (height_px, width_px):
+            return self
+        planes = (self.ratio, self.added, self.alpha, 1 / self.depth_m)
+        ratio, added, alpha, near = (cv2.resize(each, (width_px, height_px), interpolation=cv2.INTER_LINEAR) for each in planes)
+        with np.errstate(divide="ignore"):
+            return LightChange(ratio, added, alpha, 1 / near)
+
     def as_layer(self, sharp_rgb: Float32[np.ndarray, "height width 3"]) -> Layer:
         """A layer lying on the surface that turns a plate beneath into plate * ratio + added; the lens blurs it like any other.
 

@@ -18,6 +18,8 @@ _MATTE_SIZE_PX = (32, 64)
 _BLOCKS = (64, 128)
 _PEAKS = 16
 _SAME = 1e-5
+_FINER = 2
+"""Reflections have at most so many times the pixels of a small panorama in width."""
 _ROUGH_LEVELS = ((512, 16), (256, 32), (128, 64), (128, 64), (64, 128), (64, 128), (64, 256), (64, 256))
 """(width in pixels, samples) of the reflections at roughness (k / 8)**1.5, k = 1 to 8: as fine as each lobe is wide."""
 
@@ -103,6 +105,7 @@ def filtered(radiance: Float32[np.ndarray, "height width 3"]) -> LightingMaps:
 
     def blurred(number: int) -> Float32[np.ndarray, "_ _ 3"]:
         width, samples = _ROUGH_LEVELS[number - 1]
+        width = min(width, max(_MATTE_SIZE_PX[1], _FINER * radiance.shape[1]))
         result = np.zeros((width * width // 2, 3), np.float32)
         lobe = np.zeros((samples, 4))
         ggx_lobe((number / count) ** 1.5, 4 * np.pi / float(source.size[0].prod()), samples, lobe)

@@ -118,14 +118,13 @@ def _hidden_sky(
     objects: _Objects, environment: Environment, surfaces: Surfaces, centre_m: Float64[np.ndarray, "3"], samples: int
 ) -> Float32[np.ndarray, "points 3"]:
     """Radiance that white surfaces lose as objects stand before the environment."""
-    from scipy.stats.qmc import Sobol
-
     lost = np.zeros((len(surfaces.alpha), 3), np.float32)
     points_m = surfaces.shadow_origin + centre_m
     sine2 = (objects.radius_m / np.maximum(np.linalg.norm(objects.middle_m - points_m, axis=1), 1e-12)) ** 2
     near = np.flatnonzero(sine2 > _NO_EFFECT)
     rng, at_once = np.random.default_rng(0), max(1, _RAYS_AT_ONCE // samples)
-    grid = Sobol(2, scramble=True, rng=rng).random(1 << (samples - 1).bit_length())
+    # The golden lattice is as even as Sobol points, which SciPy takes a second to load.
+    grid = np.stack([(np.arange(samples) + 0.5) / samples, np.arange(samples) * (5**0.5 - 1) / 2 % 1.0], axis=-1)
     for start in range(0, len(near), at_once):
         some = near[start : start + at_once]
         uv = (grid + rng.random((len(some), 1, 2))) % 1.0

@@ -68,7 +68,7 @@ def test_a_layer_goes_behind_the_post_and_before_the_wall(files: Path, composite
 
 def test_an_object_stands_on_the_pixel_it_was_put_on(files: Path, composite: Composite) -> None:
     out, layer = files / "out.png", files / "cake.exr"
-    arguments = ("--object", CAKE, "--at-pixel", "100,70", "--height", 0.1, "--shadow", 0.6)
+    arguments = ("--object", CAKE, "--at-pixel", "100,70", "--height", 0.1, "--shadow", 0)
     code, told = composite(
         *(files / "photo.exr", "--lens", files / "lens.json", "--focus", 2.0, "--depth", files / "depth.exr"),
         *(*arguments, "--out", out, "--save-layer", layer),

@@ -14,7 +14,8 @@ from mrbokeh.commands._composite_parts import plate_by
 from mrbokeh.commands._insertion_options import ColourOptions
 from mrbokeh.commands.composite import app
 from mrbokeh.compositing.choose import best_mode, insertion_of
-from mrbokeh.compositing.plate import ended_shadow, plate_of, with_blur_in_metres, with_ground_behind
+from mrbokeh.compositing.ground import ended_shadow, with_ground_behind
+from mrbokeh.compositing.plate import plate_of, with_blur_in_metres
 from mrbokeh.demo.plan import DATA
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.exr_io import read_exr
@@ -257,7 +258,7 @@ def test_grain_and_a_grey_card_change_virtual_light_alone(files: Path) -> None:
 def test_distortion_bends_what_is_rendered(files: Path) -> None:
     """A barrel of -0.3 at the unit of the focal length, 216 px, pulls what stands 50 px aside to the middle by 0.3 * (50/216)^2 = 1.6 %."""
     (files / "barrel.json").write_text(json.dumps({"model": "opencv", "k1": -0.3}))
-    standing = ("--object", CAKE, "--at", "0.5,0.1,2", "--height", "0.2")
+    standing = ("--object", CAKE, "--at", "0.5,0.1,2", "--height", "0.2", "--shadow", "0")
     columns = []
     for words in ((), ("--distortion", files / "barrel.json")):
         picture = put_in(files, *standing, *words, card=None)
@@ -266,11 +267,15 @@ def test_distortion_bends_what_is_rendered(files: Path) -> None:
 
 
 def test_the_ground_catches_a_shadow_or_all_that_changes(files: Path) -> None:
-    standing = ("--object", CAKE, "--at", "0,0.2,2", "--height", "0.2", "--pitch", "25", "--shadow", "0.7")
-    plain, shadow, light = (put_in(files, *standing[: 8 if n == 0 else 10], *("--catch", "light") * (n == 2), card=None) for n in range(3))
-    darker = [float((plain - each).clip(0).sum()) for each in (shadow, light)]
-    assert min(darker) > 1.0, "both darken the ground"
+    standing = ("--object", CAKE, "--at", "0,0.2,2", "--height", "0.2", "--pitch", "25", "--sun", "-50,40")
+    none, shadow, light, half = (
+        put_in(files, *standing, *words, card=None)
+        for words in (("--shadow", "0"), ("--catch", "shadow"), ("--catch", "light"), ("--shadow", "0.5"))
+    )
+    darker = [float((none - each).clip(0).sum()) for each in (shadow, light, half)]
+    assert min(darker) > 1.0, "all darken the ground"
     assert changed(shadow, light).any()
+    assert darker[2] == pytest.approx(0.5 * darker[1], rel=0.05)
 
 
 def test_a_scene_file_with_its_camera(files: Path) -> None:

@@ -10,7 +10,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.moving_layers import ShutterTiming
 from mrbokeh.scene.staging.filming import FilmedLayers, Filming
 from mrbokeh.scene.staging.picture_box import shadow_box
-from mrbokeh.scene.staging.scene_description import OneObject
+from mrbokeh.scene.staging.scene_description import OneObject, looking_down
 from mrbokeh.scene.virtual_scene import shadow_layer
 from mrbokeh.tracking.world_axes import upright_camera
 
@@ -20,7 +20,7 @@ CAMERA = Camera(160, 112, (220.0, 220.0), (80.0, 56.0))
 
 @pytest.mark.parametrize("stands_at_m", [(0.1, 0.3, 2.0), (-0.6, 0.4, 1.6), (0.0, 0.2, 0.6)])
 def test_the_shadow_is_that_of_the_whole_frame(stands_at_m: tuple[float, float, float]) -> None:
-    one = OneObject(ALIEN, stands_at_m, height_m=0.25, tilt_rad=0.2, shadow=0.7)
+    one = OneObject(ALIEN, stands_at_m, height_m=0.25, world_from_camera=looking_down(0.2), shadow=0.7)
     filmed = FilmedLayers(Filming("embree"), one.described(), threads=1)
     camera = upright_camera(one.seen_by(CAMERA), filmed._staged.description.up)
     scene, catcher = filmed._staged.scene_at(0.0), filmed._staged.catcher

@@ -13,7 +13,8 @@ from mrbokeh.layering.pixel_box import Box
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Scene, SceneRenderer
 from mrbokeh.scene.choose import scene_renderer
-from mrbokeh.scene.light_change import GREY, light_change
+from mrbokeh.scene.light_change import GREY, LightChange, light_change
+from mrbokeh.scene.mesh import Mesh
 from mrbokeh.scene.moving_layers import FilmedScene, ShutterTiming, moving_layer, moving_shadow_layer
 from mrbokeh.scene.moving_layers.moving_layer import ShadowCatcher
 from mrbokeh.scene.staging.picture_box import shadow_box
@@ -24,6 +25,8 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import upright_camera
 
 CATCHES = ("shadow", "light")
+_FEW_PX, _FEW_SAMPLES = 5_000, 16
+_MOST_PX = 100_000
 
 CameraAt = Callable[[float], Camera]
 
@@ -33,14 +36,15 @@ class Filming:
     """Render settings of a staged scene.
 
     backend: a name of `mrbokeh.scene.choose`. samples: paths per pixel of "mitsuba". distortion: of the plate's lens. catches:
-    "shadow", as dark as the scene says, or "light": all that the objects change on the ground (`mrbokeh.scene.light_change`). shutter:
-    motion blur; None for none.
+    "shadow", as dark as the scene says, or "light": all that the objects change on the ground (`mrbokeh.scene.light_change`), of which
+    caught_share (0 to 1) is shown. shutter: motion blur; None for none.
     """
 
     backend: str = "auto"
     samples: int = 64
     denoise: bool = False
     catches: str = "shadow"
+    caught_share: float = 1.0
     distortion: LensDistortion = field(default_factory=LensDistortion)
     shutter: ShutterTiming | None = None
 
@@ -56,6 +60,12 @@ class Filming:
 
             return MitsubaTracer(self.samples, threads=threads, denoise=self.denoise)
         return scene_renderer(self.backend, threads)
+
+
+def _at_most(camera: Camera, pixels: int) -> Camera:
+    """Return the same view in at most so many pixels."""
+    scale = min(1.0, (pixels / (camera.width_px * camera.height_px)) ** 0.5)
+    return camera.resized(max(1, round(scale * camera.width_px)), max(1, round(scale * camera.height_px)))
 
 
 class FilmedLayers:
@@ -116,8 +126,33 @@ class FilmedLayers:
             return []
         if self._filming.catches == "shadow":
             return [self._shadow(scene, camera, ShadowCatcher(catcher, shadow.strength))]
-        change = light_change(self._renderer, scene, camera, catcher, samples=self._filming.samples)
-        return [change.evenly().as_layer(np.zeros_like(change.ratio)) if sharp_rgb is None else change.as_layer(sharp_rgb)]
+        frame = Box(0, camera.height_px, 0, camera.width_px)
+        box = frame if self._filming.backend == "mitsuba" else self._changed_box(scene, camera, catcher)
+        if box.is_empty:
+            return [clear(camera.height_px, camera.width_px)]
+        change = self._change(scene, box.camera_of(camera), catcher).weakened(self._filming.caught_share)
+        part_rgb = None if sharp_rgb is None else np.ascontiguousarray(box.of(sharp_rgb))
+        part = change.evenly().as_layer(np.zeros_like(change.ratio)) if part_rgb is None else change.as_layer(part_rgb)
+        return [part if box == frame else box.placed(part, frame.size_px)]
+
+    def _changed_box(self, scene: Scene, camera: Camera, catcher: Mesh) -> Box:
+        """Return the part of the frame in which the light changes, as seen in few pixels."""
+        few = _at_most(camera, _FEW_PX)
+        rows, columns = np.nonzero((light_change(self._renderer, scene, few, catcher, samples=_FEW_SAMPLES).ratio < 1.0).any(axis=2))
+        if not len(rows):
+            return Box(0, 0, 0, 0)
+        step = camera.width_px / few.width_px
+        low, high = (np.array([rows, columns]).min(axis=1) - 1) * step, (np.array([rows, columns]).max(axis=1) + 2) * step
+        (top, left), (bottom, right) = low.astype(int).tolist(), np.ceil(high).astype(int).tolist()
+        return Box(top, bottom, left, right).within((camera.height_px, camera.width_px))
+
+    def _change(self, scene: Scene, camera: Camera, catcher: Mesh) -> LightChange:
+        """Return the change of light; that of the sky is soft, and seen in at most _MOST_PX pixels."""
+        if self._filming.backend == "mitsuba":
+            return light_change(self._renderer, scene, camera, catcher, samples=self._filming.samples)
+        some = _at_most(camera, _MOST_PX)
+        change = light_change(self._renderer, scene, some, catcher, samples=self._filming.samples)
+        return change.enlarged(camera.height_px, camera.width_px)
 
     def _shadow(self, scene: Scene, camera: Camera, catcher: ShadowCatcher) -> Layer:
         """Drawn where hard shadows fall; the path tracer's are soft and may fall anywhere."""

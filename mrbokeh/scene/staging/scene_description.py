@@ -2,16 +2,20 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.renderers.choose import DEFAULT
 
+if TYPE_CHECKING:
+    from mrbokeh.scene.light import Environment, Light
+
 Triple = tuple[float, float, float]
 
-_SHADOW_SIZE_M = 2.0
-"""Side of the part of the ground that catches the shadow of one object."""
+_SHADOW_SIZE_M, _SHADOW_HEIGHTS = 2.0, 8.0
+"""Side of the part of the ground that catches the shadow of one object: at least so many metres, and so many of its heights."""
 
 
 @dataclass(frozen=True)
@@ -37,10 +41,13 @@ class Sun:
 
 @dataclass(frozen=True)
 class Lighting:
+    """environment: a panorama's file. made: a panorama and lights that are made already, in place of it and of suns."""
+
     environment: Path | None = None
     rotation_rad: float = 0.0
     exposure: float = 1.0
     suns: tuple[Sun, ...] = ()
+    made: "tuple[Environment, tuple[Light, ...]] | None" = None
 
 
 @dataclass(frozen=True)
@@ -86,33 +93,36 @@ class SceneDescription:
 class OneObject:
     """Object that stands before a camera, with its light, described by the options of a command.
 
-    stands_at_m: in camera axes (x right, y down, z forward). tilt_rad: how far the camera looks down. height_m: scaled to it; None
-    keeps the size of the file. turn_rad: about the vertical, clockwise seen from above. shadow: darkness of the shadow, 0 to 1.
+    stands_at_m: in camera axes (x right, y down, z forward). world_from_camera: (3, 3) turns them into upright ones (`looking_down`).
+    height_m: scaled to it; None keeps the size of the file. turn_rad: about the vertical, clockwise seen from above. shadow: darkness of
+    the shadow, 0 to 1.
     """
 
     glb: Path
     stands_at_m: Triple
     height_m: float | None = None
     turn_rad: float = 0.0
-    tilt_rad: float = 0.0
+    world_from_camera: np.ndarray = field(default_factory=lambda: np.eye(3))
     light: Lighting = field(default_factory=Lighting)
     shadow: float = 0.0
 
     def described(self) -> SceneDescription:
         """The scene in a world whose vertical is true and whose origin is the camera."""
-        foot_m = _world_from_camera(self.tilt_rad) @ np.asarray(self.stands_at_m)
+        foot_m = self.world_from_camera @ np.asarray(self.stands_at_m)
         place = (float(foot_m[0]), float(foot_m[1]), float(foot_m[2]))
         placed = PlacedObject(name=self.glb.stem, glb=self.glb, position_m=place, yaw_rad=self.turn_rad, height_m=self.height_m)
-        shadow = ShadowPlane(_SHADOW_SIZE_M, self.shadow, place) if self.shadow > 0 else None
+        size_m = max(_SHADOW_SIZE_M, _SHADOW_HEIGHTS * (self.height_m or 0.0))
+        shadow = ShadowPlane(size_m, self.shadow, place) if self.shadow > 0 else None
         return SceneDescription(path=self.glb, up="-y", objects=(placed,), light=self.light, shadow=shadow)
 
     def seen_by(self, camera: Camera) -> Camera:
-        """The camera in that world: turned about its x axis by the tilt."""
+        """The camera in that world."""
         camera_from_world = np.eye(4)
-        camera_from_world[:3, :3] = _world_from_camera(self.tilt_rad).T
+        camera_from_world[:3, :3] = self.world_from_camera.T
         return replace(camera, camera_from_world=camera_from_world)
 
 
-def _world_from_camera(tilt_rad: float) -> np.ndarray:
+def looking_down(tilt_rad: float) -> np.ndarray:
+    """Return the rotation (3, 3) from the axes of a camera that looks down by an angle to upright ones."""
     cosine, sine = np.cos(tilt_rad), np.sin(tilt_rad)
     return np.array([[1.0, 0.0, 0.0], [0.0, cosine, sine], [0.0, -sine, cosine]])

@@ -39,6 +39,8 @@ class Assets:
     def light(self, light: Lighting, up: str) -> tuple[Environment | None, tuple[Light, ...]]:
         """Environment and lights in the upright world; the very same objects as long as nothing changed, for backends keep their tables."""
         path = light.environment
+        if (made := light.made) is not None:
+            return self._kept_while((light, up), "light", lambda: _exposed(*made, light.exposure))
         if path is None:
             return self._kept_while((light, up), "light", lambda: _made_up_light(light, up))
         panorama = self._kept_while((path, modified_s(path)), "panorama", lambda: Panorama(read_linear(path)))
@@ -70,6 +72,10 @@ def _suns(light: Lighting, up: str) -> tuple[Light, ...]:
 
 def _made_up_light(light: Lighting, up: str) -> tuple[Environment | None, tuple[Light, ...]]:
     return _even_grey(_GREY * light.exposure), _suns(light, up) or (sun(SUN_DIRECTION, _SUN * light.exposure),)
+
+
+def _exposed(environment: Environment, lights: tuple[Light, ...], factor: float) -> tuple[Environment, tuple[Light, ...]]:
+    return (environment, lights) if factor == 1.0 else (environment.brighter(factor), tuple(each.brighter(factor) for each in lights))
 
 
 class Panorama:

@@ -1,0 +1,112 @@
+"""Ground that an object stands on: its slope by the depth around the foot, what of it may hide the object, and where its shadow ends."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from mrbokeh.compositing.plate import Plate
+from mrbokeh.images.layer import Layer
+
+_SAME_SURFACE, _SURELY_SAME = 0.02, 0.01
+"""Largest shares by which depth changes from pixel to pixel of one surface: along a table, and where no edge may be missed."""
+_FARTHER = 0.05
+_FOUND = 2
+_NEAR_FOOT = 0.05
+"""Half width of the ground that is looked at around a foot, in widths of the picture."""
+_ROUNDS, _ROUGH, _EVEN = 10, 0.01, 0.02
+_STEEPEST_DEG = 80.0
+
+
+def ground_under(plate: Plate, foot_px: tuple[float, float]) -> Float[np.ndarray, "3 3"] | None:
+    """Return the rotation from camera axes to upright ones (x right, y down, z forward) by the ground's slope at a pixel, or None.
+
+    The plane of the depth around the pixel is taken for level. None without depth, where that is no plane, and for what is no ground: a
+    wall, a ceiling, or what slopes by more than 80 degrees to the camera's own up.
+    """
+    if plate.depth_m is None:
+        return None
+    height_px, width_px = plate.depth_m.shape
+    reach, (x_px, y_px) = max(4, round(_NEAR_FOOT * width_px)), (int(each) for each in foot_px)
+    beside = np.zeros((height_px, width_px), bool)
+    beside[max(0, y_px - reach) : y_px + reach + 1, max(0, x_px - reach) : x_px + reach + 1] = True
+    place = np.nonzero(_same_surface(plate.depth_m, foot_px, beside, _SAME_SURFACE))
+    near = 1.0 / plate.depth_m[place].astype(np.float64)
+    camera = plate.camera
+    rays = np.column_stack([(np.stack(place[::-1], axis=-1) + 0.5 - camera.principal_px) / camera.focal_px, np.ones(len(near))])
+    if len(near) < 32 or not np.isfinite(near).all():
+        return None
+    normal = _plane_of(rays, near)
+    if normal is None or normal[1] >= -np.cos(np.radians(_STEEPEST_DEG)):
+        return None
+    down = -normal
+    forward = np.array([0.0, 0.0, 1.0]) - down[2] * down
+    forward /= np.linalg.norm(forward)
+    return np.stack([np.cross(down, forward), down, forward])
+
+
+def _plane_of(rays: Float[np.ndarray, "points 3"], near: Float[np.ndarray, " points"]) -> Float[np.ndarray, "3"] | None:
+    """Return the unit normal, towards the camera, of the plane on which most points lie; None where fewer than half lie on one.
+
+    Along rays (x, y, 1), 1 / z of a plane is linear. near: 1 / z of each point.
+    """
+    weights = np.ones(len(near))
+    for _ in range(_ROUNDS):
+        slope, *_rest = np.linalg.lstsq(rays * weights[:, None], near * weights, rcond=None)
+        apart = np.abs(rays @ slope - near) / near
+        weights = 1.0 / np.sqrt(1.0 + (apart / _ROUGH) ** 2)
+    if np.median(apart) > _EVEN:
+        return None
+    return -slope / np.linalg.norm(slope)
+
+
+def with_ground_behind(plate: Plate, foot_px: tuple[float, float], layers: Sequence[Layer]) -> Plate:
+    """Return the plate with the ground on which something stands no nearer than that, where it is seen above the foot.
+
+    A floor or a table is the farther the higher it is in the picture, so that it never hides what stands on it; depth that says otherwise
+    is wrong. The ground is what goes on from the foot without a jump of depth, but not below the foot, where near things stand.
+    """
+    if plate.depth_m is None:
+        return plate
+    covered_m = np.minimum.reduce([np.where(layer.alpha > 0.0, layer.depth_m, np.inf) for layer in layers])
+    above = np.broadcast_to(np.arange(len(covered_m))[:, None] <= int(foot_px[1]), covered_m.shape)
+    ground = _same_surface(plate.depth_m, foot_px, above, _SAME_SURFACE) & np.isfinite(covered_m)
+    return replace(plate, depth_m=np.where(ground, np.maximum(plate.depth_m, covered_m), plate.depth_m))
+
+
+def ended_shadow(plate: Plate, foot_px: tuple[float, float], objects: Layer, shadow: Layer) -> Layer:
+    """Return the shadow of objects as far as the ground goes on which they stand at a pixel.
+
+    It was drawn on a plane without end, and would hang sharp in the air over what lies blurred beyond a table's edge: past a jump of depth,
+    and clearly farther than the plane. A shadow apart from the foot, as of a thing in the air, stays.
+    """
+    covered = (objects.alpha > 0.0) | (shadow.alpha > 0.0)
+    if plate.depth_m is None or not shadow.alpha.any():
+        return shadow
+    beside = _same_surface(np.ones_like(plate.depth_m), foot_px, covered, _SURELY_SAME)
+    beyond = (
+        beside
+        & ~_same_surface(plate.depth_m, foot_px, covered, _SURELY_SAME)
+        & (plate.depth_m > shadow.depth_m * np.float32(1.0 + _FARTHER))
+    )
+    return replace(
+        shadow, alpha=np.where(beyond, np.float32(0.0), shadow.alpha), rgb=np.where(beyond[..., None], np.float32(0.0), shadow.rgb)
+    )
+
+
+def _same_surface(
+    depth_m: Float32[np.ndarray, "height width"], start_px: tuple[float, float], within: Bool[np.ndarray, "height width"], step: float
+) -> Bool[np.ndarray, "height width"]:
+    """Return the pixels (H, W) that are reached from one of them without a jump of depth by more than a share, and within a mask.
+
+    Noise of single pixels is no jump: depth is that of the median of 5x5 pixels.
+    """
+    import cv2
+
+    x_px, y_px = (int(each) for each in start_px)
+    found = cv2.copyMakeBorder((~within).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
+    found[y_px + 1, x_px + 1] = 0
+    logs = cv2.medianBlur(np.log(np.minimum(depth_m, np.float32(1e6))), 5)
+    cv2.floodFill(logs, found, (x_px, y_px), 0.0, step, step, 4 | (_FOUND << 8) | cv2.FLOODFILL_MASK_ONLY)
+    return found[1:-1, 1:-1] == _FOUND

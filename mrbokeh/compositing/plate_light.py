@@ -1,0 +1,107 @@
+"""Light of a virtual object from the photograph that it stands in: a panorama of what is seen, and light from above for its ground.
+
+A photograph shows the light that its own surfaces send, and seldom the lamps and the sky that light them. What is seen is taken as it is;
+beyond the frame it goes on ever more blurred; and what is above and out of sight is made as bright as it must be to light a white surface
+where the object stands. How bright such a surface is nobody tells: brightest parts of a picture are taken for nearly white, and a picture
+as a whole for grey (exposure meters do), near the foot as well as over the frame.
+"""
+
+import math
+
+import cv2
+import numpy as np
+from jaxtyping import Float, Float32
+
+from mrbokeh.compositing.plate import Plate
+from mrbokeh.images.color import luminance
+from mrbokeh.scene.light import Environment, Light, directions, solid_angles_sr, sun
+
+_PANORAMA_PX = (32, 64)
+_WIDTH_PX = 48
+"""The photograph is looked at this small: light is even over many pixels."""
+_WHITE, _GREY = 0.85, 0.25
+"""What the brightest parts of a picture reflect, and a picture as a whole."""
+_BRIGHT_PERCENTILE = 97.0
+_NEAR_SHARE = 0.25
+"""Width of the surroundings of the foot, in widths of the picture."""
+_LEAST_WHITE, _MOST_WHITE = 0.05, 1.5
+_COLOURED = 0.5
+"""Share of a picture's cast that is taken for light: cameras balance most of it, and the rest is as often paint."""
+_SUNLIT = 0.55
+"""Share of the light on the ground that comes from the main light, where one is told."""
+
+Rgb = Float32[np.ndarray, "height width 3"]
+Triple = Float[np.ndarray, "3"]
+
+
+def picture_light(
+    plate: Plate, foot_px: tuple[float, float], world_from_camera: Float[np.ndarray, "3 3"], sun_degrees: tuple[float, float] | None = None
+) -> tuple[Environment, tuple[Light, ...]]:
+    """Return the light at a pixel of a photograph, in a world with x right, y down and z forward, and the main light where it is told.
+
+    foot_px: where the object stands. world_from_camera: rotation of the camera in that world. sun_degrees: where the main light comes
+    from: degrees to the right of the view, and above the horizon; its share of the light on the ground is a little more than half.
+    """
+    small = _small(plate)
+    white = white_at(small, foot_px[0] / plate.rgb.shape[1], foot_px[1] / plate.rgb.shape[0])
+    seen = _panorama_of(small, plate, world_from_camera)
+    if sun_degrees is None:
+        return Environment(_lit_from_above(seen, white)), ()
+    right, above = (math.radians(each) for each in sun_degrees)
+    travels = (-math.sin(right) * math.cos(above), math.sin(above), -math.cos(right) * math.cos(above))
+    red, green, blue = (math.pi * _SUNLIT * white / max(math.sin(above), 0.1)).tolist()
+    return Environment(_lit_from_above(seen, (1.0 - _SUNLIT) * white)), (sun(travels, (red, green, blue)),)
+
+
+def white_at(picture: Rgb, x_share: float, y_share: float) -> Triple:
+    """Return the light (3,) that a white matte surface sends where an object stands, estimated from a small linear picture.
+
+    x_share, y_share: the place, in widths and heights of the picture.
+    """
+    light = luminance(picture)
+    rows, columns = np.mgrid[: light.shape[0], : light.shape[1]] + 0.5
+    apart = np.hypot(columns - x_share * light.shape[1], rows - y_share * light.shape[0]) / light.shape[1]
+    near = light[apart <= max(_NEAR_SHARE, float(apart.min()) + 0.01)]
+    told = [
+        (np.percentile(part, _BRIGHT_PERCENTILE) / _WHITE, np.mean(part) / _GREY)
+        for part in (np.minimum(light, 1.0), np.minimum(near, 1.0))
+    ]
+    level = float(np.clip(np.exp(np.log(np.maximum(told, 1e-4)).mean()), _LEAST_WHITE, _MOST_WHITE))
+    # Shades of grey (Finlayson and Trezzi 2004): the sixth powers of a picture have the colour of its light.
+    cast = (np.minimum(picture, 1.0).reshape(-1, 3).astype(np.float64) ** 6.0).mean(axis=0) ** (1.0 / 6.0)
+    cast = (cast / cast.max()) ** _COLOURED if cast.max() > 0.0 else np.ones(3)
+    return level * cast / luminance(cast[None])[0]
+
+
+def _small(plate: Plate) -> Rgb:
+    rgb = plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb
+    height_px, width_px = rgb.shape[:2]
+    size = (min(width_px, _WIDTH_PX), max(1, round(height_px * min(1.0, _WIDTH_PX / width_px))))
+    return np.maximum(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.float32(0.0))
+
+
+def _panorama_of(small: Rgb, plate: Plate, world_from_camera: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "rows columns 3"]:
+    """Return what is seen as a panorama; beyond the frame a direction has the mean of what is nearest to it, the wider the farther."""
+    camera = plate.camera.resized(small.shape[1], small.shape[0])
+    rays = camera.unproject(camera.pixel_centres_px(), np.ones(small.shape[:2])).reshape(-1, 3) @ world_from_camera.T
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    towards = directions(*_PANORAMA_PX).reshape(-1, 3)
+    cosines = towards @ rays.T
+    nearest = cosines.max(axis=1, keepdims=True)
+    width = np.maximum(1.0 - nearest, 1.0 - math.cos(math.pi / _PANORAMA_PX[0]))
+    weights = np.exp((cosines - nearest) / width)
+    mean = weights @ small.reshape(-1, 3) / weights.sum(axis=1, keepdims=True)
+    return mean.reshape(*_PANORAMA_PX, 3)
+
+
+def _lit_from_above(panorama: Float[np.ndarray, "rows columns 3"], white: Triple) -> Rgb:
+    """Return the panorama with light added above the horizon, most of it high up, until the ground has the irradiance of `white` times pi.
+
+    A panorama that is brighter already is darkened as a whole.
+    """
+    upwards = np.maximum(-directions(*_PANORAMA_PX)[..., 1:2], 0.0)
+    weights = upwards * solid_angles_sr(*_PANORAMA_PX)[..., None]
+    wanted, there = math.pi * white, (panorama * weights).sum(axis=(0, 1))
+    kept = min(1.0, float((wanted / np.maximum(there, 1e-9)).min()))
+    missing = (wanted - kept * there) / float((upwards * weights).sum())
+    return (kept * panorama + missing * upwards).astype(np.float32)

@@ -1,0 +1,106 @@
+"""Light and ground of a photograph for what is put into it: the ground has the irradiance that is told, and slopes as its depth says."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mrbokeh.compositing.ground import ground_under
+from mrbokeh.compositing.plate import Plate, plate_of
+from mrbokeh.compositing.plate_light import picture_light, white_at
+from mrbokeh.demo.plan import DATA
+from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens import Lens
+from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.light import directions, solid_angles_sr
+from mrbokeh.scene.light_change import light_change
+from mrbokeh.scene.staging.filming import FilmedLayers, Filming
+from mrbokeh.scene.staging.scene_description import Lighting, OneObject, looking_down
+from mrbokeh.tracking.world_axes import upright_camera
+
+HEIGHT, WIDTH = 36, 48
+LENS = Lens(focal_length_mm=30.0, f_number=4.0, focus_distance_m=2.0)
+DOWN_RAD, ROLL_RAD = 0.5, 0.1
+
+
+def photograph(tint: tuple[float, float, float] = (1.0, 1.0, 1.0), size_px: tuple[int, int] = (HEIGHT, WIDTH)) -> Plate:
+    """Grey noise of 0.05 to 0.45, brighter to the right."""
+    grey = 0.05 + 0.2 * np.random.default_rng(2).random((*size_px, 1)) + np.linspace(0.0, 0.2, size_px[1])[:, None]
+    return plate_of((grey * tint).astype(np.float32), LENS)
+
+
+def floors_down() -> np.ndarray:
+    """Return where the world's down is for a camera that looks down and is rolled."""
+    cosine, sine = np.cos(ROLL_RAD), np.sin(ROLL_RAD)
+    return (looking_down(DOWN_RAD) @ np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]]))[1]
+
+
+def floor_m(plate: Plate) -> np.ndarray:
+    """Return the depth of a floor 1 m below that camera."""
+    rays = (plate.camera.pixel_centres_px() - plate.camera.principal_px) / plate.camera.focal_px
+    along = rays @ floors_down()[:2] + floors_down()[2]
+    return np.where(along > 0.01, 1.0 / np.maximum(along, 0.01), np.inf).astype(np.float32)
+
+
+def test_the_ground_gets_the_irradiance_of_a_white_surface() -> None:
+    plate = photograph((1.3, 1.0, 0.6))
+    environment, lights = picture_light(plate, (24.0, 28.0), np.eye(3))
+    upwards = np.maximum(-directions(32, 64)[..., 1], 0.0) * solid_angles_sr(32, 64)
+    white = (environment.radiance * upwards[..., None]).sum(axis=(0, 1)) / np.pi
+    np.testing.assert_allclose(white, white_at(plate.rgb, 0.5, 28 / HEIGHT), rtol=0.02)
+    assert not lights
+    assert white[0] > 1.05 * white[1] > 1.05**2 * white[2], "warm light in a warm picture"
+    ahead = environment.radiance[18:21, 31:33].mean(axis=(0, 1))  # just below the middle of the picture, where nothing is added
+    np.testing.assert_allclose(ahead, plate.rgb[20:28, 18:30].mean(axis=(0, 1)), rtol=0.15)
+
+
+def test_a_main_light_takes_its_share_of_the_light() -> None:
+    """The sun from the right and 30 degrees above the horizon travels left and down, and the ground keeps its irradiance."""
+    plate = photograph()
+    environment, (main,) = picture_light(plate, (24.0, 28.0), np.eye(3), (90.0, 30.0))
+    np.testing.assert_allclose(main.direction, (-np.cos(np.pi / 6), 0.5, 0.0), atol=1e-9)
+    upwards = np.maximum(-directions(32, 64)[..., 1], 0.0) * solid_angles_sr(32, 64)
+    irradiance = (environment.radiance * upwards[..., None]).sum(axis=(0, 1)) + 0.5 * np.array(main.rgb)
+    np.testing.assert_allclose(irradiance / np.pi, white_at(plate.rgb, 0.5, 28 / HEIGHT), rtol=0.03)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.004])
+def test_the_ground_slopes_as_its_depth_says(noise: float) -> None:
+    plate = photograph(size_px=(90, 120))
+    depth_m = floor_m(plate) * (1 + noise * np.random.default_rng(3).standard_normal((90, 120))).astype(np.float32)
+    found = ground_under(replace(plate, depth_m=depth_m), (50.0, 60.0))
+    assert found is not None
+    np.testing.assert_allclose(found @ found.T, np.eye(3), atol=1e-12)
+    assert np.degrees(np.arccos(np.minimum(found[1] @ floors_down(), 1.0))) < (0.01 if noise == 0 else 2.0)
+
+
+def test_a_wall_and_noise_are_no_ground() -> None:
+    plate = photograph(size_px=(90, 120))
+    wall = np.full((90, 120), 2.0, np.float32)
+    rough = (2.0 + np.random.default_rng(4).random((90, 120))).astype(np.float32)
+    assert [ground_under(replace(plate, depth_m=each), (50.0, 60.0)) for each in (wall, rough, None)] == [None, None, None]
+
+
+def test_soft_light_in_few_pixels_is_that_of_all_pixels() -> None:
+    """A cake of 0.3 m in a picture of ten times the pixels that the change of light is computed in."""
+    camera = Camera(1200, 900, (1800.0, 1800.0), (600.0, 450.0))
+    made = picture_light(photograph(), (60.0, 60.0), looking_down(0.5))
+    one = OneObject(
+        DATA / "objects" / "cakeBirthday.glb",
+        (0.0, 0.1, 2.0),
+        height_m=0.3,
+        world_from_camera=looking_down(0.5),
+        light=Lighting(made=made),
+        shadow=1.0,
+    )
+    filmed = FilmedLayers(Filming("embree", catches="light"), one.described(), threads=1)
+    found = filmed.at(lambda _: one.seen_by(camera))[-1].alpha
+    scene, catcher = filmed._staged.scene_at(0.0), filmed._staged.catcher
+    assert catcher is not None
+    upright = upright_camera(one.seen_by(camera), filmed._staged.description.up)
+    whole = 1.0 - light_change(EmbreeRaycaster(1), scene, upright, catcher, samples=64).evenly().ratio[..., 0]
+    seen = np.zeros_like(whole)
+    seen[::6, ::6] = np.abs(found - whole)[::6, ::6]
+    assert whole.max() > 0.5
+    assert np.percentile(seen[::6, ::6][whole[::6, ::6] > 0.01], 95) < 0.08, "the noise of 64 rays a pixel"
+    assert abs(float((found - whole).mean())) < 0.003
