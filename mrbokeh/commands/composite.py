@@ -83,7 +83,7 @@ def composite(
     lens = lens and facts.on(lens, renderer)
     require_one_focus(focus=optics.focus, focus_at=optics.focus_at)
     open_focused = partial(plate_by, photo, taken, colour, bundle, lens=lens, facts={} if lens else facts.given)
-    plate = open_focused(focus_m=optics.focus)
+    plate = open_focused(focus_m=optics.focus if optics.focus_at is None else 1.0)  # then only its depth is asked for
     if optics.focus_at is not None:
         plate = open_focused(focus_m=focused_at_pixel(plate.lens, plate.depth_m, optics.focus_at).focus_distance_m)
     _tell_metres(photo, virtual, standing, lens)

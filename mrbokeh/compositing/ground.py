@@ -11,19 +11,20 @@ from mrbokeh.images.layer import Layer
 
 _SAME_SURFACE, _SURELY_SAME = 0.02, 0.01
 """Largest shares by which depth changes from pixel to pixel of one surface: along a table, and where no edge may be missed."""
-_FARTHER = 0.05
+_FARTHER, _JUST_BEFORE = 0.05, np.float32(0.999)
 _FOUND = 2
 _NEAR_FOOT = 0.05
 """Half width of the ground that is looked at around a foot, in widths of the picture."""
 _ROUNDS, _ROUGH, _EVEN = 10, 0.01, 0.02
-_STEEPEST_DEG = 80.0
+_STEEPEST_DEG, _ROLL_DEG = 60.0, 10.0
 
 
 def ground_under(plate: Plate, foot_px: tuple[float, float]) -> Float[np.ndarray, "3 3"] | None:
     """Return the rotation from camera axes to upright ones (x right, y down, z forward) by the ground's slope at a pixel, or None.
 
-    The plane of the depth around the pixel is taken for level. None without depth, where that is no plane, and for what is no ground: a
-    wall, a ceiling, or what slopes by more than 80 degrees to the camera's own up.
+    The plane of the depth around the pixel is taken for level along the view; across it the camera is, as photographs are taken. None
+    without depth, where that is no plane, and for what is no ground: a wall, a ceiling, what slopes by more than 60 degrees towards the
+    camera, or by more than 10 to a side.
     """
     if plate.depth_m is None:
         return None
@@ -38,12 +39,10 @@ def ground_under(plate: Plate, foot_px: tuple[float, float]) -> Float[np.ndarray
     if len(near) < 32 or not np.isfinite(near).all():
         return None
     normal = _plane_of(rays, near)
-    if normal is None or normal[1] >= -np.cos(np.radians(_STEEPEST_DEG)):
+    if normal is None or normal[1] >= -np.cos(np.radians(_STEEPEST_DEG)) or abs(normal[0]) > -normal[1] * np.tan(np.radians(_ROLL_DEG)):
         return None
-    down = -normal
-    forward = np.array([0.0, 0.0, 1.0]) - down[2] * down
-    forward /= np.linalg.norm(forward)
-    return np.stack([np.cross(down, forward), down, forward])
+    _, y, z = -normal / np.hypot(normal[1], normal[2])
+    return np.array([[1.0, 0.0, 0.0], [0.0, y, z], [0.0, -z, y]])
 
 
 def _plane_of(rays: Float[np.ndarray, "points 3"], near: Float[np.ndarray, " points"]) -> Float[np.ndarray, "3"] | None:
@@ -79,19 +78,22 @@ def ended_shadow(plate: Plate, foot_px: tuple[float, float], objects: Layer, sha
     """Return the shadow of objects as far as the ground goes on which they stand at a pixel.
 
     It was drawn on a plane without end, and would hang sharp in the air over what lies blurred beyond a table's edge: past a jump of depth,
-    and clearly farther than the plane. A shadow apart from the foot, as of a thing in the air, stays.
+    and clearly farther than the plane. A shadow apart from the foot, as of a thing in the air, stays. On the ground itself it lies as far
+    away as that: a plane that is a little too far would be hidden by what it darkens.
     """
     covered = (objects.alpha > 0.0) | (shadow.alpha > 0.0)
     if plate.depth_m is None or not shadow.alpha.any():
         return shadow
     beside = _same_surface(np.ones_like(plate.depth_m), foot_px, covered, _SURELY_SAME)
-    beyond = (
-        beside
-        & ~_same_surface(plate.depth_m, foot_px, covered, _SURELY_SAME)
-        & (plate.depth_m > shadow.depth_m * np.float32(1.0 + _FARTHER))
-    )
+    same = _same_surface(plate.depth_m, foot_px, covered, _SURELY_SAME)
+    beyond = beside & ~same & (plate.depth_m > shadow.depth_m * np.float32(1.0 + _FARTHER))
     return replace(
-        shadow, alpha=np.where(beyond, np.float32(0.0), shadow.alpha), rgb=np.where(beyond[..., None], np.float32(0.0), shadow.rgb)
+        shadow,
+        alpha=np.where(beyond, np.float32(0.0), shadow.alpha),
+        rgb=np.where(beyond[..., None], np.float32(0.0), shadow.rgb),
+        depth_m=np.where(
+            same & (shadow.alpha > 0.0) & (objects.alpha == 0.0), np.minimum(shadow.depth_m, plate.depth_m * _JUST_BEFORE), shadow.depth_m
+        ),
     )
 
 

@@ -26,7 +26,9 @@ from mrbokeh.tracking.world_axes import upright_camera
 
 CATCHES = ("shadow", "light")
 _FEW_PX, _FEW_SAMPLES = 5_000, 16
-_MOST_PX = 100_000
+_MOST_PX, _SMALL = 60_000, 6
+_UNSEEN = 0.004
+"""Share of a surface's light whose loss nobody sees: half a code of 8 bits in bright places. So far the shadow fades out."""
 
 CameraAt = Callable[[float], Camera]
 
@@ -136,23 +138,28 @@ class FilmedLayers:
         return [part if box == frame else box.placed(part, frame.size_px)]
 
     def _changed_box(self, scene: Scene, camera: Camera, catcher: Mesh) -> Box:
-        """Return the part of the frame in which the light changes, as seen in few pixels."""
+        """Return the part of the frame in which one sees the light change, looked at in few pixels; a small frame as a whole."""
+        frame = Box(0, camera.height_px, 0, camera.width_px)
+        if camera.width_px * camera.height_px <= _SMALL * _MOST_PX:
+            return frame
         few = _at_most(camera, _FEW_PX)
-        rows, columns = np.nonzero((light_change(self._renderer, scene, few, catcher, samples=_FEW_SAMPLES).ratio < 1.0).any(axis=2))
+        ratio = light_change(self._renderer, scene, few, catcher, samples=_FEW_SAMPLES).ratio
+        rows, columns = np.nonzero(ratio.min(axis=2) < 1.0 - _UNSEEN)
         if not len(rows):
             return Box(0, 0, 0, 0)
         step = camera.width_px / few.width_px
         low, high = (np.array([rows, columns]).min(axis=1) - 1) * step, (np.array([rows, columns]).max(axis=1) + 2) * step
         (top, left), (bottom, right) = low.astype(int).tolist(), np.ceil(high).astype(int).tolist()
-        return Box(top, bottom, left, right).within((camera.height_px, camera.width_px))
+        return Box(top, bottom, left, right).within(frame.size_px)
 
     def _change(self, scene: Scene, camera: Camera, catcher: Mesh) -> LightChange:
-        """Return the change of light; that of the sky is soft, and seen in at most _MOST_PX pixels."""
+        """Return the change of light that one sees; that of the sky is soft, and computed in at most _MOST_PX pixels."""
         if self._filming.backend == "mitsuba":
             return light_change(self._renderer, scene, camera, catcher, samples=self._filming.samples)
         some = _at_most(camera, _MOST_PX)
         change = light_change(self._renderer, scene, some, catcher, samples=self._filming.samples)
-        return change.enlarged(camera.height_px, camera.width_px)
+        seen = replace(change, ratio=np.minimum(change.ratio + np.float32(_UNSEEN), np.float32(1.0)))
+        return seen.enlarged(camera.height_px, camera.width_px)
 
     def _shadow(self, scene: Scene, camera: Camera, catcher: ShadowCatcher) -> Layer:
         """Drawn where hard shadows fall; the path tracer's are soft and may fall anywhere."""
