@@ -23,7 +23,6 @@ class Placement:
     height_m: float
     turn_deg: float
     tilt_deg: float
-    exposure: float
 
 
 DESK = (
@@ -35,7 +34,6 @@ DESK = (
         height_m=0.075,
         turn_deg=20.0,
         tilt_deg=10.0,
-        exposure=0.7,
     ),
     Placement(
         name="cake_blurred",
@@ -45,17 +43,16 @@ DESK = (
         height_m=0.075,
         turn_deg=20.0,
         tilt_deg=10.0,
-        exposure=0.7,
     ),
 )
 
 
 BOARD = (
     Placement(
-        name="alien_sharp", glb="alien.glb", slice_index=0, at_pixel="185,265", height_m=0.012, turn_deg=25.0, tilt_deg=35.0, exposure=0.6
+        name="alien_sharp", glb="alien.glb", slice_index=0, at_pixel="185,265", height_m=0.012, turn_deg=25.0, tilt_deg=35.0
     ),
     Placement(
-        name="alien_blurred", glb="alien.glb", slice_index=4, at_pixel="185,265", height_m=0.012, turn_deg=25.0, tilt_deg=35.0, exposure=0.6
+        name="alien_blurred", glb="alien.glb", slice_index=4, at_pixel="185,265", height_m=0.012, turn_deg=25.0, tilt_deg=35.0
     ),
 )
 
@@ -119,7 +116,7 @@ def _composite(folder: Path, stack: Path, placement: Placement, renderer: str) -
     arguments = (
         *("composite", str(stack), "--slice", str(placement.slice_index), "--object", str(DATA / "objects" / placement.glb)),
         *("--at-pixel", placement.at_pixel, "--height", f"{placement.height_m:g}", "--turn", f"{placement.turn_deg:g}"),
-        *("--pitch", f"{placement.tilt_deg:g}", "--exposure", f"{placement.exposure:g}", "--shadow", "0.5", *blur),
+        *("--pitch", f"{placement.tilt_deg:g}", *blur),
         *("--save-layer", str(picture.with_suffix(".exr")), "--out", str(picture), "--overwrite"),
     )
     purpose = f"Put {placement.glb} into slice {placement.slice_index} ({folder.name}), blurred by the {renderer}"
