@@ -25,7 +25,7 @@ _BRIGHT_PERCENTILE = 97.0
 _NEAR_SHARE = 0.25
 """Width of the surroundings of the foot, in widths of the picture."""
 _LEAST_WHITE, _MOST_WHITE = 0.05, 1.5
-_COLOURED = 0.5
+_COLOURED = 0.25
 """Share of a picture's cast that is taken for light: cameras balance most of it, and the rest is as often paint."""
 _SUNLIT = 0.55
 """Share of the light on the ground that comes from the main light, where one is told."""
