@@ -61,8 +61,8 @@ class ObjectOptions:
     at_pixel: Annotated[
         str | None,
         typer.Option(
-            help="X,Y of the pixel on which the object stands; needs depth. Without --object the layers stand there: their depth is scaled "
-            "so that it is the photograph's at that pixel, which leaves them as they look."
+            help="X,Y of the pixel on which the object stands; without depth on level ground. Without --object the layers stand there: "
+            "their depth is scaled so that it is the photograph's at that pixel, which leaves them as they look."
         ),
     ] = None
     height: Annotated[
@@ -77,6 +77,10 @@ class ObjectOptions:
     pitch: Annotated[
         float | None,
         typer.Option(help="How far the camera looks down, in degrees. Default: by the slope of the ground at --at-pixel, else 0."),
+    ] = None
+    camera_height: Annotated[
+        float | None,
+        typer.Option(metavar="METRES", min=0.001, help="Height of the camera above the ground, where there is no depth. Default: 1.5."),
     ] = None
     environment: Annotated[
         Path | None, typer.Option(help="Panorama (.hdr, .exr) that lights the --object. Default: one made of the photograph.")

@@ -12,7 +12,7 @@ import numpy as np
 
 from mrbokeh.commands._composite_options import LensOptions, ObjectOptions, PlateOptions, RenderingOptions, ResultOptions
 from mrbokeh.commands._insertion_options import ColourOptions, LookGroup, VirtualOptions, near_far_of
-from mrbokeh.compositing.ground import ended_shadow, ground_under
+from mrbokeh.compositing.ground import ended_shadow, ground_under, level_ground_m
 from mrbokeh.compositing.near_and_far import nearer_than
 from mrbokeh.compositing.plate import (
     Inserted,
@@ -53,13 +53,17 @@ def plate_by(
     lens: Lens | None,
     focus_m: float | None,
     facts: Mapping[str, float],
+    guessing: bool = False,
 ) -> Plate:
-    """Open the photograph, slice or bundle, with depth and matte from their files. lens, focus_m, facts: in place of its own."""
+    """Open the photograph, slice or bundle, with depth and matte from their files. lens, focus_m, facts: in place of its own.
+
+    guessing: what a photograph does not tell of its lens is guessed.
+    """
     if facts and photo.is_dir():
         told = " and ".join(flag(name) for name in facts)
         raise InputError(f"{told} would change the lens that {photo} states itself: leave that out, or give --lens LENS.json")
     if bundle is None:
-        plate = open_plate(photo, 0 if options.all_slices else options.slice_, lens, focus_m, facts)
+        plate = open_plate(photo, 0 if options.all_slices else options.slice_, lens, focus_m, facts, guessing=guessing)
     else:
         plate = bundle_plate(bundle, lens, focus_m)
     if colour.of_plate is not None:
@@ -75,6 +79,39 @@ def plate_by(
         if own is not None and plate.blur_from and before_m is not None:
             plate = with_blur_in_metres(plate, before_m, focus_m)
     return plate if options.matte is None else with_matte(plate, options.matte)
+
+
+def on_level_ground(plate: Plate, standing: ObjectOptions) -> tuple[Plate, Plate, ObjectOptions]:
+    """Return the plate, focused on the foot where nothing tells its focus, the same with level ground for its depth, and where it is."""
+    from mrbokeh.scene.staging.scene_description import looking_down
+
+    x_px, y_px = pair_of(standing.at_pixel)
+    pitch_deg = standing.pitch or 0.0
+    per_metre_m = level_ground_m(plate.camera, looking_down(math.radians(pitch_deg)), 1.0)
+    distance_m = replace(plate, depth_m=per_metre_m).depth_at_m(x_px, y_px)
+    if not math.isfinite(distance_m):
+        raise InputError(
+            f"--at-pixel {standing.at_pixel} lies above the horizon of a camera that looks down by {pitch_deg:g} degrees: choose a lower "
+            f"pixel, say how far the camera looks down with --pitch DEGREES, or give --depth"
+        )
+    at_focus = standing.camera_height is None and plate.focus_known and plate.lens.focus_distance_m < _FARTHEST_M
+    height_m = plate.lens.focus_distance_m / distance_m if at_focus else standing.camera_height or _EYES_M
+    distance_m *= height_m
+    taken = ["the camera to be level (--pitch DEGREES says how far it looks down)"] * (standing.pitch is None)
+    if at_focus:
+        taken.append(f"the object to stand where the lens is focused, {distance_m:.3g} m away (--camera-height METRES)")
+    elif standing.camera_height is None:
+        taken.append(f"the camera to be {_EYES_M:g} m above the ground (--camera-height METRES)")
+    if not plate.focus_known:
+        taken.append(f"the focus to be on the object, {distance_m:.3g} m away (--focus METRES)")
+        plate = replace(plate, lens=plate.lens.focused_at(distance_m))
+    guess(f"there is no depth: mrbokeh takes {', '.join(taken)}" if taken else "")
+    grounded = replace(plate, depth_m=per_metre_m * np.float32(height_m))
+    height = standing.height
+    if height is None and standing.camera_height is None:
+        height = f"{_HIGH_SHARE * plate.rgb.shape[0]:.0f}px"
+        guess(f"the object is made {height} high, a quarter of the picture (--height METRES or such as 300px)")
+    return plate, grounded, replace(standing, pitch=pitch_deg, height=height)
 
 
 def _from_space(plate: Plate, photo: Path, space: NamedSpace) -> Plate:
@@ -240,6 +277,8 @@ if TYPE_CHECKING:
 
 _COVERED = 0.5
 _HIGHEST, _NEARER, _MUCH_HIDDEN = 20.0, 0.03, 0.4
+_EYES_M, _FARTHEST_M = 1.5, 100.0
+"""Height of a camera in the hand, where nothing tells it, and the farthest focus that tells where an object stands."""
 _HIGH_SHARE = 0.25
 """Share of the picture's height that an object takes whose size is neither told nor known."""
 

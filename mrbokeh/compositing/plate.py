@@ -13,7 +13,7 @@ import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32
@@ -31,6 +31,7 @@ from mrbokeh.stacks.capture_bundle import CaptureBundle
 from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
 from mrbokeh.stacks.guessed_metres import is_lens_guessed
 from mrbokeh.stacks.photograph import Photograph, lens_for_photograph, read_photograph
+from mrbokeh.system.channel import guess
 from mrbokeh.system.errors import InputError, require_file
 
 _log = logging.getLogger(__name__)
@@ -45,7 +46,7 @@ class Plate:
     near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects, sharp; or None.
     alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
     metres_guessed: of a stack that knows no focus distance; blur is right in pixels all the same. blur_from: where the lens has its blur
-        from, in words, if its focal length and f-number are made up.
+        from, in words, if its focal length and f-number are made up. focus_known: False where nothing tells it.
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -57,6 +58,7 @@ class Plate:
     alpha: Float32[np.ndarray, "height width"] | None = None
     metres_guessed: bool = False
     blur_from: str = ""
+    focus_known: bool = True
 
     def __post_init__(self) -> None:
         size = self.rgb.shape[:2]
@@ -73,12 +75,17 @@ class Plate:
             raise InputError(
                 "to stand an object on a pixel the photograph needs depth: give --depth, a focal stack, or --at X,Y,Z in metres"
             )
+        depth_m = self.depth_at_m(x_px, y_px)
+        x_m, y_m, z_m = self.camera.unproject(np.array([x_px, y_px], np.float64), np.array(depth_m))
+        return float(x_m), float(y_m), float(z_m)
+
+    def depth_at_m(self, x_px: float, y_px: float) -> float:
+        """Return the depth at a pixel of a photograph with depth. Raises InputError if it lies outside."""
+        assert self.depth_m is not None
         height, width = self.depth_m.shape
         if not (0 <= x_px < width and 0 <= y_px < height):
             raise InputError(f"pixel {x_px:g},{y_px:g} lies outside the photograph of {width}x{height} px: choose one within")
-        depth_m = float(self.depth_m[int(y_px), int(x_px)])
-        x_m, y_m, z_m = self.camera.unproject(np.array([x_px, y_px], np.float64), np.array(depth_m))
-        return float(x_m), float(y_m), float(z_m)
+        return float(self.depth_m[int(y_px), int(x_px)])
 
     def length_m(self, pixels: float, depth_m: float) -> float:
         """Return the length of what covers so many pixels upright at a depth, facing the camera."""
@@ -91,12 +98,15 @@ def open_plate(
     lens: Lens | None = None,
     focus_m: float | None = None,
     facts: Mapping[str, float] | None = None,
+    *,
+    guessing: bool = False,
 ) -> Plate:
     """Open a photograph with a lens, or a slice of a merged focal stack, which brings its own lens and depth.
 
     lens: replaces that of the photograph's metadata or of the stack, but keeps the focus of a slice. focus_m replaces all.
     A phone's photograph with depth inside brings that, its sharp original, and a lens with the blur that the phone put on.
-    facts: of a photograph's lens, in place of what its metadata state or lack (`Photograph.stating`).
+    facts: of a photograph's lens, in place of what its metadata state or lack (`Photograph.stating`). guessing: what is lacking then is
+    guessed, and said, but the focus.
     """
     if not photo.exists():
         require_file(photo, "a photograph or the folder of a focal stack")
@@ -111,14 +121,19 @@ def open_plate(
     if slice_index is not None:
         raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}: leave it out")
     photograph, phone = read_photograph(photo).stating(facts or {}), _phone(photo)
-    blur_from = ""
+    blur_from, focus_known = "", True
+    if guessing and lens is None and phone is None:
+        photograph, guesses = photograph.guessing()
+        guess(f"{photo} does not tell its lens, which is guessed: {guesses}" if guesses else "")
+        focus_known = focus_m is not None or photograph.focus_distance_m is not None
+        photograph = photograph if focus_known else replace(photograph, focus_distance_m=float("inf"))
     if lens is None and not facts and phone is not None and phone.focus is not None:
         photograph, blur_from = _with_the_phones_blur(photograph, phone.focus, photo), "the phone's own blur"
     lens = photograph.lens(photo, focus_m) if lens is None else lens_for_photograph(lens, photograph, photo)
     focused = lens if focus_m is None else lens.focused_at(focus_m)
     plate = with_own_alpha(plate_of(photograph.rgb, focused), photo, read_alpha(photo, photograph.orientation))
     if phone is None:
-        return plate
+        return replace(plate, focus_known=focus_known)
     original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
     return replace(with_depth(plate, photo, DepthSettings()), sharp_rgb=original, blur_from=blur_from)
 
@@ -132,18 +147,15 @@ def _phone(photo: Path) -> PhonePhoto | None:
         return None
 
 
-_PHONE_FOCAL_MM, _LONG_SIDE_MM = 28.0, 36.0
-"""The field of view of most phones, as of full frame."""
-
-
 def _with_the_phones_blur(photograph: Photograph, focus: PhoneFocus, photo: Path) -> Photograph:
     """State the lens whose blur the phone put on; what its file does not tell is the field of view, which is then guessed."""
     height_px, width_px = photograph.rgb.shape[:2]
-    facts = {"focal_length_mm": _PHONE_FOCAL_MM, "sensor_width_mm": _LONG_SIDE_MM * width_px / max(height_px, width_px)}
-    if photograph.focal_length_mm is not None and photograph.sensor_width_mm is not None:
-        facts = {"focal_length_mm": photograph.focal_length_mm, "sensor_width_mm": photograph.sensor_width_mm}
-    else:
-        _log.warning(f"{photo} does not tell its field of view: that of {_PHONE_FOCAL_MM:g} mm on full frame is taken")
+    told = replace(photograph, f_number=1.0)
+    seen, guesses = told.guessing()
+    if guesses:
+        _log.warning(f"{photo} does not tell its field of view: {guesses} is taken")
+    assert seen.focal_length_mm is not None and seen.sensor_width_mm is not None
+    facts: dict[str, Any] = {"focal_length_mm": seen.focal_length_mm, "sensor_width_mm": seen.sensor_width_mm}
     wide_open = Lens(**facts, f_number=1.0, focus_distance_m=photograph.focus_distance_m or focus.focus_distance_m)
     f_number = wide_open.coc_px_per_dioptre(width_px) / focus.coc_px_per_dioptre(width_px, height_px)
     return replace(photograph, **facts, f_number=f_number, focus_distance_m=wide_open.focus_distance_m)  # type: ignore[arg-type]

@@ -48,12 +48,8 @@ DESK = (
 
 
 BOARD = (
-    Placement(
-        name="alien_sharp", glb="alien.glb", slice_index=0, at_pixel="185,265", height_m=0.012, turn_deg=25.0, tilt_deg=35.0
-    ),
-    Placement(
-        name="alien_blurred", glb="alien.glb", slice_index=4, at_pixel="185,265", height_m=0.012, turn_deg=25.0, tilt_deg=35.0
-    ),
+    Placement(name="alien_sharp", glb="alien.glb", slice_index=0, at_pixel="185,265", height_m=0.012, turn_deg=25.0, tilt_deg=35.0),
+    Placement(name="alien_blurred", glb="alien.glb", slice_index=4, at_pixel="185,265", height_m=0.012, turn_deg=25.0, tilt_deg=35.0),
 )
 
 

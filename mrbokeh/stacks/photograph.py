@@ -24,6 +24,8 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 
 _log = logging.getLogger(__name__)
+_USUAL_FOCAL_MM, _LONG_SIDE_MM, _USUAL_F_NUMBER = 28.0, 36.0, 8.0
+"""What most phones have, as of full frame, and an f-number at which nearly all is sharp."""
 _OPTION_OF = {
     "focal length": "--focal-length MM",
     "f-number": "--f-number N",
@@ -64,6 +66,19 @@ class Photograph:
             width_px, height_px = self.cut_from_px or (self.rgb.shape[1], self.rgb.shape[0])
             told["sensor_width_mm"] *= width_px / height_px
         return replace(self, **told)  # type: ignore[arg-type]
+
+    def guessing(self) -> tuple["Photograph", str]:
+        """Return the photograph with a guess for all of its lens but the focus that its file does not tell, and the guesses in words."""
+        guessed, words = self, []
+        if self.focal_length_mm is None or self.sensor_width_mm is None:
+            long_side_px = max(self.cut_from_px or self.rgb.shape[:2])
+            width_mm = _LONG_SIDE_MM * self.rgb.shape[1] / long_side_px
+            guessed = replace(guessed, focal_length_mm=_USUAL_FOCAL_MM, sensor_width_mm=width_mm)
+            words.append(f"the field of view of {_USUAL_FOCAL_MM:g} mm on full frame (--focal-length, --sensor-width)")
+        if self.f_number is None:
+            guessed = replace(guessed, f_number=_USUAL_F_NUMBER)
+            words.append(f"f/{_USUAL_F_NUMBER:g} (--f-number)")
+        return guessed, " and ".join(words)
 
     def lens(self, path: Path, focus_m: float | None = None) -> Lens:
         """Return the lens with a round opening. focus_m replaces the file's own focus. Raises InputError if parts are unknown."""
