@@ -87,6 +87,7 @@ def composite(
     if optics.focus_at is not None:
         plate = open_focused(focus_m=focused_at_pixel(plate.lens, plate.depth_m, optics.focus_at).focus_distance_m)
     _tell_metres(photo, virtual, standing, lens)
+    guess(plate.depth_note)
     layers_for = layers_by(virtual, standing, rendering, plate, bundle)
     mode = virtual.mode or best_mode(plate)
     insertion = insertion_of(mode, taken.near_distance, exact_depth=taken.exact_depth)

@@ -44,6 +44,7 @@ class Plate:
     sharp_rgb: (H, W, 3) the same view all in focus (of a focal stack), in the colours of rgb, or None.
     near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects, sharp; or None.
     alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
+    depth_note: what is known and what is guessed of a phone's own depth and focus, in words.
     metres_guessed: of a stack that knows no focus distance; blur is right in pixels all the same. blur_from: where the lens has its blur
         from, in words, if its focal length and f-number are made up.
     """
@@ -57,6 +58,7 @@ class Plate:
     alpha: Float32[np.ndarray, "height width"] | None = None
     metres_guessed: bool = False
     blur_from: str = ""
+    depth_note: str = ""
 
     def __post_init__(self) -> None:
         size = self.rgb.shape[:2]
@@ -112,15 +114,19 @@ def open_plate(
         raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}: leave it out")
     photograph, phone = read_photograph(photo).stating(facts or {}), _phone(photo)
     blur_from = ""
-    if lens is None and not facts and phone is not None and phone.focus is not None:
+    is_focus_guessed = phone is not None and phone.focus is not None and bool(phone.focus.note) and lens is None and focus_m is None
+    if lens is None and not facts and phone is not None and phone.focus is not None and phone.focus.blur_at_infinity is not None:
         photograph, blur_from = _with_the_phones_blur(photograph, phone.focus, photo), "the phone's own blur"
+    elif phone is not None and phone.focus is not None and photograph.focus_distance_m is None:
+        photograph = replace(photograph, focus_distance_m=phone.focus.focus_distance_m)
     lens = photograph.lens(photo, focus_m) if lens is None else lens_for_photograph(lens, photograph, photo)
     focused = lens if focus_m is None else lens.focused_at(focus_m)
     plate = with_own_alpha(plate_of(photograph.rgb, focused), photo, read_alpha(photo, photograph.orientation))
     if phone is None:
         return plate
     original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
-    return replace(with_depth(plate, photo, DepthSettings()), sharp_rgb=original, blur_from=blur_from)
+    note = f"{photo}: {phone.depth.note}" + (f"; {phone.focus.note}" if phone.focus is not None and is_focus_guessed else "")
+    return replace(with_depth(plate, photo, DepthSettings()), sharp_rgb=original, blur_from=blur_from, depth_note=note)
 
 
 def _phone(photo: Path) -> PhonePhoto | None:

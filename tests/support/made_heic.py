@@ -1,4 +1,4 @@
-"""Small HEIC files made for tests: HEVC by PyAV in the boxes of ISO/IEC 23008-12, with profiles, turns, Exif, XMP and auxiliary pictures."""
+"""Small HEIC files made for tests: HEVC by PyAV in the boxes of ISO/IEC 23008-12, with profiles, turns, Exif, XMP and depth."""
 
 import struct
 from dataclasses import dataclass, field
