@@ -210,7 +210,7 @@ def _by_profile(profile: ColourProfile, codes: Shaped[np.ndarray, "height width 
     import cv2
 
     tables = profile.tables(int(_INTEGER_RANGE[codes.dtype]))
-    light = np.dstack([_looked_up(np.ascontiguousarray(tables[:, i]), codes[..., i : i + 1]) for i in range(3)])
+    light = np.dstack([np.take(tables[:, i], codes[..., i]) for i in range(3)])
     return np.asarray(cv2.transform(light, profile.rec709_from_rgb.astype(np.float32)))
 
 
