@@ -55,7 +55,7 @@ def stored_orientation(path: Path) -> int:
     if suffix not in _TELLING:
         return AS_STORED
     try:
-        with Image.open(path) as picture:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:
             # Not picture.getexif(), which decodes the whole of a PNG to look for the tag behind its pixels.
             return known_orientation(Image.Image.getexif(picture).get(_TAG))
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
@@ -68,7 +68,7 @@ def exif_and_size(path: Path) -> "tuple[Image.Exif, SizePx] | None":
 
     try:
         if not is_heif(path):
-            with Image.open(path) as picture:
+            with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:
                 return picture.getexif(), picture.size
         exif = Image.Exif()
         exif.load(heif_exif(path))

@@ -13,7 +13,10 @@ ICC, NCLX = b"prof", b"nclx"
 
 @dataclass(frozen=True)
 class Item:
-    """A picture of a HEIC. codes: (H, W, 3), 8 bits, or 10 bits as uint16 up to 1023. properties: boxes beside those of HEVC itself."""
+    """A picture of a HEIC. properties: boxes beside those of HEVC itself.
+
+    codes: (H, W, 3), 8 bits, or 10 bits as uint16 up to 1023; or grey (H, W), 8 bits.
+    """
 
     codes: np.ndarray
     properties: tuple[bytes, ...] = ()
@@ -117,13 +120,13 @@ def _meta(boxes: _Boxes, primary: int, start: int) -> bytes:
 
 def _hevc(codes: np.ndarray) -> tuple[bytes, bytes]:
     """Encode losslessly (but for the conversion to YCbCr) and return the picture with lengths before its parts, and its hvcC box."""
-    deep = codes.dtype == np.uint16
+    deep, grey = codes.dtype == np.uint16, codes.ndim == 2
     encoder = av.CodecContext.create("libx265", "w")
     encoder.height, encoder.width = codes.shape[:2]
-    encoder.pix_fmt, encoder.time_base = "yuv444p10le" if deep else "yuv444p", Fraction(1, 25)
+    encoder.pix_fmt, encoder.time_base = "gray" if grey else "yuv444p10le" if deep else "yuv444p", Fraction(1, 25)
     encoder.options = {"x265-params": "lossless=1:log-level=none:keyint=1:range=full:colormatrix=smpte170m:repeat-headers=1:info=0"}
     frame = av.VideoFrame(encoder.width, encoder.height, encoder.pix_fmt)
-    for plane, numbers in zip(frame.planes, np.moveaxis(_ycbcr(codes), 2, 0), strict=True):
+    for plane, numbers in zip(frame.planes, [codes] if grey else np.moveaxis(_ycbcr(codes), 2, 0), strict=True):
         rows = np.zeros((plane.height, plane.line_size // numbers.itemsize), numbers.dtype)
         rows[:, : plane.width] = numbers
         plane.update(rows.tobytes())
@@ -136,7 +139,7 @@ def _hevc(codes: np.ndarray) -> tuple[bytes, bytes]:
         struct.pack(">BH", 0x80 | kind, len(each)) + b"".join(struct.pack(">H", len(nal)) + nal for nal in each)
         for kind, each in zip((32, 33, 34), heads, strict=True)
     )
-    general = b"\1\4" + b"\0" * 10 + b"\x5d\xf0\0\xfc\xff" + bytes([0xF8 | depth, 0xF8 | depth]) + b"\0\0\x0f\3"
+    general = b"\1\4" + b"\0" * 10 + b"\x5d\xf0\0\xfc" + bytes([0xFC if grey else 0xFF, 0xF8 | depth, 0xF8 | depth]) + b"\0\0\x0f\3"
     return picture, box(b"hvcC", general + arrays)
 
 
