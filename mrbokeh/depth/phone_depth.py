@@ -254,9 +254,10 @@ def _apple_focus(depth: DepthMap, found: AppleDepth, path: Path) -> PhoneFocus |
     note = f"its focus is guessed from what is near in the middle of the picture, {1.0 / dioptres:.3g} m; --focus-at X,Y says better"
     px_per_dioptre = _portrait_blur(found, tags, size_px)
     if px_per_dioptre is None:
-        return PhoneFocus(1.0 / dioptres, None, x, y, note)
+        return PhoneFocus(focus_distance_m=1.0 / dioptres, blur_at_infinity=None, x=x, y=y, note=note)
     note += f"; its blur is taken for that of full frame at f/{float(found.xmp[_BLUR + 'SimulatedAperture']):g}, as its file tells"
-    return PhoneFocus(1.0 / dioptres, px_per_dioptre * dioptres / (2.0 * max(size_px)), x, y, note)
+    blur_at_infinity = px_per_dioptre * dioptres / (2.0 * max(size_px))
+    return PhoneFocus(focus_distance_m=1.0 / dioptres, blur_at_infinity=blur_at_infinity, x=x, y=y, note=note)
 
 
 def _facts(path: Path) -> tuple[dict[int, Any], tuple[int, int]]:
