@@ -216,7 +216,7 @@ class SharpPhotograph:
 def open_sharp(photo: Path, depth: Path | None, settings: DepthSettings) -> SharpPhotograph:
     """Open a photograph with its depth. Raises InputError if there is no depth.
 
-    depth: None if the photograph itself holds it (a phone's GDepth). A phone's photograph with a blurred face gives the sharp original
+    depth: None if the photograph itself holds it (a phone's). A phone's photograph with a blurred face gives the sharp original
     inside, a merged focal stack its all-in-focus picture and its depth.
     """
     if photo.is_dir():

@@ -28,8 +28,8 @@ def develop(
 ) -> DecodedPhoto:
     """Return a photograph in linear light, the way up in which it is stored (EXIF orientation is not applied).
 
-    RAW through `decode_raw` in camera RGB; PNG, TIFF, JPEG and WebP as sRGB, EXR and HDR as they are, both in Rec.709. Smaller
-    sizes are area averages of light, and of the share that is saturated.
+    RAW through `decode_raw` in camera RGB; PNG, TIFF, JPEG, WebP and HEIC by their colour profile, EXR and HDR as they are, all in
+    Rec.709. Smaller sizes are area averages of light, and of the share that is saturated.
     """
     if is_raw(path):
         decoded = decode_raw(path, white_balance, half_size=half_size)

@@ -9,12 +9,14 @@ import math
 import shutil
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 from capture.photos.focus_metadata import FocusReading, Tags, at_infinity, canon_reading, number, read_focus
 from capture.photos.photo_metadata import PhotoMetadata, SensorReading, parse_time, read_sensor, sensor_of_model, stated_size_px
+from mrbokeh.images.heif import is_heif
 from mrbokeh.system.errors import InputError, require_file
 
 _TAGS = (
@@ -176,7 +178,8 @@ def read_metadata_of(paths: Sequence[Path], advance: Callable[[], None] = lambda
         found[index] = found[index].filled_from(more)
         if _has_gaps(found[index]):
             found[index] = found[index].filled_from(metadata_from_tags(read_tags_with_exifread(paths[index])))
-    return found
+    # HEIC is decoded upright (irot, imir); its Exif tells the same turn again.
+    return [replace(each, orientation=None) if is_heif(path) else each for path, each in zip(paths, found, strict=True)]
 
 
 def read_tags(path: Path) -> dict[str, str]:

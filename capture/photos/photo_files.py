@@ -7,7 +7,8 @@ from pathlib import Path
 
 from capture.photos.raw import RAW_SUFFIXES
 from capture.photos.sidecar import FOCUS_FILE, LENS_FILE
-from mrbokeh.images.image_io import ENCODED_SUFFIXES, HEIF_ADVICE, HEIF_SUFFIXES, LINEAR_SUFFIXES
+from mrbokeh.images.heif import has_heif, heif_advice, is_heif
+from mrbokeh.images.image_io import ENCODED_SUFFIXES, LINEAR_SUFFIXES
 from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_FILE_NAME
 from mrbokeh.system.errors import InputError
 
@@ -55,11 +56,12 @@ def find_photos(given: Sequence[Path], scene: Path) -> tuple[list[PhotoFolder], 
             photos, results = _photos_under(path, Path(scene).resolve())
             found |= {each: path for each in photos if each not in found}
             skipped += results
+        elif _is_unread_heif(path):
+            skipped.append(SkippedFile(path, heif_advice()))
         elif path.suffix.lower() in PHOTO_SUFFIXES:
             found.setdefault(path, path.parent)
         else:
-            unknown = f"not a photograph by its suffix {path.suffix or '(none)'}"
-            skipped.append(SkippedFile(path, HEIF_ADVICE if path.suffix.lower() in HEIF_SUFFIXES else unknown))
+            skipped.append(SkippedFile(path, f"not a photograph by its suffix {path.suffix or '(none)'}"))
     folders: dict[Path, list[Path]] = {}
     for path in sorted(found, key=natural_key):
         folders.setdefault(path.parent, []).append(path)
@@ -77,21 +79,24 @@ def no_photographs(given: Sequence[Path], folders: Sequence[PhotoFolder], sideca
     looked_in = [each.folder for each in folders if any(each.folder.is_relative_to(top) for top in searched)]
     read = {folder / name for folder in looked_in for name in (LENS_FILE, FOCUS_FILE)} | ({sidecar.resolve()} if sidecar else set())
     beside = sorted((path for folder in looked_in for path in folder.iterdir() if path not in read), key=natural_key)
-    known = (*PHOTO_SUFFIXES, *HEIF_SUFFIXES)
-    return [path for path in beside if path.is_file() and not path.name.startswith(".") and path.suffix.lower() not in known]
+    return [path for path in beside if path.is_file() and not path.name.startswith(".") and path.suffix.lower() not in PHOTO_SUFFIXES]
+
+
+def _is_unread_heif(path: Path) -> bool:
+    return is_heif(path) and not has_heif()
 
 
 def _photos_under(top: Path, scene: Path) -> tuple[list[Path], list[SkippedFile]]:
     """Find photographs below a folder, without hidden files, our own scene and other focal stacks' folders.
 
-    Beside photographs, EXR and HDR files are taken for somebody's results and left out. HEIC is found, but cannot be read.
+    Beside photographs, EXR and HDR files are taken for somebody's results and left out. HEIC is left out where its extra is missing.
     """
-    candidates = [path for path in top.rglob("*") if path.suffix.lower() in (*PHOTO_SUFFIXES, *HEIF_SUFFIXES) and path.is_file()]
+    candidates = [path for path in top.rglob("*") if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file()]
     stacks = {path.parent for path in top.rglob(STACK_FILE_NAME)} | {scene}
     visible = [path for path in candidates if not any(part.startswith(".") for part in path.relative_to(top).parts)]
     ours = [path for path in visible if not stacks.intersection(path.parents)]
-    photos = [path for path in ours if path.suffix.lower() in PHOTO_SUFFIXES]
-    unread = [SkippedFile(path, HEIF_ADVICE) for path in sorted(set(ours) - set(photos))]
+    photos = [path for path in ours if not _is_unread_heif(path)]
+    unread = [SkippedFile(path, heif_advice()) for path in sorted(set(ours) - set(photos))]
     results = [path for path in photos if path.suffix.lower() in LINEAR_SUFFIXES]
     if len(results) == len(photos):
         return photos, unread

@@ -12,7 +12,8 @@ PhotoArgument = Annotated[
     Path,
     typer.Argument(
         metavar="PHOTO",
-        help="A photograph (RAW, JPEG, TIFF, PNG, WebP, EXR, HDR), the folder of a merged focal stack, or a viewfinder's capture bundle.",
+        help="A photograph (RAW, JPEG, HEIC, TIFF, PNG, WebP, EXR, HDR), the folder of a merged focal stack, or a viewfinder's capture "
+        "bundle.",
     ),
 ]
 OutOption = Annotated[
@@ -30,8 +31,8 @@ class PlateOptions(shared.NearOptions):
     depth: Annotated[
         Path | None,
         typer.Option(
-            help="Depth of the photograph: EXR with Z, PNG or TIFF, a phone's JPEG, disparity (.npz) or a depth network (.onnx). Default: "
-            "PHOTO's own."
+            help="Depth of the photograph: EXR with Z, PNG or TIFF, a phone's photograph, disparity (.npz) or a depth network (.onnx). "
+            "Default: PHOTO's own."
         ),
     ] = None
     rgb: Annotated[

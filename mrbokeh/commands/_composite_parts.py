@@ -76,6 +76,7 @@ def plate_by(
     source = options.depth or (photo if near_far_m or options.depth_scale else None)
     if source is not None:
         before_m, plate = plate.depth_m, with_depth(plate, source, DepthSettings(near_far_m, options.depth_scale))
+        plate = replace(plate, depth_note="")
         if own is not None and plate.blur_from and before_m is not None:
             plate = with_blur_in_metres(plate, before_m, focus_m)
     return plate if options.matte is None else with_matte(plate, options.matte)

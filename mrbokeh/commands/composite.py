@@ -90,6 +90,7 @@ def composite(
     if optics.focus_at is not None:
         plate = open_focused(focus_m=focused_at_pixel(plate.lens, plate.depth_m, optics.focus_at).focus_distance_m)
     _tell_metres(photo, virtual, standing, lens)
+    guess(plate.depth_note)
     grounded = plate
     if on_ground and plate.depth_m is None:
         plate, grounded, standing = on_level_ground(plate, standing)

@@ -51,6 +51,7 @@ PACKAGES = (
     ("mitsuba", "path-traced objects, with reflections on the ground", "mitsuba"),
     ("pyoidn", "denoising of path-traced objects", "denoise"),
     ("opencolorio", "ACES and other colour spaces", "ocio"),
+    ("pi-heif", "reading HEIC photographs of phones, with their depth", "heic"),
     ("distributed", "videos composited by several machines", "cluster"),
 )
 PROGRAMS = (

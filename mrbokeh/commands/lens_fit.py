@@ -51,7 +51,7 @@ class MatchResultOptions:
 
 @grouped
 def match(
-    photo: Annotated[Path, typer.Argument(help="A photograph with out-of-focus lights: RAW, JPEG, TIFF, PNG, WebP, EXR or HDR.")],
+    photo: Annotated[Path, typer.Argument(help="A photograph with out-of-focus lights: RAW, JPEG, TIFF, PNG, WebP, HEIC, EXR or HDR.")],
     out: Annotated[Path, typer.Option(help="The lens file to write, e.g. lens.json.")],
     result: MatchResultOptions,
     lights: LightOptions,

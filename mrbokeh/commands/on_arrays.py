@@ -22,7 +22,7 @@ Plane = Float32[np.ndarray, "height width"]
 
 
 def read_picture(path: File) -> Rgb:
-    """Read a photograph (RAW, JPEG, TIFF, PNG, WebP, EXR, HDR), upright, as linear Rec.709 (H, W, 3) of float32; white is 1."""
+    """Read a photograph (RAW, JPEG, TIFF, PNG, WebP, HEIC, EXR, HDR), upright, as linear Rec.709 (H, W, 3) of float32; white is 1."""
     from mrbokeh.stacks.photograph import read_photograph
 
     return read_photograph(path).rgb

@@ -40,7 +40,9 @@ class DepthOptions:
 
     depth: Annotated[
         Path | None,
-        typer.Option(help="EXR with Z, PNG or TIFF, disparity (.npz), a phone's JPEG, or a depth network (.onnx). Default: PHOTO's own."),
+        typer.Option(
+            help="EXR with Z, PNG or TIFF, disparity (.npz), a phone's photograph, or a depth network (.onnx). Default: PHOTO's own."
+        ),
     ] = None
     disparity: DisparityOption = None
     depth_scale: Annotated[float | None, typer.Option(help="--depth holds distance: metres for each step; 0 is unknown.")] = None
@@ -107,7 +109,8 @@ class ResultOptions:
 @grouped
 def transfer(
     photo: Annotated[
-        Path, typer.Argument(help="All-in-focus photograph, or a merged focal stack; of a phone's JPEG with depth the sharp original.")
+        Path,
+        typer.Argument(help="All-in-focus photograph, or a merged focal stack; of a phone's photograph with depth the sharp original."),
     ],
     out: Annotated[Path, typer.Option(help="A picture, a film (.mov, .mp4, .mkv: a focus pull), or a folder (a focal stack).")],
     depth: DepthOptions,

@@ -45,6 +45,7 @@ class Plate:
     sharp_rgb: (H, W, 3) the same view all in focus (of a focal stack), in the colours of rgb, or None.
     near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects, sharp; or None.
     alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
+    depth_note: what is known and what is guessed of a phone's own depth and focus, in words.
     metres_guessed: of a stack that knows no focus distance; blur is right in pixels all the same. blur_from: where the lens has its blur
         from, in words, if its focal length and f-number are made up. focus_known: False where nothing tells it.
     """
@@ -59,6 +60,7 @@ class Plate:
     metres_guessed: bool = False
     blur_from: str = ""
     focus_known: bool = True
+    depth_note: str = ""
 
     def __post_init__(self) -> None:
         size = self.rgb.shape[:2]
@@ -122,20 +124,24 @@ def open_plate(
         raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}: leave it out")
     photograph, phone = read_photograph(photo).stating(facts or {}), _phone(photo)
     blur_from, focus_known = "", True
+    is_focus_guessed = phone is not None and phone.focus is not None and bool(phone.focus.note) and lens is None and focus_m is None
     if guessing and lens is None and phone is None:
         photograph, guesses = photograph.guessing()
         guess(f"{photo} does not tell its lens, which is guessed: {guesses}" if guesses else "")
         focus_known = focus_m is not None or photograph.focus_distance_m is not None
         photograph = photograph if focus_known else replace(photograph, focus_distance_m=float("inf"))
-    if lens is None and not facts and phone is not None and phone.focus is not None:
+    if lens is None and not facts and phone is not None and phone.focus is not None and phone.focus.blur_at_infinity is not None:
         photograph, blur_from = _with_the_phones_blur(photograph, phone.focus, photo), "the phone's own blur"
+    elif phone is not None and phone.focus is not None and photograph.focus_distance_m is None:
+        photograph = replace(photograph, focus_distance_m=phone.focus.focus_distance_m)
     lens = photograph.lens(photo, focus_m) if lens is None else lens_for_photograph(lens, photograph, photo)
     focused = lens if focus_m is None else lens.focused_at(focus_m)
     plate = with_own_alpha(plate_of(photograph.rgb, focused), photo, read_alpha(photo, photograph.orientation))
     if phone is None:
         return replace(plate, focus_known=focus_known)
     original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
-    return replace(with_depth(plate, photo, DepthSettings()), sharp_rgb=original, blur_from=blur_from)
+    note = f"{photo}: {phone.depth.note}" + (f"; {phone.focus.note}" if phone.focus is not None and is_focus_guessed else "")
+    return replace(with_depth(plate, photo, DepthSettings()), sharp_rgb=original, blur_from=blur_from, depth_note=note)
 
 
 def _phone(photo: Path) -> PhonePhoto | None:

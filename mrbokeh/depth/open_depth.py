@@ -231,8 +231,8 @@ _SAME_ASPECT = 0.02
 def open_depth(source: Path, photo_rgb: Rgb, settings: DepthSettings | None = None) -> DepthMap:
     """Read depth from any source and bring it to the photograph's size along its edges.
 
-    source: EXR with Z, PNG or TIFF (settings say what the numbers mean), disparity of stereo (.npz, .npy), a phone's JPEG with GDepth
-    inside, or a depth network (.onnx). photo_rgb: (H, W, 3) linear.
+    source: EXR with Z, PNG or TIFF (settings say what the numbers mean), disparity of stereo (.npz, .npy), a phone's photograph
+    with depth inside, or a depth network (.onnx). photo_rgb: (H, W, 3) linear.
     Raises InputError if the source cannot be read, does not say what it means, or is of another shape than the photograph.
     """
     settings = settings or DepthSettings()

@@ -4,9 +4,14 @@ import struct
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
+
+from mrbokeh.images.heif import heif_exif, is_heif, open_heif
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 TIFF_SUFFIXES = (".tif", ".tiff")
 _HEADER_BYTES, _BIG_HEADER_BYTES, _BIG = 8, 16, 43
@@ -28,6 +33,9 @@ def tiff_tags(path: Path) -> Mapping[int, Any]:
         return {}
 
 
+SizePx = tuple[int, int]
+"""Width, height."""
+
 AS_STORED = 1
 _TAG = 0x0112
 _TELLING = (".png", ".jpg", ".jpeg", ".webp")
@@ -38,7 +46,7 @@ Picture = TypeVar("Picture", bound=np.ndarray)
 
 
 def stored_orientation(path: Path) -> int:
-    """Return EXIF's orientation, 1 to 8; AS_STORED if the file has none."""
+    """Return EXIF's orientation, 1 to 8; AS_STORED if the file has none, or is HEIC, which is decoded upright."""
     from PIL import Image, UnidentifiedImageError
 
     suffix = path.suffix.lower()
@@ -47,11 +55,26 @@ def stored_orientation(path: Path) -> int:
     if suffix not in _TELLING:
         return AS_STORED
     try:
-        with Image.open(path) as picture:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:
             # Not picture.getexif(), which decodes the whole of a PNG to look for the tag behind its pixels.
             return known_orientation(Image.Image.getexif(picture).get(_TAG))
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
         return AS_STORED
+
+
+def exif_and_size(path: Path) -> "tuple[Image.Exif, SizePx] | None":
+    """Return the EXIF of a picture (JPEG, TIFF, PNG, WebP, HEIC) and its size as stored; None if it cannot be read."""
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        if not is_heif(path):
+            with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:
+                return picture.getexif(), picture.size
+        exif = Image.Exif()
+        exif.load(heif_exif(path))
+        return exif, open_heif(path).size
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
+        return None
 
 
 def known_orientation(told: object) -> int:
@@ -76,9 +99,6 @@ def as_stored(picture: Picture, orientation: int) -> Picture:
     turned = np.rot90(picture, -turns)
     return np.ascontiguousarray(turned[:, ::-1] if mirrored else turned)  # type: ignore[return-value]
 
-
-SizePx = tuple[int, int]
-"""Width, height."""
 
 _SAME_ASPECT = 0.01
 

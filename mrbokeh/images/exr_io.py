@@ -169,8 +169,11 @@ def rec709_from_chromaticities(chromaticities: Sequence[float]) -> Float64[np.nd
     None where they are no colour space: primaries on one line, white without luminance.
     """
     XYZ_from_rgb = _xyz_matrix(np.asarray(chromaticities, np.float64).reshape(4, 2))
-    if XYZ_from_rgb is None:
-        return None
+    return None if XYZ_from_rgb is None else rec709_from_matrix(XYZ_from_rgb)
+
+
+def rec709_from_matrix(XYZ_from_rgb: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"] | None:
+    """Return the matrix to linear Rec.709 from RGB whose XYZ are known; its white is adapted to D65 (Bradford). None without a white."""
     ours, theirs = (_CONES_FROM_XYZ @ matrix.sum(axis=1) for matrix in (XYZ_from_rec709, XYZ_from_rgb))
     if theirs.min() <= 0:
         return None

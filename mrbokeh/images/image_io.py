@@ -1,7 +1,8 @@
 """Pictures and layers to and from scene-linear float32: HDR as it is, EXR from the primaries that it states, PNG, TIFF, JPEG and WebP
 through a stated encoding; and previews and contact sheets for people.
 
-WebP is read only: it keeps 8 bits, mostly lossily. HEIC is not read: what decodes it from Python brings x265 (GPL) or must be built.
+WebP and HEIC are read only: WebP keeps 8 bits, mostly lossily, and HEIC needs the extra `heic`; what encodes it from Python brings x265
+(GPL). Colour profiles are honoured on reading (`color_profiles`); integers are written as sRGB without one.
 
 Files are written without stating primaries: EXR takes Rec.709 by default, and kernels and maps of numbers have none.
 """
@@ -15,6 +16,7 @@ from jaxtyping import Float, Float32, UInt8
 
 from mrbokeh.images.color import display_rgb8
 from mrbokeh.images.exr_io import ExrPart, in_rec709, read_exr, stated_primaries, write_exr
+from mrbokeh.images.heif import HEIF_SUFFIXES
 from mrbokeh.images.layer import Layer
 from mrbokeh.images.picture_codec import Encoding, codes_of, linear_from_codes, stored_pixels, stored_rgb, write_stored
 from mrbokeh.system.errors import InputError, require_file
@@ -88,10 +90,7 @@ def _font_scale(caption: str, width_px: int) -> float:
 
 INTEGER_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 """Suffixes of integer pictures that are read and written; the others are read only."""
-ENCODED_SUFFIXES = (*INTEGER_SUFFIXES, ".webp")
-HEIF_SUFFIXES = (".heic", ".heif", ".hif")
-HEIF_ADVICE = "HEIC is not read: convert it to PNG or TIFF of 16 bits, or to JPEG"
-_HEIF_BY = "by `heif-convert IN.heic OUT.png` (libheif), `magick IN.heic OUT.png`, or on a Mac `sips -s format jpeg IN.heic --out OUT.jpg`"
+ENCODED_SUFFIXES = (*INTEGER_SUFFIXES, ".webp", *HEIF_SUFFIXES)
 LINEAR_SUFFIXES = (".exr", ".hdr")
 _DEPTH_NAMES = ("Z", "depth.Z", "Depth.Z")
 _LONE_DEPTH_NAMES = (*_DEPTH_NAMES, "Y")
@@ -100,8 +99,9 @@ _LONE_DEPTH_NAMES = (*_DEPTH_NAMES, "Y")
 def read_image(path: Path | str, encoding: Encoding = "srgb") -> Float32[np.ndarray, "height width 3"]:
     """Read a picture as scene-linear Rec.709 (H, W, 3), without its alpha (see `read_layer`).
 
-    encoding: what the numbers of an integer file (PNG, TIFF, JPEG, WebP) mean; EXR, HDR and float TIFF are linear already. EXR of other
-    primaries (ACES, the camera RGB of focal stacks) is converted; `read_camera_rgb` gives what is stored.
+    encoding: what the numbers of an integer file (PNG, TIFF, JPEG, WebP, HEIC) mean: "srgb" or what the file's colour profile says, or
+    "linear", plain numbers; EXR, HDR and float TIFF are linear already. EXR of other primaries (ACES, the camera RGB of focal stacks) is
+    converted; `read_camera_rgb` gives what is stored.
     """
     return _read_rgba(Path(path), encoding)[..., :3]
 
@@ -202,8 +202,6 @@ def _read_rgba(path: Path, encoding: Encoding) -> Float32[np.ndarray, "height wi
     if suffix == ".exr":
         layer = read_layer(path)
         return np.dstack([layer.rgb, layer.alpha])
-    if suffix in HEIF_SUFFIXES:
-        raise InputError(f"{path}: {HEIF_ADVICE}, such as {_HEIF_BY}")
     if suffix not in ENCODED_SUFFIXES + LINEAR_SUFFIXES:
         raise InputError(
             f"{path}: expected one of {', '.join(LINEAR_SUFFIXES + ENCODED_SUFFIXES)}, not {suffix or 'a file without suffix'}"

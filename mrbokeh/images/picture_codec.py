@@ -1,4 +1,4 @@
-"""PNG, TIFF, JPEG, WebP and HDR files to and from the numbers that they store, and these to and from scene-linear light.
+"""PNG, TIFF, JPEG, WebP, HEIC and HDR files to and from the numbers that they store, and these to and from scene-linear light.
 
 OpenCV turns a TIFF by its tag Orientation, unlike other formats, and multiplies straight 8-bit colour by alpha, as libtiff's RGBA
 reader does; both are undone here so that all formats are treated alike. PNG chunks that carry no pixels are dropped before decoding,
@@ -18,7 +18,9 @@ import numpy as np
 from jaxtyping import Float, Float32, Shaped, UInt8
 
 from mrbokeh.images.color import srgb_codes, srgb_to_linear
+from mrbokeh.images.color_profiles import ColourProfile, profile_of
 from mrbokeh.images.exif import TIFF_SUFFIXES, as_stored, known_orientation, tiff_tags
+from mrbokeh.images.heif import heif_pixels, is_heif
 from mrbokeh.system.atomic_files import atomic_path
 from mrbokeh.system.errors import InputError
 
@@ -140,7 +142,7 @@ _SWAPPED_BY_OPENCV = (np.dtype(np.uint8), np.dtype(np.uint16), np.dtype(np.float
 
 
 def stored_pixels(path: Path) -> np.ndarray:
-    """Read the stored numbers of a PNG, TIFF, JPEG, WebP or HDR file: (H, W) or (H, W, 3 or 4), blue first.
+    """Read the stored numbers of a PNG, TIFF, JPEG, WebP, HEIC or HDR file: (H, W) or (H, W, 3 or 4), blue first.
 
     Raises InputError if the file is empty or damaged.
     """
@@ -149,6 +151,8 @@ def stored_pixels(path: Path) -> np.ndarray:
     data = np.fromfile(path, np.uint8)
     if not data.size:
         raise InputError(f"{path} is empty: copy or render it again")
+    if is_heif(path):
+        return heif_pixels(path)
     sound = without_chatter(data)
     with quiet_opencv():
         pixels = None if sound is None else cv2.imdecode(sound, cv2.IMREAD_UNCHANGED)
@@ -188,14 +192,26 @@ def write_stored(path: Path | str, pixels: Shaped[np.ndarray, "height width *cha
 def linear_from_codes(
     codes: Shaped[np.ndarray, "height width channels"], encoding: Encoding, path: Path
 ) -> Float32[np.ndarray, "height width channels"]:
-    """Convert 8 or 16 bit codes to scene-linear light; alpha, the fourth channel, has no curve. path: the file, for the error."""
+    """Convert 8 or 16 bit codes to scene-linear Rec.709; alpha, the fourth channel, has no curve.
+
+    path: the file, whose colour profile counts where the encoding is not "linear", and for the error.
+    """
     if codes.dtype not in _INTEGER_RANGE:
         raise InputError(f"{path} stores {codes.dtype}: expected 8 or 16 bit integers or float")
     top = np.float32(_INTEGER_RANGE[codes.dtype])
     if encoding != "srgb":
         return codes / top
-    linear = _looked_up(srgb_to_linear(np.arange(int(top) + 1) / top), codes[..., :3])
+    colour, profile = codes[..., :3], profile_of(path)
+    linear = _looked_up(srgb_to_linear(np.arange(int(top) + 1) / top), colour) if profile is None else _by_profile(profile, colour)
     return linear if codes.shape[2] == 3 else np.dstack([linear, codes[..., 3] / top])
+
+
+def _by_profile(profile: ColourProfile, codes: Shaped[np.ndarray, "height width 3"]) -> Float32[np.ndarray, "height width 3"]:
+    import cv2
+
+    tables = profile.tables(int(_INTEGER_RANGE[codes.dtype]))
+    light = np.dstack([np.take(tables[:, i], codes[..., i]) for i in range(3)])
+    return np.asarray(cv2.transform(light, profile.rec709_from_rgb.astype(np.float32)))
 
 
 def _looked_up(

@@ -120,7 +120,7 @@ def full_value(path: Path) -> float:
 
 
 def read_photograph(path: Path | str) -> Photograph:
-    """Read a RAW file, JPEG, TIFF, PNG, WebP, EXR or HDR.
+    """Read a RAW file, JPEG, TIFF, PNG, WebP, HEIC, EXR or HDR.
 
     Raises InputError where it cannot be read, MissingExtraError for RAW without the extra.
     """

@@ -233,6 +233,16 @@ def test_bands_and_parts_leave_no_seams(monkeypatch: pytest.MonkeyPatch) -> None
     np.testing.assert_allclose(DEFAULT.sum_kernels(values, coc_px, APERTURES["disc"]), whole, atol=2e-6)
 
 
+def test_a_band_between_lights_may_be_dark() -> None:
+    """700x1600 px are bands of 384 rows and more, of which the middle ones hold no light: the parts together are the whole."""
+    top, bottom = np.zeros((2, 1600, 700, 4), np.float32)
+    top[:100], bottom[-100:] = picture(100, 700, seed=1), picture(100, 700, seed=2)
+    coc_px = np.full((1600, 700), 9.0, np.float32)
+    both = DEFAULT.sum_kernels(top + bottom, coc_px, APERTURES["disc"])
+    apart = [DEFAULT.sum_kernels(each, coc_px, APERTURES["disc"]) for each in (top, bottom)]
+    np.testing.assert_allclose(both, apart[0] + apart[1], atol=2e-6)
+
+
 def test_pixels_without_light_have_no_say_and_light_beyond_the_border_is_lost() -> None:
     values, coc_px = np.zeros((300, 300, 4), np.float32), np.full((300, 300), np.nan, np.float32)
     values[140:160, 100:130], coc_px[140:160, 100:130] = picture(20, 30), waves(20, 30, 0.0, 25.0)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from mrbokeh.compositing.plate_look.colour_match import Triple, triple_of
+from mrbokeh.images.exif import exif_and_size
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.pixel_box import Box
@@ -156,13 +157,10 @@ def falloff_of_photo(path: Path | str) -> RadialFalloff:
 
 
 def _camera_and_lens(path: Path | str) -> tuple[CameraAndLens, tuple[int, int]]:
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as picture:
-            exif, size_px = picture.getexif(), picture.size
-    except (UnidentifiedImageError, OSError):
-        raise InputError(f"{path}: expected a photograph with Exif (JPEG, TIFF): give the falloff as K1,K2,K3 or a flat field") from None
+    found = exif_and_size(Path(path))
+    if found is None:
+        raise InputError(f"{path}: expected a photograph with Exif (JPEG, TIFF, HEIC): give the falloff as K1,K2,K3 or a flat field")
+    exif, size_px = found
     texts = [exif.get(_MAKER), exif.get(_MODEL), exif.get_ifd(_EXIF_IFD).get(_LENS_MODEL)]
     if not all(isinstance(each, str) for each in texts):
         raise InputError(f"{path}: expected its Exif to name camera and lens: give the falloff as K1,K2,K3 or a flat field")

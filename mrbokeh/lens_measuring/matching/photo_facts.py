@@ -1,4 +1,4 @@
-"""Facts that a photograph's metadata state about its lens: Exif of JPEG, TIFF and PNG."""
+"""Facts that a photograph's metadata state about its lens: Exif of JPEG, TIFF, PNG, WebP and HEIC."""
 
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mrbokeh.images.exif import cut_from_px
+from mrbokeh.images.exif import cut_from_px, exif_and_size
 from mrbokeh.optics.lens import lens_distance_m
 from mrbokeh.system.console import flag
 from mrbokeh.system.errors import InputError
@@ -61,13 +61,8 @@ def read_facts(path: Path | str, size_px: tuple[int, int]) -> PhotoFacts:
 
 
 def exif_tags(path: Path) -> dict[int, Any]:
-    from PIL import Image, UnidentifiedImageError
-
-    try:
-        with Image.open(path) as picture:
-            return dict(picture.getexif().get_ifd(_EXIF_IFD))
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
-        return {}
+    found = exif_and_size(path)
+    return {} if found is None else dict(found[0].get_ifd(_EXIF_IFD))
 
 
 def positive_rational(value: Any) -> float | None:

@@ -206,7 +206,7 @@ class BandRunner:
             largest_px=light.largest_of_tile_px,
         )
         waiting, lock = zip(bands, targets, strict=False), Lock()
-        width = max((int((band.parts[:, 3] - band.parts[:, 2]).max()) for band in bands), default=0)
+        width = max((int((band.parts[:, 3] - band.parts[:, 2]).max(initial=0)) for band in bands), default=0)
         tables = self.tables
 
         def work() -> None:
