@@ -81,7 +81,11 @@ class ObjectOptions:
     ] = None
     camera_height: Annotated[
         float | None,
-        typer.Option(metavar="METRES", min=0.001, help="Height of the camera above the ground, where there is no depth. Default: 1.5."),
+        typer.Option(
+            metavar="METRES",
+            min=0.001,
+            help="Height of the camera above the ground, where there is no depth. Default: by the focus, or 1.5.",
+        ),
     ] = None
     environment: Annotated[
         Path | None, typer.Option(help="Panorama (.hdr, .exr) that lights the --object. Default: one made of the photograph.")

@@ -12,7 +12,7 @@ import numpy as np
 
 from mrbokeh.commands._composite_options import LensOptions, ObjectOptions, PlateOptions, RenderingOptions, ResultOptions
 from mrbokeh.commands._insertion_options import ColourOptions, LookGroup, VirtualOptions, near_far_of
-from mrbokeh.compositing.ground import ended_shadow, ground_under, level_ground_m
+from mrbokeh.compositing.ground import ended_shadow, ground_under
 from mrbokeh.compositing.near_and_far import nearer_than
 from mrbokeh.compositing.plate import (
     Inserted,
@@ -82,19 +82,23 @@ def plate_by(
     return plate if options.matte is None else with_matte(plate, options.matte)
 
 
-def on_level_ground(plate: Plate, standing: ObjectOptions) -> tuple[Plate, Plate, ObjectOptions]:
-    """Return the plate, focused on the foot where nothing tells its focus, the same with level ground for its depth, and where it is."""
+def on_level_ground(plate: Plate, standing: ObjectOptions) -> tuple[Plate, ObjectOptions]:
+    """Return the plate, focused on the foot where nothing tells its focus, and the options with the foot's place on level ground."""
     from mrbokeh.scene.staging.scene_description import looking_down
 
     x_px, y_px = pair_of(standing.at_pixel)
+    if not (0 <= x_px < plate.camera.width_px and 0 <= y_px < plate.camera.height_px):
+        size = f"{plate.camera.width_px}x{plate.camera.height_px} px"
+        raise InputError(f"pixel {x_px:g},{y_px:g} lies outside the photograph of {size}: choose one within")
     pitch_deg = standing.pitch or 0.0
-    per_metre_m = level_ground_m(plate.camera, looking_down(math.radians(pitch_deg)), 1.0)
-    distance_m = replace(plate, depth_m=per_metre_m).depth_at_m(x_px, y_px)
-    if not math.isfinite(distance_m):
+    ray = plate.camera.unproject(np.array([x_px, y_px]), np.array(1.0))
+    falls = float(looking_down(math.radians(pitch_deg))[1] @ ray)
+    if falls <= 0.0:
         raise InputError(
             f"--at-pixel {standing.at_pixel} lies above the horizon of a camera that looks down by {pitch_deg:g} degrees: choose a lower "
             f"pixel, say how far the camera looks down with --pitch DEGREES, or give --depth"
         )
+    distance_m = 1.0 / falls
     at_focus = standing.camera_height is None and plate.focus_known and plate.lens.focus_distance_m < _FARTHEST_M
     height_m = plate.lens.focus_distance_m / distance_m if at_focus else standing.camera_height or _EYES_M
     distance_m *= height_m
@@ -107,12 +111,12 @@ def on_level_ground(plate: Plate, standing: ObjectOptions) -> tuple[Plate, Plate
         taken.append(f"the focus to be on the object, {distance_m:.3g} m away (--focus METRES)")
         plate = replace(plate, lens=plate.lens.focused_at(distance_m))
     guess(f"there is no depth: mrbokeh takes {', '.join(taken)}" if taken else "")
-    grounded = replace(plate, depth_m=per_metre_m * np.float32(height_m))
     height = standing.height
-    if height is None and standing.camera_height is None:
+    if height is None:
         height = f"{_HIGH_SHARE * plate.rgb.shape[0]:.0f}px"
         guess(f"the object is made {height} high, a quarter of the picture (--height METRES or such as 300px)")
-    return plate, grounded, replace(standing, pitch=pitch_deg, height=height)
+    place = ",".join(f"{each:.9g}" for each in distance_m * ray)
+    return plate, replace(standing, at=place, at_pixel=None, pitch=pitch_deg, height=height)
 
 
 def _from_space(plate: Plate, photo: Path, space: NamedSpace) -> Plate:
@@ -280,6 +284,8 @@ _COVERED = 0.5
 _HIGHEST, _NEARER, _MUCH_HIDDEN = 20.0, 0.03, 0.4
 _EYES_M, _FARTHEST_M = 1.5, 100.0
 """Height of a camera in the hand, where nothing tells it, and the farthest focus that tells where an object stands."""
+_DARK = 0.6
+"""How dark the shadow of a light is, where nothing tells."""
 _HIGH_SHARE = 0.25
 """Share of the picture's height that an object takes whose size is neither told nor known."""
 
@@ -360,7 +366,12 @@ def _object_layers(glb: Path, options: ObjectOptions, rendering: RenderingOption
     foot_px = pair_of(options.at_pixel) if options.at_pixel else _pixel_of(first.camera, stands_at_m)
     world_from_camera = _upright(options, first, foot_px)
     catches = rendering.catch or ("shadow" if options.plain else "light")
-    shadow = options.shadow if options.shadow is not None else float(not options.plain)
+    if catches == "shadow" and not (options.plain or options.sun or options.environment):
+        raise InputError(
+            "--catch shadow shows shadows of lights, and the photograph tells of none: say where one is with --sun RIGHT,ABOVE"
+        )
+    usual = 0.0 if options.plain else _DARK if catches == "shadow" else 1.0
+    shadow = usual if options.shadow is None else options.shadow
     one = OneObject(
         glb=glb,
         stands_at_m=stands_at_m,
@@ -484,6 +495,6 @@ def _triple(text: str) -> tuple[float, float, float]:
 
 def pair_of(at_pixel: str | None) -> tuple[float, float]:
     if at_pixel is None:
-        raise InputError("where does the object stand? Give --at X,Y,Z in metres, or --at-pixel X,Y on a photograph with depth")
+        raise InputError("where does the object stand? Give --at X,Y,Z in metres, or --at-pixel X,Y")
     x_px, y_px = numbers_in(at_pixel, "--at-pixel expects 2 numbers with commas between", (2,))
     return x_px, y_px

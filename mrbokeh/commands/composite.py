@@ -83,18 +83,17 @@ def composite(
     lens, renderer = lens_and_renderer(optics.lens, optics.renderer or (bundle.renderer if bundle and optics.lens is None else None))
     lens = lens and facts.on(lens, renderer)
     require_one_focus(focus=optics.focus, focus_at=optics.focus_at)
-    on_ground = standing.object_ is not None and bool(standing.at_pixel) and not photo.is_dir()
+    on_ground = standing.object_ is not None and bool(standing.at_pixel) and not photo.is_dir() and not standing.plain
     stated = {} if lens else facts.given
-    open_focused = partial(plate_by, photo, taken, colour, bundle, lens=lens, facts=stated, guessing=on_ground and not standing.plain)
+    open_focused = partial(plate_by, photo, taken, colour, bundle, lens=lens, facts=stated, guessing=on_ground)
     plate = open_focused(focus_m=optics.focus if optics.focus_at is None else 1.0)  # then only its depth is asked for
     if optics.focus_at is not None:
         plate = open_focused(focus_m=focused_at_pixel(plate.lens, plate.depth_m, optics.focus_at).focus_distance_m)
     _tell_metres(photo, virtual, standing, lens)
     guess(plate.depth_note)
-    grounded = plate
     if on_ground and plate.depth_m is None:
-        plate, grounded, standing = on_level_ground(plate, standing)
-    layers_for = layers_by(virtual, standing, rendering, grounded, bundle)
+        plate, standing = on_level_ground(plate, standing)
+    layers_for = layers_by(virtual, standing, rendering, plate, bundle)
     mode = virtual.mode or best_mode(plate)
     insertion = insertion_of(mode, taken.near_distance, exact_depth=taken.exact_depth)
     if taken.all_slices:

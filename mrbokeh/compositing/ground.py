@@ -8,7 +8,6 @@ from jaxtyping import Bool, Float, Float32
 
 from mrbokeh.compositing.plate import Plate
 from mrbokeh.images.layer import Layer
-from mrbokeh.optics.camera import Camera
 
 _SAME_SURFACE, _SURELY_SAME = 0.02, 0.01
 """Largest shares by which depth changes from pixel to pixel of one surface: along a table, and where no edge may be missed."""
@@ -37,7 +36,7 @@ def ground_under(plate: Plate, foot_px: tuple[float, float]) -> Float[np.ndarray
     near = 1.0 / plate.depth_m[place].astype(np.float64)
     camera = plate.camera
     rays = np.column_stack([(np.stack(place[::-1], axis=-1) + 0.5 - camera.principal_px) / camera.focal_px, np.ones(len(near))])
-    if len(near) < 32 or not np.isfinite(near).all():
+    if len(near) < 32 or not (np.isfinite(near) & (near > 0.0)).all():
         return None
     normal = _plane_of(rays, near)
     if normal is None or normal[1] >= -np.cos(np.radians(_STEEPEST_DEG)) or abs(normal[0]) > -normal[1] * np.tan(np.radians(_ROLL_DEG)):
@@ -59,13 +58,6 @@ def _plane_of(rays: Float[np.ndarray, "points 3"], near: Float[np.ndarray, " poi
     if np.median(apart) > _EVEN:
         return None
     return -slope / np.linalg.norm(slope)
-
-
-def level_ground_m(camera: Camera, world_from_camera: Float[np.ndarray, "3 3"], height_m: float) -> Float32[np.ndarray, "height width"]:
-    """Return the depth of level ground below a camera; inf above the horizon. height_m: of the camera above it."""
-    rays = camera.unproject(camera.pixel_centres_px(), np.ones((camera.height_px, camera.width_px)))
-    falls = rays @ world_from_camera[1]
-    return np.where(falls > 0.0, height_m / np.maximum(falls, 1e-9), np.inf).astype(np.float32)
 
 
 def with_ground_behind(plate: Plate, foot_px: tuple[float, float], layers: Sequence[Layer]) -> Plate:

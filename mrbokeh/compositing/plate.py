@@ -78,6 +78,8 @@ class Plate:
                 "to stand an object on a pixel the photograph needs depth: give --depth, a focal stack, or --at X,Y,Z in metres"
             )
         depth_m = self.depth_at_m(x_px, y_px)
+        if not 0.0 < depth_m < np.inf:
+            raise InputError(f"pixel {x_px:g},{y_px:g} shows what is infinitely far, by its depth: choose one on the ground")
         x_m, y_m, z_m = self.camera.unproject(np.array([x_px, y_px], np.float64), np.array(depth_m))
         return float(x_m), float(y_m), float(z_m)
 

@@ -103,5 +103,5 @@ def _lit_from_above(panorama: Float[np.ndarray, "rows columns 3"], white: Triple
     weights = upwards * solid_angles_sr(*_PANORAMA_PX)[..., None]
     wanted, there = math.pi * white, (panorama * weights).sum(axis=(0, 1))
     kept = min(1.0, float((wanted / np.maximum(there, 1e-9)).min()))
-    missing = (wanted - kept * there) / float((upwards * weights).sum())
+    missing = np.maximum(wanted - kept * there, 0.0) / float((upwards * weights).sum())
     return (kept * panorama + missing * upwards).astype(np.float32)

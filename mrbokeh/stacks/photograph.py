@@ -70,11 +70,14 @@ class Photograph:
     def guessing(self) -> tuple["Photograph", str]:
         """Return the photograph with a guess for all of its lens but the focus that its file does not tell, and the guesses in words."""
         guessed, words = self, []
+        if self.focal_length_mm is None and self.sensor_width_mm is not None:
+            width_mm, focal_mm = self.sensor_width_mm, _USUAL_FOCAL_MM / _LONG_SIDE_MM * self.sensor_width_mm
+        else:
+            width_mm = _LONG_SIDE_MM * self.rgb.shape[1] / max(self.cut_from_px or self.rgb.shape[:2])
+            focal_mm = self.focal_length_mm or _USUAL_FOCAL_MM
         if self.focal_length_mm is None or self.sensor_width_mm is None:
-            long_side_px = max(self.cut_from_px or self.rgb.shape[:2])
-            width_mm = _LONG_SIDE_MM * self.rgb.shape[1] / long_side_px
-            guessed = replace(guessed, focal_length_mm=_USUAL_FOCAL_MM, sensor_width_mm=width_mm)
-            words.append(f"the field of view of {_USUAL_FOCAL_MM:g} mm on full frame (--focal-length, --sensor-width)")
+            guessed = replace(guessed, focal_length_mm=focal_mm, sensor_width_mm=width_mm)
+            words.append(f"the field of view of {focal_mm:.4g} mm on {width_mm:.4g} mm of sensor width (--focal-length, --sensor-width)")
         if self.f_number is None:
             guessed = replace(guessed, f_number=_USUAL_F_NUMBER)
             words.append(f"f/{_USUAL_F_NUMBER:g} (--f-number)")

@@ -101,9 +101,9 @@ def _hash_of(options: type) -> int:
     return hash(tuple(sorted(options.options)))  # type: ignore[attr-defined]
 
 
-def _are_alike(self: Any, other: Any) -> bool:
+def _are_alike(self: Any, other: Any) -> Any:
     if type(other) is not type(self):
-        return bool(_compare(self, other))
+        return _compare(self, other)
     return all(getattr(self, name) == getattr(other, name) for name in self._values.keys() | other._values.keys())
 
 

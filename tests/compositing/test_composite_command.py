@@ -82,19 +82,19 @@ def test_an_object_stands_on_the_pixel_it_was_put_on(files: Path, composite: Com
 
 
 def test_without_depth_an_object_stands_on_level_ground(files: Path, composite: Composite) -> None:
-    """Row 70 of 96 is 22.5 px below the horizon of a level camera, whose focal length is 214 px: 1.5 m of height are 14.3 m away."""
+    """Row 70 of 96 is 22 px below the horizon of a level camera, whose focal length is 214 px: 1.5 m of height are 14.6 m away."""
     layer = files / "cake.exr"
     words = (files / "photo.exr", "--object", CAKE, "--out", files / "out.png", "--overwrite", "--save-layer", layer)
     lens = ("--focal-length", 35, "--sensor-width", 23.5, "--f-number", 4)
     code, told = composite(*words, *lens, "--at-pixel", "100,70", "--camera-height", 1.5, "--height", "20px")
-    assert code == 0 and "the focus to be on the object, 14.3 m away" in told, told
+    assert code == 0 and "the focus to be on the object, 14.6 m away" in told, told
     rows, columns = np.nonzero(read_layer(layer).alpha > 0.5)
     assert 66 <= rows.max() <= 74 and 16 <= np.ptp(rows) <= 30 and abs(columns.mean() - 100) < 4
     code, told = composite(*words, *lens, "--focus", 3, "--at-pixel", "100,70")
     assert code == 0 and "where the lens is focused, 3 m away" in told and "24px high" in told, told
     assert read_layer(layer).depth_m[68, 100] == pytest.approx(3.0, abs=0.5)
     code, told = composite(*words, "--at-pixel", "100,70")
-    assert code == 0 and "28 mm on full frame" in told and "f/8" in told
+    assert code == 0 and "28 mm on 36 mm of sensor" in told and "f/8" in told
     code, told = composite(*words, *lens, "--at-pixel", "100,40")
     assert code == 2 and "above the horizon of a camera that looks down by 0 degrees" in told
 

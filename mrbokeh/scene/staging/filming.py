@@ -26,7 +26,7 @@ from mrbokeh.tracking.world_axes import upright_camera
 
 CATCHES = ("shadow", "light")
 _FEW_PX, _FEW_SAMPLES = 5_000, 16
-_MOST_PX, _SMALL = 60_000, 6
+_MOST_PX, _SMALL, _FINER = 60_000, 6, 10
 _UNSEEN = 0.004
 """Share of a surface's light whose loss nobody sees: half a code of 8 bits in bright places. So far the shadow fades out."""
 
@@ -144,7 +144,7 @@ class FilmedLayers:
             return frame
         few = _at_most(camera, _FEW_PX)
         ratio = light_change(self._renderer, scene, few, catcher, samples=_FEW_SAMPLES).ratio
-        rows, columns = np.nonzero(ratio.min(axis=2) < 1.0 - _UNSEEN)
+        rows, columns = np.nonzero((ratio.min(axis=2) < 1.0 - _UNSEEN) | (self._objects(scene, few).alpha > 0.0))
         if not len(rows):
             return Box(0, 0, 0, 0)
         step = camera.width_px / few.width_px
@@ -153,11 +153,12 @@ class FilmedLayers:
         return Box(top, bottom, left, right).within(frame.size_px)
 
     def _change(self, scene: Scene, camera: Camera, catcher: Mesh) -> LightChange:
-        """Return the change of light that one sees; that of the sky is soft, and computed in at most _MOST_PX pixels."""
+        """Return the change of light that one sees; it is soft, and computed in few pixels, in more of them where lights throw shadows."""
         if self._filming.backend == "mitsuba":
             return light_change(self._renderer, scene, camera, catcher, samples=self._filming.samples)
-        some = _at_most(camera, _MOST_PX)
-        change = light_change(self._renderer, scene, some, catcher, samples=self._filming.samples)
+        finer = _FINER if scene.lighting[0] else 1
+        some, samples = _at_most(camera, _MOST_PX * finer), max(1, self._filming.samples * 2 // (1 + finer))
+        change = light_change(self._renderer, scene, some, catcher, samples=samples)
         seen = replace(change, ratio=np.minimum(change.ratio + np.float32(_UNSEEN), np.float32(1.0)))
         return seen.enlarged(camera.height_px, camera.width_px)
 
