@@ -24,8 +24,8 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 
 _log = logging.getLogger(__name__)
-_USUAL_FOCAL_MM, _LONG_SIDE_MM, _USUAL_F_NUMBER = 28.0, 36.0, 8.0
-"""What most phones have, as of full frame, and an f-number at which nearly all is sharp."""
+_USUAL_FOCAL_MM, _LONG_SIDE_MM, _USUAL_F_NUMBER, _SHORTEST_MM = 28.0, 36.0, 8.0, 14.0
+"""What most phones have, as of full frame, an f-number at which nearly all is sharp, and what is short on full frame."""
 _OPTION_OF = {
     "focal length": "--focal-length MM",
     "f-number": "--f-number N",
@@ -73,8 +73,10 @@ class Photograph:
         if self.focal_length_mm is None and self.sensor_width_mm is not None:
             width_mm, focal_mm = self.sensor_width_mm, _USUAL_FOCAL_MM / _LONG_SIDE_MM * self.sensor_width_mm
         else:
-            width_mm = _LONG_SIDE_MM * self.rgb.shape[1] / max(self.cut_from_px or self.rgb.shape[:2])
             focal_mm = self.focal_length_mm or _USUAL_FOCAL_MM
+            # A lens too short for full frame is that of a phone or a compact camera, whose sensor is as much smaller.
+            long_side_mm = _LONG_SIDE_MM * (focal_mm / _USUAL_FOCAL_MM if focal_mm < _SHORTEST_MM else 1.0)
+            width_mm = long_side_mm * self.rgb.shape[1] / max(self.cut_from_px or self.rgb.shape[:2])
         if self.focal_length_mm is None or self.sensor_width_mm is None:
             guessed = replace(guessed, focal_length_mm=focal_mm, sensor_width_mm=width_mm)
             words.append(f"the field of view of {focal_mm:.4g} mm on {width_mm:.4g} mm of sensor width (--focal-length, --sensor-width)")

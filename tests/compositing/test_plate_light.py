@@ -16,6 +16,7 @@ from mrbokeh.scene.light import directions, solid_angles_sr
 from mrbokeh.scene.light_change import light_change
 from mrbokeh.scene.staging.filming import FilmedLayers, Filming
 from mrbokeh.scene.staging.scene_description import Lighting, OneObject, looking_down
+from mrbokeh.stacks.photograph import Photograph
 from mrbokeh.tracking.world_axes import upright_camera
 
 HEIGHT, WIDTH = 36, 48
@@ -103,3 +104,10 @@ def test_soft_light_in_few_pixels_is_that_of_all_pixels() -> None:
     assert whole.max() > 0.5
     assert np.percentile(seen[::6, ::6][whole[::6, ::6] > 0.01], 95) < 0.08, "the noise of 64 rays a pixel"
     assert abs(float((found - whole).mean())) < 0.003
+
+
+@pytest.mark.parametrize(("told_mm", "focal_mm", "width_mm"), [(None, 28.0, 36.0), (85.0, 85.0, 36.0), (4.2, 4.2, 5.4)])
+def test_a_guessed_sensor_fits_the_focal_length(told_mm: float | None, focal_mm: float, width_mm: float) -> None:
+    """4.2 mm in a phone are 28 mm on full frame: its sensor is 36 * 4.2 / 28 mm wide."""
+    guessed, _ = Photograph(np.zeros((30, 40, 3), np.float32), focal_length_mm=told_mm).guessing()
+    assert (guessed.focal_length_mm, guessed.sensor_width_mm) == pytest.approx((focal_mm, width_mm))
