@@ -1,0 +1,241 @@
+"""The camera of one picture, or one sentence why it does not tell."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from mrbokeh.solving.line_segments import Segments, find_segments, segments_from_pixels, working_copy
+from mrbokeh.solving.solved_camera import FAIR, GUESSED, HIGH, KNOWN, LOW, SOLVED, SolvedCamera
+from mrbokeh.solving.vanishing_points import (
+    NOBODY,
+    SHORTEST_FOCAL,
+    USUAL_FOCAL,
+    Frame,
+    angles_to,
+    best_frames,
+    fit,
+    polished,
+    scored,
+    signed_sines,
+    vanishing_points,
+)
+from mrbokeh.system.errors import InputError
+
+AXES = ("x", "y", "z")
+_ADVICE = "give --line X1,Y1,X2,Y2,x|y|z for edges that are straight and level (x, z) or upright (y) in the world"
+_WIDEST = 2.4
+_FEWEST, _REFUSED, _LOW_SCORE, _HIGH_SCORE = 8, 25.0, 60.0, 90.0
+"""Segments, and scores in nats, below which a camera is refused, doubtful, and not sure."""
+_MOST_ROLL_DEG, _MOST_SD_DEG, _LOW_SD_DEG, _HIGH_SD_DEG = 20.0, 4.0, 1.5, 0.7
+_TOLD = 0.2
+"""Standard deviation of the logarithm of a focal length beyond which segments do not tell it."""
+_MOST_DISTORTION = 0.04
+"""Bending of straight lines in the corner, as a part of its distance from the middle, that no lens but a fisheye has."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """Edge told by hand. ends_px: x1, y1, x2, y2 in pixels of the picture. axis: "x" or "z" if it is level in the world, "y" if upright."""
+
+    ends_px: tuple[float, float, float, float]
+    axis: str
+
+    def __post_init__(self) -> None:
+        if self.axis not in AXES:
+            raise InputError(f"expected x, y or z as the direction of a line, got {self.axis!r}")
+        if not np.isfinite(self.ends_px).all() or np.hypot(self.ends_px[2] - self.ends_px[0], self.ends_px[3] - self.ends_px[1]) < 1.0:
+            raise InputError(f"expected a line between two pixels, got {self.ends_px}: give two ends")
+
+
+def solve_camera(
+    rgb: Float32[np.ndarray, "height width 3"], focal_length_px: float | None = None, lines: Sequence[Line] = (), *, seed: int = 0
+) -> SolvedCamera:
+    """Solve the camera of a scene-linear picture, which nobody cropped. focal_length_px: if it is known. lines: instead of what is found.
+
+    Three orthogonal directions are looked for, of which one is vertical (Manhattan world; Coughlan and Yuille, 1999). Raises InputError
+    if the picture does not tell, with what to do.
+    """
+    height_px, width_px = rgb.shape[:2]
+    side_px = max(width_px, height_px)
+    if max(width_px, height_px) > _WIDEST * min(width_px, height_px):
+        raise InputError(
+            f"expected a picture as a lens takes it, but {width_px}x{height_px} px is a panorama or was cropped, so that its middle is not "
+            f"the lens's: give the whole picture"
+        )
+    known = None if focal_length_px is None else _usable(focal_length_px / side_px)
+    segments = find_segments(working_copy(rgb))
+    if lines:
+        return _from_lines(lines, segments, known, (width_px, height_px))
+    if len(segments) < _FEWEST:
+        raise InputError(f"expected straight edges, but this picture shows {len(segments)} of them: {_ADVICE}")
+    free = best_frames(segments, np.random.default_rng(seed))
+    frames = free if known is None else best_frames(segments, np.random.default_rng(seed), known)
+    if not frames or frames[0].score < _REFUSED:
+        raise InputError(f"the {len(segments)} straight edges of this picture agree on no upright world: {_ADVICE}")
+    best = polished(segments, frames[0], known)
+    guessed = known is None and _sd(best, 3) > _TOLD
+    if guessed:
+        frames = best_frames(segments, np.random.default_rng(seed), USUAL_FOCAL) or frames
+        best = polished(segments, frames[0], USUAL_FOCAL)
+    _require_pinhole(segments, best)
+    found = _solved(best, (width_px, height_px), segments, source=GUESSED if guessed else SOLVED if known is None else KNOWN)
+    found = _with_doubts(found, best, frames)
+    return _compared(found, best, polished(segments, free[0]) if free else None)
+
+
+def _usable(focal: float) -> float:
+    if not 0.2 < focal < 40.0:
+        raise InputError(
+            f"expected a focal length between 0.2 and 40 times the longer side of the picture, got {focal:.3g} times: check --focal-length "
+            f"and --sensor-width"
+        )
+    return focal
+
+
+def _sd(frame: Frame, index: int) -> float:
+    return float("inf") if frame.covariance is None else float(np.sqrt(max(frame.covariance[index, index], 0.0)))
+
+
+def _solved(frame: Frame, size_px: tuple[int, int], segments: Segments, source: str) -> SolvedCamera:
+    focal_px = frame.focal * max(size_px)
+    told = source == SOLVED
+    return SolvedCamera(
+        width_px=size_px[0],
+        height_px=size_px[1],
+        focal_length_px=focal_px,
+        focal_length_source=source,
+        camera_from_world=frame.directions,
+        focal_length_sd_px=focal_px * _sd(frame, 3) if told else 0.0,
+        roll_sd_deg=float(np.degrees(_sd(frame, 2))),
+        pitch_sd_deg=float(np.degrees(_sd(frame, 0))),
+        solved_focal_length_px=focal_px if told else None,
+        solved_focal_length_sd_px=focal_px * _sd(frame, 3) if told else None,
+        segments_by_direction={name: frame.count(index) for index, name in enumerate(AXES)},
+        assumed=_assumed(frame, source),
+        segments_px=segments.in_pixels(*size_px),
+        axes=frame.axes,
+    )
+
+
+def _assumed(frame: Frame, source: str) -> tuple[str, ...]:
+    said = []
+    if source == GUESSED:
+        said.append("guessed: the focal length of 29 mm on full frame (--focal-length MM --sensor-width MM), as the lines do not tell it")
+    if not frame.count(1):
+        said.append("assumed: no upright lines were found, so upright is what is square to the level ones, and the camera nearly level")
+    if not frame.count(0) and not frame.count(2):
+        said.append("assumed: no level lines were found, so which way the grid runs on the ground is arbitrary")
+    return tuple(said)
+
+
+def _with_doubts(found: SolvedCamera, best: Frame, frames: Sequence[Frame]) -> SolvedCamera:
+    """Return the camera with the doubt that other frames leave, or refuse it."""
+    weights = np.exp([max(-50.0, each.score - frames[0].score) for each in frames])
+    apart = np.array([_apart_deg(frames[0], each) for each in frames])
+    doubt_deg = float(np.sqrt((weights * apart**2).sum() / weights.sum()))
+    found = replace(found, pitch_sd_deg=float(np.hypot(found.pitch_sd_deg, doubt_deg)))
+    sd_deg = float(np.hypot(found.pitch_sd_deg, found.roll_sd_deg))
+    if abs(found.roll_deg) > _MOST_ROLL_DEG:
+        raise InputError(
+            f"the lines say that the camera was rolled by {found.roll_deg:.0f} degrees, which few are: turn the picture upright, or {_ADVICE}"
+        )
+    if sd_deg > _MOST_SD_DEG or (not best.count(1) and frames[0].score < _LOW_SCORE):
+        counts = ", ".join(f"{count} along {name}" for name, count in found.segments_by_direction.items())
+        raise InputError(f"the straight edges of this picture ({counts}) do not tell where its horizon is: {_ADVICE}")
+    if frames[0].score < _LOW_SCORE or sd_deg > _LOW_SD_DEG or not best.count(1) or best.focal < 1.05 * SHORTEST_FOCAL:
+        return replace(found, confidence=LOW)
+    return replace(found, confidence=HIGH if frames[0].score > _HIGH_SCORE and sd_deg < _HIGH_SD_DEG else FAIR)
+
+
+def _apart_deg(one: Frame, other: Frame) -> float:
+    return float(np.degrees(np.arccos(np.clip(one.down @ other.down, -1.0, 1.0))))
+
+
+def _compared(found: SolvedCamera, best: Frame, free: Frame | None) -> SolvedCamera:
+    """Return the camera with what the segments alone say beside a known focal length; what disagrees is doubtful."""
+    if found.focal_length_source != KNOWN or free is None:
+        return found
+    side_px = max(found.width_px, found.height_px)
+    if _sd(free, 3) < _TOLD:
+        found = replace(found, solved_focal_length_px=free.focal * side_px, solved_focal_length_sd_px=free.focal * side_px * _sd(free, 3))
+    sd_deg = float(np.degrees(np.hypot(_sd(free, 0), _sd(free, 2))))
+    agrees = _apart_deg(best, free) < 2.0 + 2.0 * min(sd_deg, 2.0) or _sd(free, 3) > _TOLD
+    return found if agrees else replace(found, confidence=LOW)
+
+
+def _require_pinhole(segments: Segments, frame: Frame) -> None:
+    """Refuse pictures whose straight lines bend evenly about the middle."""
+    used = frame.axes != NOBODY
+    chosen, points = segments.chosen(used), vanishing_points(frame.directions, frame.focal)[frame.axes[used]]
+    off = signed_sines(chosen, points) * np.sign((chosen.along * (points[:, :2] - points[:, 2:] * chosen.middle)).sum(axis=1))
+    # A point at m seen at m (1 + k m.m) turns a segment along u by 2 k (m.u) (u x m).
+    across = chosen.along[:, 0] * chosen.middle[:, 1] - chosen.along[:, 1] * chosen.middle[:, 0]
+    turn = 2.0 * (chosen.along * chosen.middle).sum(axis=1) * across
+    weight = 1.0 / chosen.sigma_rad**2
+    strength = -float((weight * turn * off).sum() / max((weight * turn**2).sum(), 1e-12))
+    sure = 1.0 / np.sqrt(max(float((weight * turn**2).sum()), 1e-12))
+    if abs(strength) * 0.36 > _MOST_DISTORTION and abs(strength) > 5.0 * sure:
+        raise InputError(
+            f"straight lines bend in this picture, by {abs(strength) * 36:.0f} % in its corners, as by a fisheye: undistort it first "
+            f"(mrbokeh reads distortion in `transfer` and `composite`, but solves pinholes only)"
+        )
+
+
+def _from_lines(lines: Sequence[Line], segments: Segments, known: float | None, size_px: tuple[int, int]) -> SolvedCamera:
+    told = segments_from_pixels(np.array([each.ends_px for each in lines], np.float64), *size_px)
+    axes = np.array([AXES.index(each.axis) for each in lines])
+    frames = [frame for focal in ([known] if known else [None, USUAL_FOCAL]) for frame in _candidates(told, axes, segments, focal)]
+    everything = told.joined(segments)
+    fitted = [_fitted_to_lines(everything, frame, axes, known) for frame in frames]
+    if not fitted:
+        raise InputError(
+            f"{len(lines)} line{'s are' if len(lines) > 1 else ' is'} too little for a camera: give two of one direction and one of another"
+        )
+    best = max(fitted, key=lambda each: each.score)
+    guessed = known is None and _sd(best, 3) > _TOLD
+    if guessed:
+        best = _fitted_to_lines(everything, replace(best, focal=USUAL_FOCAL), axes, USUAL_FOCAL)
+    worst = float(np.degrees(angles_to(told, vanishing_points(best.directions, best.focal))[axes, np.arange(len(axes))].max()))
+    source = GUESSED if guessed else SOLVED if known is None else KNOWN
+    found = _solved(best, size_px, everything, source)
+    sd_deg = float(np.hypot(found.pitch_sd_deg, found.roll_sd_deg))
+    if worst > 5.0 or sd_deg > _MOST_SD_DEG:
+        why = f"one is off by {worst:.1f} degrees" if worst > 5.0 else f"the horizon is uncertain by {sd_deg:.0f} degrees"
+        raise InputError(f"the lines given fit no camera: {why}; check their ends and directions, give more of them, or --focal-length")
+    return replace(found, confidence=HIGH if worst < 1.0 and sd_deg < _HIGH_SD_DEG else FAIR if worst < 2.0 and sd_deg < _LOW_SD_DEG else LOW)
+
+
+def _candidates(told: Segments, axes: np.ndarray, segments: Segments, focal: float | None) -> list[Frame]:
+    """Return frames with a vanishing point of each direction that two lines tell, or of segments where none is told."""
+    points = [np.linalg.svd(told.chosen(axes == axis).lines)[2][-1] for axis in range(3) if (axes == axis).sum() > 1]
+    rng = np.random.default_rng(0)
+    return best_frames(told.joined(segments), rng, focal, given=np.array(points) if points else None)
+
+
+def _fitted_to_lines(segments: Segments, frame: Frame, axes: np.ndarray, focal: float | None) -> Frame:
+    """Return the frame with its directions named as the first segments say, fitted to these and to others of the directions left."""
+    count = len(axes)
+    told, own = segments.chosen(np.arange(count)), np.arange(count)
+
+    def misfit(directions: Float64[np.ndarray, "3 3"], length: float) -> float:
+        off = angles_to(told, vanishing_points(directions, length))[axes, own] / told.sigma_rad
+        return float(np.minimum(off**2, 1e4).sum())
+
+    named = min((frame.directions[:, list(order)] for order in permutations(range(3))), key=lambda each: misfit(each, frame.focal))
+    frame = replace(frame, directions=_upright(named))
+    for _ in range(5):
+        seen = scored(segments, frame, focal is not None).axes
+        seen[np.isin(seen, axes)] = NOBODY
+        seen[:count] = axes
+        frame = fit(segments, replace(frame, axes=seen), focal)
+    return replace(frame, score=frame.score - misfit(frame.directions, frame.focal))
+
+
+def _upright(directions: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:
+    """Return a right-handed frame whose second direction points down in the picture, and the third ahead or the first right."""
+    _, down, ahead = directions.T
+    down, ahead = down * (1.0 if down[1] >= 0.0 else -1.0), ahead * (1.0 if ahead[2] >= 0.0 else -1.0)
+    return np.stack([np.cross(down, ahead), down, ahead], axis=1)
