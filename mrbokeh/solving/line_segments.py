@@ -63,6 +63,11 @@ class Segments:
     def joined(self, other: "Segments") -> "Segments":
         return Segments(np.concatenate([self.start, other.start]), np.concatenate([self.end, other.end]))
 
+    def straightened(self, bending: float) -> "Segments":
+        """Return the segments without a lens's distortion: a point at m is seen at about m (1 + bending m.m)."""
+        start, end = (each * (1.0 - bending * (each**2).sum(axis=1, keepdims=True)) for each in (self.start, self.end))
+        return Segments(start, end)
+
     def in_pixels(self, width_px: int, height_px: int) -> Float64[np.ndarray, "segments 4"]:
         """Return (N, 4): x and y of both ends in pixels of a picture of that size."""
         middle, side_px = np.array([width_px, height_px]) / 2.0, max(width_px, height_px)

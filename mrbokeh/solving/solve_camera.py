@@ -19,7 +19,6 @@ from mrbokeh.solving.vanishing_points import (
     fit,
     polished,
     scored,
-    signed_sines,
     vanishing_points,
 )
 from mrbokeh.system.errors import InputError
@@ -32,8 +31,10 @@ _FEWEST, _REFUSED, _LOW_SCORE, _HIGH_SCORE = 8, 25.0, 60.0, 90.0
 _MOST_ROLL_DEG, _MOST_SD_DEG, _LOW_SD_DEG, _HIGH_SD_DEG = 20.0, 4.0, 1.5, 0.7
 _TOLD = 0.2
 """Standard deviation of the logarithm of a focal length beyond which segments do not tell it."""
-_MOST_DISTORTION = 0.04
-"""Bending of straight lines in the corner, as a part of its distance from the middle, that no lens but a fisheye has."""
+_LONG_FOCAL = 1.9
+"""Focal length in long sides, 68 mm on full frame, from which lines alone are not trusted: they hardly run together any more."""
+_MOST_DISTORTION, _TOLD_DISTORTION = 7.0, 1.0
+"""Distortion in the corners, in percent, that only fisheyes have, and that is said."""
 
 
 @dataclass(frozen=True)
@@ -76,12 +77,16 @@ def solve_camera(
     if not frames or frames[0].score < _REFUSED:
         raise InputError(f"the {len(segments)} straight edges of this picture agree on no upright world: {_ADVICE}")
     best = polished(segments, frames[0], known)
-    guessed = known is None and _sd(best, 3) > _TOLD
+    guessed = known is None and _sd(best, 4) > _TOLD
     if guessed:
         frames = best_frames(segments, np.random.default_rng(seed), USUAL_FOCAL) or frames
         best = polished(segments, frames[0], USUAL_FOCAL)
-    _require_pinhole(segments, best)
     found = _solved(best, (width_px, height_px), segments, source=GUESSED if guessed else SOLVED if known is None else KNOWN)
+    if abs(found.distortion_percent) > _MOST_DISTORTION and abs(best.bending) > 4.0 * _sd(best, 3):
+        raise InputError(
+            f"straight lines bend in this picture, by {abs(found.distortion_percent):.0f} % in its corners, as by a fisheye, but a "
+            f"solved camera is a pinhole: undistort the picture first"
+        )
     found = _with_doubts(found, best, frames)
     return _compared(found, best, polished(segments, free[0]) if free else None)
 
@@ -102,26 +107,30 @@ def _sd(frame: Frame, index: int) -> float:
 def _solved(frame: Frame, size_px: tuple[int, int], segments: Segments, source: str) -> SolvedCamera:
     focal_px = frame.focal * max(size_px)
     told = source == SOLVED
+    distortion_percent = 25.0 * (1.0 + (min(size_px) / max(size_px)) ** 2) * frame.bending
     return SolvedCamera(
         width_px=size_px[0],
         height_px=size_px[1],
         focal_length_px=focal_px,
         focal_length_source=source,
         camera_from_world=frame.directions,
-        focal_length_sd_px=focal_px * _sd(frame, 3) if told else 0.0,
+        focal_length_sd_px=focal_px * _sd(frame, 4) if told else 0.0,
         roll_sd_deg=float(np.degrees(_sd(frame, 2))),
         pitch_sd_deg=float(np.degrees(_sd(frame, 0))),
         solved_focal_length_px=focal_px if told else None,
-        solved_focal_length_sd_px=focal_px * _sd(frame, 3) if told else None,
+        solved_focal_length_sd_px=focal_px * _sd(frame, 4) if told else None,
         segments_by_direction={name: frame.count(index) for index, name in enumerate(AXES)},
-        assumed=_assumed(frame, source),
+        distortion_percent=distortion_percent,
+        assumed=_assumed(frame, source, distortion_percent),
         segments_px=segments.in_pixels(*size_px),
         axes=frame.axes,
     )
 
 
-def _assumed(frame: Frame, source: str) -> tuple[str, ...]:
+def _assumed(frame: Frame, source: str, distortion_percent: float) -> tuple[str, ...]:
     said = []
+    if abs(distortion_percent) > _TOLD_DISTORTION:
+        said.append(f"left out: the lens's distortion of {distortion_percent:+.1f} % in the corners; the camera is a pinhole")
     if source == GUESSED:
         said.append("guessed: the focal length of 29 mm on full frame (--focal-length MM --sensor-width MM), as the lines do not tell it")
     if not frame.count(1):
@@ -136,7 +145,11 @@ def _with_doubts(found: SolvedCamera, best: Frame, frames: Sequence[Frame]) -> S
     weights = np.exp([max(-50.0, each.score - frames[0].score) for each in frames])
     apart = np.array([_apart_deg(frames[0], each) for each in frames])
     doubt_deg = float(np.sqrt((weights * apart**2).sum() / weights.sum()))
+    spread = float(np.sqrt((weights * np.log([each.focal / frames[0].focal for each in frames]) ** 2).sum() / weights.sum()))
     found = replace(found, pitch_sd_deg=float(np.hypot(found.pitch_sd_deg, doubt_deg)))
+    if found.focal_length_source == SOLVED:
+        sd_px = float(np.hypot(found.focal_length_sd_px, spread * found.focal_length_px))
+        found = replace(found, focal_length_sd_px=sd_px, solved_focal_length_sd_px=sd_px)
     sd_deg = float(np.hypot(found.pitch_sd_deg, found.roll_sd_deg))
     if abs(found.roll_deg) > _MOST_ROLL_DEG:
         raise InputError(
@@ -145,7 +158,8 @@ def _with_doubts(found: SolvedCamera, best: Frame, frames: Sequence[Frame]) -> S
     if sd_deg > _MOST_SD_DEG or (not best.count(1) and frames[0].score < _LOW_SCORE):
         counts = ", ".join(f"{count} along {name}" for name, count in found.segments_by_direction.items())
         raise InputError(f"the straight edges of this picture ({counts}) do not tell where its horizon is: {_ADVICE}")
-    if frames[0].score < _LOW_SCORE or sd_deg > _LOW_SD_DEG or not best.count(1) or best.focal < 1.05 * SHORTEST_FOCAL:
+    is_long = found.focal_length_source == SOLVED and best.focal > _LONG_FOCAL
+    if is_long or frames[0].score < _LOW_SCORE or sd_deg > _LOW_SD_DEG or not best.count(1) or best.focal < 1.05 * SHORTEST_FOCAL:
         return replace(found, confidence=LOW)
     return replace(found, confidence=HIGH if frames[0].score > _HIGH_SCORE and sd_deg < _HIGH_SD_DEG else FAIR)
 
@@ -159,29 +173,11 @@ def _compared(found: SolvedCamera, best: Frame, free: Frame | None) -> SolvedCam
     if found.focal_length_source != KNOWN or free is None:
         return found
     side_px = max(found.width_px, found.height_px)
-    if _sd(free, 3) < _TOLD:
-        found = replace(found, solved_focal_length_px=free.focal * side_px, solved_focal_length_sd_px=free.focal * side_px * _sd(free, 3))
+    if _sd(free, 4) < _TOLD:
+        found = replace(found, solved_focal_length_px=free.focal * side_px, solved_focal_length_sd_px=free.focal * side_px * _sd(free, 4))
     sd_deg = float(np.degrees(np.hypot(_sd(free, 0), _sd(free, 2))))
-    agrees = _apart_deg(best, free) < 2.0 + 2.0 * min(sd_deg, 2.0) or _sd(free, 3) > _TOLD
+    agrees = _apart_deg(best, free) < 2.0 + 2.0 * min(sd_deg, 2.0) or _sd(free, 4) > _TOLD
     return found if agrees else replace(found, confidence=LOW)
-
-
-def _require_pinhole(segments: Segments, frame: Frame) -> None:
-    """Refuse pictures whose straight lines bend evenly about the middle."""
-    used = frame.axes != NOBODY
-    chosen, points = segments.chosen(used), vanishing_points(frame.directions, frame.focal)[frame.axes[used]]
-    off = signed_sines(chosen, points) * np.sign((chosen.along * (points[:, :2] - points[:, 2:] * chosen.middle)).sum(axis=1))
-    # A point at m seen at m (1 + k m.m) turns a segment along u by 2 k (m.u) (u x m).
-    across = chosen.along[:, 0] * chosen.middle[:, 1] - chosen.along[:, 1] * chosen.middle[:, 0]
-    turn = 2.0 * (chosen.along * chosen.middle).sum(axis=1) * across
-    weight = 1.0 / chosen.sigma_rad**2
-    strength = -float((weight * turn * off).sum() / max((weight * turn**2).sum(), 1e-12))
-    sure = 1.0 / np.sqrt(max(float((weight * turn**2).sum()), 1e-12))
-    if abs(strength) * 0.36 > _MOST_DISTORTION and abs(strength) > 5.0 * sure:
-        raise InputError(
-            f"straight lines bend in this picture, by {abs(strength) * 36:.0f} % in its corners, as by a fisheye: undistort it first "
-            f"(mrbokeh reads distortion in `transfer` and `composite`, but solves pinholes only)"
-        )
 
 
 def _from_lines(lines: Sequence[Line], segments: Segments, known: float | None, size_px: tuple[int, int]) -> SolvedCamera:
@@ -195,7 +191,7 @@ def _from_lines(lines: Sequence[Line], segments: Segments, known: float | None, 
             f"{len(lines)} line{'s are' if len(lines) > 1 else ' is'} too little for a camera: give two of one direction and one of another"
         )
     best = max(fitted, key=lambda each: each.score)
-    guessed = known is None and _sd(best, 3) > _TOLD
+    guessed = known is None and _sd(best, 4) > _TOLD
     if guessed:
         best = _fitted_to_lines(everything, replace(best, focal=USUAL_FOCAL), axes, USUAL_FOCAL)
     worst = float(np.degrees(angles_to(told, vanishing_points(best.directions, best.focal))[axes, np.arange(len(axes))].max()))
@@ -205,7 +201,9 @@ def _from_lines(lines: Sequence[Line], segments: Segments, known: float | None, 
     if worst > 5.0 or sd_deg > _MOST_SD_DEG:
         why = f"one is off by {worst:.1f} degrees" if worst > 5.0 else f"the horizon is uncertain by {sd_deg:.0f} degrees"
         raise InputError(f"the lines given fit no camera: {why}; check their ends and directions, give more of them, or --focal-length")
-    return replace(found, confidence=HIGH if worst < 1.0 and sd_deg < _HIGH_SD_DEG else FAIR if worst < 2.0 and sd_deg < _LOW_SD_DEG else LOW)
+    return replace(
+        found, confidence=HIGH if worst < 1.0 and sd_deg < _HIGH_SD_DEG else FAIR if worst < 2.0 and sd_deg < _LOW_SD_DEG else LOW
+    )
 
 
 def _candidates(told: Segments, axes: np.ndarray, segments: Segments, focal: float | None) -> list[Frame]:

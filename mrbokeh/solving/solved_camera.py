@@ -27,7 +27,8 @@ class SolvedCamera:
     focal_length_source: known (told beforehand), solved, or guessed; camera_height_source: known or guessed. solved_focal_length_px: what
     the segments alone say, also where the focal length was known; None if they do not tell. camera_from_world: (3, 3) rotation; its second
     column is down. segments_by_direction: how many segments point along x, y and z; 0: not found. confidence: high, fair or low.
-    assumed: what was taken for granted, in sentences. segments_px: (N, 4) x and y of both ends, and axes: (N,) 0, 1, 2 or -1, for pictures.
+    distortion_percent: how much farther out the lens shows what is in the corners, negative: nearer, as far as lines tell; the camera itself
+    is the pinhole without it. assumed: what was taken for granted, in sentences. segments_px: (N, 4) x and y of both ends, and axes: (N,) 0, 1, 2 or -1, for pictures.
     """
 
     width_px: int
@@ -41,6 +42,7 @@ class SolvedCamera:
     solved_focal_length_px: float | None = None
     solved_focal_length_sd_px: float | None = None
     segments_by_direction: dict[str, int] = field(default_factory=dict)
+    distortion_percent: float = 0.0
     confidence: str = LOW
     camera_height_m: float = GUESSED_HEIGHT_M
     camera_height_source: str = GUESSED
@@ -78,10 +80,22 @@ class SolvedCamera:
         """Return the (x, y) of the horizon at the left and right edge of the picture; y may lie outside of it."""
         right, down, ahead = self.camera_from_world[:, 1]
         (middle_x, middle_y), down = self.principal_point_px, max(abs(down), 1e-9) * (1.0 if down >= 0.0 else -1.0)
-        left_y, right_y = (
-            middle_y - (right * (x - middle_x) + ahead * self.focal_length_px) / down for x in (0.0, float(self.width_px))
-        )
+        left_y, right_y = (middle_y - (right * (x - middle_x) + ahead * self.focal_length_px) / down for x in (0.0, float(self.width_px)))
         return (0.0, float(left_y)), (float(self.width_px), float(right_y))
+
+    def disagreement(self) -> str:
+        """Return in words how the known focal length and that of the lines differ, "" up to 2 standard deviations or 5 %."""
+        own, sd_px = self.solved_focal_length_px, self.solved_focal_length_sd_px
+        if self.focal_length_source != KNOWN or own is None or sd_px is None:
+            return ""
+        off_px = abs(own - self.focal_length_px)
+        if off_px <= 2.0 * sd_px or off_px <= 0.05 * self.focal_length_px:
+            return ""
+        return f"the lines say {own:.0f} +- {sd_px:.0f} px, but {self.focal_length_px:.0f} px are stated"
+
+    def of_sensor(self, width_mm: float | None) -> "SolvedCamera":
+        """Return the camera with the width of its sensor along the rows of the picture, None if it is unknown."""
+        return replace(self, sensor_width_mm=width_mm)
 
     def camera(self) -> Camera:
         """Return the pinhole, which stands camera_height_m above the world's origin."""

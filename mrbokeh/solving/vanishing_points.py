@@ -24,6 +24,8 @@ _FOCAL_SPREAD = 0.6
 SHORTEST_FOCAL, LONGEST_FOCAL = 0.35, 8.0
 _ROLL_RAD, _PITCH_RAD = np.radians(4.0), np.radians(22.0)
 _WORST_PRIOR = 18.0
+_BENDING, _MOST_BENDING = 0.02, 0.6
+"""Standard deviation of radial distortion, 0.7 % in the corners, and the most that is tried."""
 _TEMPER = 0.3
 """Segments are not independent: each counts as this part of one."""
 _PAIRS, _CANDIDATES, _REFINED = 4000, 36, 10
@@ -48,8 +50,8 @@ class Frame:
 
     directions: (3, 3), columns are the world's right, down and forward in camera axes. focal: in long sides of the picture.
     axes: for each segment 0, 1 or 2 by its direction, or -1. score: in nats, against segments that point anywhere. found: which directions
-    have more segments than chance gives. covariance: (4, 4) of a turn about the camera's axes in radians and of the logarithm of the focal
-    length; None before it is refined.
+    have more segments than chance gives. bending: radial distortion (`Segments.straightened`). covariance: (5, 5) of a turn about the
+    camera's axes in radians, of the bending and of the logarithm of the focal length; None before it is refined.
     """
 
     directions: Directions
@@ -57,7 +59,8 @@ class Frame:
     axes: Axes
     score: float
     found: tuple[bool, bool, bool] = (True, True, True)
-    covariance: Float64[np.ndarray, "4 4"] | None = None
+    bending: float = 0.0
+    covariance: Float64[np.ndarray, "5 5"] | None = None
 
     @property
     def down(self) -> Float64[np.ndarray, "3"]:
@@ -205,6 +208,7 @@ def priors(directions: Float64[np.ndarray, "*frames 3 3"], focals: np.ndarray | 
 
 def scored(segments: Segments, frame: Frame, known: bool) -> Frame:
     """Return the frame with its segments and its score, without directions that chance may have made."""
+    segments = segments.straightened(frame.bending)
     points = vanishing_points(frame.directions, frame.focal)
     off, gains = angles_to(segments, points) / segments.sigma_rad, np.log(_ANY + _EACH * _gains(segments, points))
     axes = np.where(off.min(axis=0) < NEAR, off.argmin(axis=0), NOBODY)
@@ -238,7 +242,8 @@ def polished(segments: Segments, frame: Frame, focal: float | None = None) -> Fr
         used = frame.axes != NOBODY
         if used.sum() < 3:
             return frame
-        off = angles_to(segments, vanishing_points(frame.directions, frame.focal))[frame.axes[used], np.flatnonzero(used)]
+        straight = segments.straightened(frame.bending)
+        off = angles_to(straight, vanishing_points(frame.directions, frame.focal))[frame.axes[used], np.flatnonzero(used)]
         frame = fit(segments, frame, focal, _noise(off, segments.length[used]))
     return frame
 
@@ -255,37 +260,40 @@ def _noise(off_rad: Float64[np.ndarray, " used"], length: Float64[np.ndarray, " 
 
 
 def fit(segments: Segments, frame: Frame, focal: float | None, noise: tuple[float, float] = (POINT_NOISE, BENDING_RAD)) -> Frame:
-    """Return the frame with directions, focal length and covariance fitted to the segments that its axes name.
+    """Return the frame with directions, focal length, bending and covariance fitted to the segments that its axes name.
 
     noise: of the ends of segments, and of their directions in radians.
     """
     used = frame.axes != NOBODY
-    chosen, axes, start = segments.chosen(used), frame.axes[used], np.zeros(3 if focal is not None else 4)
+    chosen, axes, start = segments.chosen(used), frame.axes[used], np.zeros(4 if focal is not None else 5)
     sigma = np.hypot(2.0 * noise[0] / chosen.length, noise[1])
+
+    start[3] = frame.bending
 
     def turned(values: Float64[np.ndarray, " values"]) -> tuple[Directions, float]:
         directions = Rotation.from_rotvec(values[:3]).as_matrix() @ frame.directions
-        return directions, (frame.focal * float(np.exp(values[3])) if focal is None else focal)
+        return directions, (frame.focal * float(np.exp(values[4])) if focal is None else focal)
 
     def residuals(values: Float64[np.ndarray, " values"]) -> Float64[np.ndarray, " residuals"]:
         directions, length = turned(values)
-        off = signed_sines(chosen, vanishing_points(directions, length)[axes]) / sigma
+        off = _signed_sines(chosen.straightened(values[3]), vanishing_points(directions, length)[axes]) / sigma
         # Weak priors keep what the segments do not tell at what is usual.
-        held = [roll_rad(directions) / _ROLL_RAD, pitch_rad(directions) / _PITCH_RAD]
+        held = [roll_rad(directions) / _ROLL_RAD, pitch_rad(directions) / _PITCH_RAD, values[3] / _BENDING]
         return np.append(off, held if focal is not None else [*held, np.log(length / USUAL_FOCAL) / _FOCAL_SPREAD])
 
     low, high = np.full(len(start), -np.inf), np.full(len(start), np.inf)
+    low[3], high[3] = -_MOST_BENDING, _MOST_BENDING
     if focal is None:
-        low[3], high[3] = min(np.log(SHORTEST_FOCAL / frame.focal), -1e-3), max(np.log(LONGEST_FOCAL / frame.focal), 1e-3)
+        low[4], high[4] = min(np.log(SHORTEST_FOCAL / frame.focal), -1e-3), max(np.log(LONGEST_FOCAL / frame.focal), 1e-3)
     found = least_squares(residuals, start, bounds=(low, high), loss="soft_l1", max_nfev=30)
     directions, length = turned(found.x)
     spread = max(1.0, float(np.median(np.abs(found.fun[: len(chosen)])) / 0.6745)) ** 2
-    covariance = np.zeros((4, 4))
+    covariance = np.zeros((5, 5))
     covariance[: len(start), : len(start)] = np.linalg.inv(found.jac.T @ found.jac + 1e-9 * np.eye(len(start))) * spread
-    return replace(frame, directions=directions, focal=length, covariance=covariance * _ALIKE)
+    return replace(frame, directions=directions, focal=length, bending=float(found.x[3]), covariance=covariance * _ALIKE)
 
 
-def signed_sines(segments: Segments, points: Float64[np.ndarray, "segments 3"]) -> Float64[np.ndarray, " segments"]:
+def _signed_sines(segments: Segments, points: Float64[np.ndarray, "segments 3"]) -> Float64[np.ndarray, " segments"]:
     """Return the sine of the angle from each segment to the way to its own point."""
     way = points[:, :2] - points[:, 2:] * segments.middle
     aside = segments.along[:, 0] * way[:, 1] - segments.along[:, 1] * way[:, 0]

@@ -137,7 +137,9 @@ def _street(made: Place) -> None:
     made.polygon(np.array([[-60, eye_m, 0], [60, eye_m, 0], [60, eye_m, 200], [-60, eye_m, 200]]), (110, 112, 115))
     half = rng.uniform(5, 8)
     for k in range(12):
-        made.polygon(np.array([[-0.1, eye_m, 3 + 6 * k], [0.1, eye_m, 3 + 6 * k], [0.1, eye_m, 6 + 6 * k], [-0.1, eye_m, 6 + 6 * k]]), (230,) * 3)
+        made.polygon(
+            np.array([[-0.1, eye_m, 3 + 6 * k], [0.1, eye_m, 3 + 6 * k], [0.1, eye_m, 6 + 6 * k], [-0.1, eye_m, 6 + 6 * k]]), (230,) * 3
+        )
     blocks = [(side, float(z), rng.uniform(6, 14)) for side in (-1, 1) for z in np.arange(0, 70, 15)]
     made.face(np.array([-half - 12, eye_m, 90.0]), np.array([2 * half + 24, 0, 0]), np.array([0, -14.0, 0]), (9, 5), 0.2)
     for side, z, high in sorted(blocks, key=lambda each: -each[1]):
