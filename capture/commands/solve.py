@@ -16,10 +16,10 @@ if TYPE_CHECKING:
 
 HELP = "\n\n".join(
     (
-        "Find the camera of one photograph: its focal length, how it was held, the horizon and the ground, from straight lines in rooms, on "
-        "streets and tables. Lines along three directions that are square to one another are looked for, of which one is upright.",
-        "A focal length that EXIF or --focal-length states is taken, and compared with what the lines say. Without either it is solved, and "
-        "guessed where the lines do not tell it. The whole picture is needed: one that was cropped has another middle.",
+        "Find the camera of one photograph: its focal length, how it was held, the horizon and the ground, from straight lines in rooms, "
+        "on streets and tables. Lines along three directions that are square to one another are looked for, of which one is upright.",
+        "A focal length that EXIF or --focal-length states is taken, and compared with what the lines say. Without either it is solved, "
+        "and guessed where the lines do not tell it. The whole picture is needed: one that was cropped has another middle.",
         "Where lines are few, give some by hand: --line X1,Y1,X2,Y2,y for an upright edge, x and z for level edges along two directions "
         "that are square to one another (which is which is yours to choose). They replace what is found along their direction.",
         "--out is read by `mrbokeh.solving`; look at --picture before you trust a camera of low confidence.",
@@ -43,9 +43,7 @@ def solve_command(
         list[str] | None,
         typer.Option(metavar="X1,Y1,X2,Y2,x|y|z", help="an edge by hand, upright (y) or level (x, z); may be repeated"),
     ] = None,
-    height: Annotated[
-        float | None, typer.Option(metavar="METRES", help="of the camera above the ground; without it 1.5 is guessed")
-    ] = None,
+    height: Annotated[float | None, typer.Option(metavar="METRES", help="of the camera above the ground, else 1.5 is guessed")] = None,
     length: Annotated[
         str | None,
         typer.Option(metavar="X1,Y1,X2,Y2,METRES", help="a known length between two pixels of the ground, instead of --height"),

@@ -32,9 +32,7 @@ def solved_picture(rgb: Float32[np.ndarray, "height width 3"], camera: SolvedCam
     drawn = np.ascontiguousarray((drawn * _DIMMED).astype(np.uint8))
     thin = max(1, round(max(size_px) / 800))
     for line in _grid_px(camera, size_px):
-        cv2.polylines(
-            drawn, [np.round(line * 16).astype(np.int32)], isClosed=False, color=_GRID, thickness=thin, lineType=cv2.LINE_AA, shift=4
-        )
+        cv2.polylines(drawn, [np.round(line * 16).astype(np.int32)], False, _GRID, thin, cv2.LINE_AA, 4)
     scale = size_px[0] / camera.width_px
     for ends, axis in zip(camera.segments_px * scale, camera.axes, strict=True):
         if axis >= 0:

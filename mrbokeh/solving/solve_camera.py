@@ -16,7 +16,9 @@ from mrbokeh.solving.vanishing_points import (
     Frame,
     angles_to,
     best_frames,
+    candidates,
     fit,
+    frames_of,
     polished,
     scored,
     vanishing_points,
@@ -29,6 +31,7 @@ _WIDEST = 2.4
 _FEWEST, _REFUSED, _LOW_SCORE, _HIGH_SCORE = 8, 25.0, 60.0, 90.0
 """Segments, and scores in nats, below which a camera is refused, doubtful, and not sure."""
 _MOST_ROLL_DEG, _MOST_SD_DEG, _LOW_SD_DEG, _HIGH_SD_DEG = 20.0, 4.0, 1.5, 0.7
+_TRIED = 8
 _TOLD = 0.2
 """Standard deviation of the logarithm of a focal length beyond which segments do not tell it."""
 _LONG_FOCAL = 1.9
@@ -104,9 +107,22 @@ def _sd(frame: Frame, index: int) -> float:
     return float("inf") if frame.covariance is None else float(np.sqrt(max(frame.covariance[index, index], 0.0)))
 
 
+def _held_sd_deg(frame: Frame) -> tuple[float, float]:
+    """Return the standard deviations of roll and pitch in degrees; a turn about the upright changes neither."""
+    if frame.covariance is None:
+        return float("inf"), float("inf")
+    right, down, ahead = frame.down
+    across = np.cross(np.eye(3), frame.down).T
+    spread = across @ frame.covariance[:3, :3] @ across.T
+    level = max(right**2 + down**2, 1e-9)
+    of_roll = np.array([down, -right, 0.0]) / level
+    roll, pitch = float(of_roll @ spread @ of_roll), float(spread[2, 2]) / level
+    return float(np.degrees(np.sqrt(max(roll, 0.0)))), float(np.degrees(np.sqrt(max(pitch, 0.0))))
+
+
 def _solved(frame: Frame, size_px: tuple[int, int], segments: Segments, source: str) -> SolvedCamera:
     focal_px = frame.focal * max(size_px)
-    told = source == SOLVED
+    told, (roll_sd_deg, pitch_sd_deg) = source == SOLVED, _held_sd_deg(frame)
     distortion_percent = 25.0 * (1.0 + (min(size_px) / max(size_px)) ** 2) * frame.bending
     return SolvedCamera(
         width_px=size_px[0],
@@ -115,8 +131,8 @@ def _solved(frame: Frame, size_px: tuple[int, int], segments: Segments, source: 
         focal_length_source=source,
         camera_from_world=frame.directions,
         focal_length_sd_px=focal_px * _sd(frame, 4) if told else 0.0,
-        roll_sd_deg=float(np.degrees(_sd(frame, 2))),
-        pitch_sd_deg=float(np.degrees(_sd(frame, 0))),
+        roll_sd_deg=roll_sd_deg,
+        pitch_sd_deg=pitch_sd_deg,
         solved_focal_length_px=focal_px if told else None,
         solved_focal_length_sd_px=focal_px * _sd(frame, 4) if told else None,
         segments_by_direction={name: frame.count(index) for index, name in enumerate(AXES)},
@@ -153,7 +169,8 @@ def _with_doubts(found: SolvedCamera, best: Frame, frames: Sequence[Frame]) -> S
     sd_deg = float(np.hypot(found.pitch_sd_deg, found.roll_sd_deg))
     if abs(found.roll_deg) > _MOST_ROLL_DEG:
         raise InputError(
-            f"the lines say that the camera was rolled by {found.roll_deg:.0f} degrees, which few are: turn the picture upright, or {_ADVICE}"
+            f"the lines say that the camera was rolled by {found.roll_deg:.0f} degrees, which few are: turn the picture upright, or "
+            f"{_ADVICE}"
         )
     if sd_deg > _MOST_SD_DEG or (not best.count(1) and frames[0].score < _LOW_SCORE):
         counts = ", ".join(f"{count} along {name}" for name, count in found.segments_by_direction.items())
@@ -175,7 +192,7 @@ def _compared(found: SolvedCamera, best: Frame, free: Frame | None) -> SolvedCam
     side_px = max(found.width_px, found.height_px)
     if _sd(free, 4) < _TOLD:
         found = replace(found, solved_focal_length_px=free.focal * side_px, solved_focal_length_sd_px=free.focal * side_px * _sd(free, 4))
-    sd_deg = float(np.degrees(np.hypot(_sd(free, 0), _sd(free, 2))))
+    sd_deg = float(np.hypot(*_held_sd_deg(free)))
     agrees = _apart_deg(best, free) < 2.0 + 2.0 * min(sd_deg, 2.0) or _sd(free, 4) > _TOLD
     return found if agrees else replace(found, confidence=LOW)
 
@@ -183,53 +200,67 @@ def _compared(found: SolvedCamera, best: Frame, free: Frame | None) -> SolvedCam
 def _from_lines(lines: Sequence[Line], segments: Segments, known: float | None, size_px: tuple[int, int]) -> SolvedCamera:
     told = segments_from_pixels(np.array([each.ends_px for each in lines], np.float64), *size_px)
     axes = np.array([AXES.index(each.axis) for each in lines])
-    frames = [frame for focal in ([known] if known else [None, USUAL_FOCAL]) for frame in _candidates(told, axes, segments, focal)]
     everything = told.joined(segments)
-    fitted = [_fitted_to_lines(everything, frame, axes, known) for frame in frames]
+    frames = [each for focal in ([known] if known else [None, USUAL_FOCAL]) for each in _candidates(told, axes, segments, focal)]
+    frames = sorted((_named(each, told, axes) for each in frames), key=lambda each: _misfit(each, told, axes))[:_TRIED]
+    fitted = [_fitted_to_lines(everything, each, axes, known) for each in frames]
     if not fitted:
-        raise InputError(
-            f"{len(lines)} line{'s are' if len(lines) > 1 else ' is'} too little for a camera: give two of one direction and one of another"
-        )
+        few = f"{len(lines)} lines are" if len(lines) > 1 else "one line is"
+        raise InputError(f"{few} too little for a camera: give two of one direction, and one or two of another")
     best = max(fitted, key=lambda each: each.score)
     guessed = known is None and _sd(best, 4) > _TOLD
     if guessed:
         best = _fitted_to_lines(everything, replace(best, focal=USUAL_FOCAL), axes, USUAL_FOCAL)
-    worst = float(np.degrees(angles_to(told, vanishing_points(best.directions, best.focal))[axes, np.arange(len(axes))].max()))
+    off_rad = angles_to(told.straightened(best.bending), vanishing_points(best.directions, best.focal))[axes, np.arange(len(axes))]
+    worst = float(np.degrees(off_rad.max()))
     source = GUESSED if guessed else SOLVED if known is None else KNOWN
     found = _solved(best, size_px, everything, source)
     sd_deg = float(np.hypot(found.pitch_sd_deg, found.roll_sd_deg))
     if worst > 5.0 or sd_deg > _MOST_SD_DEG:
         why = f"one is off by {worst:.1f} degrees" if worst > 5.0 else f"the horizon is uncertain by {sd_deg:.0f} degrees"
         raise InputError(f"the lines given fit no camera: {why}; check their ends and directions, give more of them, or --focal-length")
-    return replace(
-        found, confidence=HIGH if worst < 1.0 and sd_deg < _HIGH_SD_DEG else FAIR if worst < 2.0 and sd_deg < _LOW_SD_DEG else LOW
-    )
+    if worst < 1.0 and sd_deg < _HIGH_SD_DEG:
+        return replace(found, confidence=HIGH)
+    return replace(found, confidence=FAIR if worst < 2.0 and sd_deg < _LOW_SD_DEG else LOW)
 
 
 def _candidates(told: Segments, axes: np.ndarray, segments: Segments, focal: float | None) -> list[Frame]:
-    """Return frames with a vanishing point of each direction that two lines tell, or of segments where none is told."""
+    """Return frames with a vanishing point that two lines tell, and others of lines, of segments, or level and upright ones."""
     points = [np.linalg.svd(told.chosen(axes == axis).lines)[2][-1] for axis in range(3) if (axes == axis).sum() > 1]
-    rng = np.random.default_rng(0)
-    return best_frames(told.joined(segments), rng, focal, given=np.array(points) if points else None)
+    if not points:
+        return []
+    length = focal or USUAL_FOCAL
+    rays = [each / [length, length, 1.0] for each in points]
+    planes = [*(told.lines * [length, length, 1.0]), np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])]
+    square = [np.cross(ray, plane) for ray in rays for plane in planes]
+    others = [each * [length, length, 1.0] for each in square if np.linalg.norm(each) > 1e-6]
+    if len(segments) >= _FEWEST:
+        others += list(candidates(segments, np.random.default_rng(0)))
+    return frames_of(told.joined(segments), np.array(points), np.array([*points, *others]), focal)
+
+
+def _misfit(frame: Frame, told: Segments, axes: np.ndarray) -> float:
+    """Return how far told lines miss the vanishing points of their directions: squares of standard deviations."""
+    straight = told.straightened(frame.bending)
+    off = angles_to(straight, vanishing_points(frame.directions, frame.focal))[axes, np.arange(len(axes))] / told.sigma_rad
+    return float(np.minimum(off**2, 1e4).sum())
+
+
+def _named(frame: Frame, told: Segments, axes: np.ndarray) -> Frame:
+    """Return the frame with its directions in the order that fits the lines told."""
+    orders = [replace(frame, directions=_upright(frame.directions[:, list(order)])) for order in permutations(range(3))]
+    return min(orders, key=lambda each: _misfit(each, told, axes))
 
 
 def _fitted_to_lines(segments: Segments, frame: Frame, axes: np.ndarray, focal: float | None) -> Frame:
-    """Return the frame with its directions named as the first segments say, fitted to these and to others of the directions left."""
+    """Return the frame fitted to the first segments, whose directions are told, and to others of the directions left."""
     count = len(axes)
-    told, own = segments.chosen(np.arange(count)), np.arange(count)
-
-    def misfit(directions: Float64[np.ndarray, "3 3"], length: float) -> float:
-        off = angles_to(told, vanishing_points(directions, length))[axes, own] / told.sigma_rad
-        return float(np.minimum(off**2, 1e4).sum())
-
-    named = min((frame.directions[:, list(order)] for order in permutations(range(3))), key=lambda each: misfit(each, frame.focal))
-    frame = replace(frame, directions=_upright(named))
-    for _ in range(5):
+    for _ in range(4):
         seen = scored(segments, frame, focal is not None).axes
         seen[np.isin(seen, axes)] = NOBODY
         seen[:count] = axes
         frame = fit(segments, replace(frame, axes=seen), focal)
-    return replace(frame, score=frame.score - misfit(frame.directions, frame.focal))
+    return replace(frame, score=scored(segments, frame, focal is not None).score - _misfit(frame, segments.chosen(np.arange(count)), axes))
 
 
 def _upright(directions: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3"]:

@@ -27,8 +27,9 @@ class SolvedCamera:
     focal_length_source: known (told beforehand), solved, or guessed; camera_height_source: known or guessed. solved_focal_length_px: what
     the segments alone say, also where the focal length was known; None if they do not tell. camera_from_world: (3, 3) rotation; its second
     column is down. segments_by_direction: how many segments point along x, y and z; 0: not found. confidence: high, fair or low.
-    distortion_percent: how much farther out the lens shows what is in the corners, negative: nearer, as far as lines tell; the camera itself
-    is the pinhole without it. assumed: what was taken for granted, in sentences. segments_px: (N, 4) x and y of both ends, and axes: (N,) 0, 1, 2 or -1, for pictures.
+    distortion_percent: how much farther out the lens shows what is in the corners, negative: nearer, as far as lines tell; the camera
+    itself is the pinhole without it. assumed: what was taken for granted, in sentences. segments_px: (N, 4) x and y of both ends, and
+    axes: (N,) 0, 1, 2 or -1, for pictures.
     """
 
     width_px: int

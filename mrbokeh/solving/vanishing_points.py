@@ -124,13 +124,10 @@ def _met(segments: Segments, point: Float64[np.ndarray, "3"]) -> Float64[np.ndar
     return point
 
 
-def best_frames(
-    segments: Segments, rng: np.random.Generator, focal: float | None = None, given: Float64[np.ndarray, "points 3"] | None = None
-) -> list[Frame]:
-    """Return refined frames, the best first. focal: if it is known. given: vanishing points of which one at least is in each frame."""
-    points = candidates(segments, rng) if len(segments) > 3 else np.zeros((0, 3))
-    firsts = points if given is None else given
-    rough = frames_of(segments, firsts, np.concatenate([points, firsts]) if given is not None else points, focal)
+def best_frames(segments: Segments, rng: np.random.Generator, focal: float | None = None) -> list[Frame]:
+    """Return refined frames, the best first. focal: if it is known."""
+    points = candidates(segments, rng)
+    rough = frames_of(segments, points, points, focal)
     refined = list[Frame]()
     for each in rough:
         frame = refine(segments, each, focal)
@@ -189,17 +186,19 @@ def ordered(directions: Float64[np.ndarray, "*frames 3 3"]) -> Float64[np.ndarra
     return np.stack([right, down, np.cross(right, down)], axis=-1)
 
 
-def roll_rad(directions: Float64[np.ndarray, "*frames 3 3"]) -> Float64[np.ndarray, "*frames"]:
+def roll_rad(directions: Float64[np.ndarray, "*frames 3 3"]) -> Float64[np.ndarray, "*frames"] | float:
     """Return how far the camera is turned clockwise about its axis: what is level in the world then falls to the left in the picture."""
-    return np.arctan2(directions[..., 0, 1], directions[..., 1, 1])
+    return np.arctan2(directions[..., 0, 1], directions[..., 1, 1])  # type: ignore[no-any-return]
 
 
-def pitch_rad(directions: Float64[np.ndarray, "*frames 3 3"]) -> Float64[np.ndarray, "*frames"]:
+def pitch_rad(directions: Float64[np.ndarray, "*frames 3 3"]) -> Float64[np.ndarray, "*frames"] | float:
     """Return how far the camera looks up."""
     return -np.arcsin(np.clip(directions[..., 2, 1], -1.0, 1.0))
 
 
-def priors(directions: Float64[np.ndarray, "*frames 3 3"], focals: np.ndarray | float, known: bool) -> Float64[np.ndarray, "*frames"]:
+def priors(
+    directions: Float64[np.ndarray, "*frames 3 3"], focals: np.ndarray | float, known: bool
+) -> Float64[np.ndarray, "*frames"] | float:
     """Return nats against a frame: cameras are held nearly level, look nearly ahead, and have usual focal lengths."""
     held = 0.5 * (roll_rad(directions) / _ROLL_RAD) ** 2 + 0.5 * (pitch_rad(directions) / _PITCH_RAD) ** 2
     lens = 0.0 if known else 0.5 * (np.log(np.asarray(focals) / USUAL_FOCAL) / _FOCAL_SPREAD) ** 2
