@@ -34,8 +34,9 @@ _MOST_ROLL_DEG, _MOST_SD_DEG, _LOW_SD_DEG, _HIGH_SD_DEG = 20.0, 4.0, 1.5, 0.7
 _TRIED = 8
 _TOLD = 0.2
 """Standard deviation of the logarithm of a focal length beyond which segments do not tell it."""
-_LONG_FOCAL = 1.9
-"""Focal length in long sides, 68 mm on full frame, from which lines alone are not trusted: they hardly run together any more."""
+_LONG_FOCAL, _LONGEST_TOLD = 1.9, 3.0
+"""Focal lengths in long sides, 68 and 108 mm on full frame, from which lines alone are doubted, and no more believed: they hardly run
+together any more, and a wall seen from the front looks alike."""
 _MOST_DISTORTION, _TOLD_DISTORTION = 7.0, 1.0
 """Distortion in the corners, in percent, that only fisheyes have, and that is said."""
 
@@ -80,7 +81,7 @@ def solve_camera(
     if not frames or frames[0].score < _REFUSED:
         raise InputError(f"the {len(segments)} straight edges of this picture agree on no upright world: {_ADVICE}")
     best = polished(segments, frames[0], known)
-    guessed = known is None and _sd(best, 4) > _TOLD
+    guessed = known is None and (_sd(best, 4) > _TOLD or best.focal > _LONGEST_TOLD)
     if guessed:
         frames = best_frames(segments, np.random.default_rng(seed), USUAL_FOCAL) or frames
         best = polished(segments, frames[0], USUAL_FOCAL)
@@ -111,7 +112,7 @@ def _held_sd_deg(frame: Frame) -> tuple[float, float]:
     """Return the standard deviations of roll and pitch in degrees; a turn about the upright changes neither."""
     if frame.covariance is None:
         return float("inf"), float("inf")
-    right, down, ahead = frame.down
+    right, down = frame.down[:2]
     across = np.cross(np.eye(3), frame.down).T
     spread = across @ frame.covariance[:3, :3] @ across.T
     level = max(right**2 + down**2, 1e-9)
@@ -178,7 +179,8 @@ def _with_doubts(found: SolvedCamera, best: Frame, frames: Sequence[Frame]) -> S
     is_long = found.focal_length_source == SOLVED and best.focal > _LONG_FOCAL
     if is_long or frames[0].score < _LOW_SCORE or sd_deg > _LOW_SD_DEG or not best.count(1) or best.focal < 1.05 * SHORTEST_FOCAL:
         return replace(found, confidence=LOW)
-    return replace(found, confidence=HIGH if frames[0].score > _HIGH_SCORE and sd_deg < _HIGH_SD_DEG else FAIR)
+    is_sure = frames[0].score > _HIGH_SCORE and sd_deg < _HIGH_SD_DEG and found.focal_length_source != GUESSED
+    return replace(found, confidence=HIGH if is_sure else FAIR)
 
 
 def _apart_deg(one: Frame, other: Frame) -> float:

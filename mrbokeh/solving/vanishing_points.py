@@ -58,7 +58,7 @@ class Frame:
     focal: float
     axes: Axes
     score: float
-    found: tuple[bool, bool, bool] = (True, True, True)
+    found: tuple[bool, ...] = (True, True, True)
     bending: float = 0.0
     covariance: Float64[np.ndarray, "5 5"] | None = None
 
