@@ -19,7 +19,6 @@ from mrbokeh.solving.vanishing_points import (
     candidates,
     fit,
     frames_of,
-    polished,
     scored,
     vanishing_points,
 )
@@ -28,8 +27,8 @@ from mrbokeh.system.errors import InputError
 AXES = ("x", "y", "z")
 _ADVICE = "give --line X1,Y1,X2,Y2,x|y|z for edges that are straight and level (x, z) or upright (y) in the world"
 _WIDEST = 2.4
-_FEWEST, _REFUSED, _LOW_SCORE, _HIGH_SCORE = 8, 25.0, 60.0, 90.0
-"""Segments, and scores in nats, below which a camera is refused, doubtful, and not sure."""
+_FEWEST, _REFUSED, _LITTLE, _MUCH = 8, 25.0, 50.0, 90.0
+"""Segments, and evidence in nats, below which a camera is refused, doubtful, and not sure."""
 _MOST_ROLL_DEG, _MOST_SD_DEG, _LOW_SD_DEG, _HIGH_SD_DEG = 20.0, 4.0, 1.5, 0.7
 _TRIED = 8
 _TOLD = 0.2
@@ -78,13 +77,13 @@ def solve_camera(
         raise InputError(f"expected straight edges, but this picture shows {len(segments)} of them: {_ADVICE}")
     free = best_frames(segments, np.random.default_rng(seed))
     frames = free if known is None else best_frames(segments, np.random.default_rng(seed), known)
-    if not frames or frames[0].score < _REFUSED:
+    if not frames or frames[0].evidence < _REFUSED:
         raise InputError(f"the {len(segments)} straight edges of this picture agree on no upright world: {_ADVICE}")
-    best = polished(segments, frames[0], known)
+    best = frames[0]
     guessed = known is None and (_sd(best, 4) > _TOLD or best.focal > _LONGEST_TOLD)
     if guessed:
         frames = best_frames(segments, np.random.default_rng(seed), USUAL_FOCAL) or frames
-        best = polished(segments, frames[0], USUAL_FOCAL)
+        best = frames[0]
     found = _solved(best, (width_px, height_px), segments, source=GUESSED if guessed else SOLVED if known is None else KNOWN)
     if abs(found.distortion_percent) > _MOST_DISTORTION and abs(best.bending) > 4.0 * _sd(best, 3):
         raise InputError(
@@ -92,7 +91,7 @@ def solve_camera(
             f"solved camera is a pinhole: undistort the picture first"
         )
     found = _with_doubts(found, best, frames)
-    return _compared(found, best, polished(segments, free[0]) if free else None)
+    return _compared(found, best, free[0] if free else None)
 
 
 def _usable(focal: float) -> float:
@@ -159,7 +158,7 @@ def _assumed(frame: Frame, source: str, distortion_percent: float) -> tuple[str,
 
 def _with_doubts(found: SolvedCamera, best: Frame, frames: Sequence[Frame]) -> SolvedCamera:
     """Return the camera with the doubt that other frames leave, or refuse it."""
-    weights = np.exp([max(-50.0, each.score - frames[0].score) for each in frames])
+    weights = np.exp([max(-50.0, each.evidence - frames[0].evidence) for each in frames])
     apart = np.array([_apart_deg(frames[0], each) for each in frames])
     doubt_deg = float(np.sqrt((weights * apart**2).sum() / weights.sum()))
     spread = float(np.sqrt((weights * np.log([each.focal / frames[0].focal for each in frames]) ** 2).sum() / weights.sum()))
@@ -173,13 +172,13 @@ def _with_doubts(found: SolvedCamera, best: Frame, frames: Sequence[Frame]) -> S
             f"the lines say that the camera was rolled by {found.roll_deg:.0f} degrees, which few are: turn the picture upright, or "
             f"{_ADVICE}"
         )
-    if sd_deg > _MOST_SD_DEG or (not best.count(1) and frames[0].score < _LOW_SCORE):
+    if sd_deg > _MOST_SD_DEG or (not best.count(1) and frames[0].evidence < _LITTLE):
         counts = ", ".join(f"{count} along {name}" for name, count in found.segments_by_direction.items())
         raise InputError(f"the straight edges of this picture ({counts}) do not tell where its horizon is: {_ADVICE}")
     is_long = found.focal_length_source == SOLVED and best.focal > _LONG_FOCAL
-    if is_long or frames[0].score < _LOW_SCORE or sd_deg > _LOW_SD_DEG or not best.count(1) or best.focal < 1.05 * SHORTEST_FOCAL:
+    if is_long or frames[0].evidence < _LITTLE or sd_deg > _LOW_SD_DEG or not best.count(1) or best.focal < 1.05 * SHORTEST_FOCAL:
         return replace(found, confidence=LOW)
-    is_sure = frames[0].score > _HIGH_SCORE and sd_deg < _HIGH_SD_DEG and found.focal_length_source != GUESSED
+    is_sure = frames[0].evidence > _MUCH and sd_deg < _HIGH_SD_DEG and found.focal_length_source != GUESSED
     return replace(found, confidence=HIGH if is_sure else FAIR)
 
 

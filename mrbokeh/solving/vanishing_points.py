@@ -5,7 +5,9 @@
    a row of focal lengths where they do not tell it.
 3. A frame's score is the log-likelihood of all segments, of which each points to one of three vanishing points or anywhere, and of
    how people hold cameras.
-4. The best frames are refined by least squares over their segments with a robust loss; the covariance is that of the last step.
+4. The best frames are refined by least squares over their segments with a robust loss, then weighted by how far off these are: long lines
+   of a good lens tell much more than its short ones, bent ones of a cheap lens do not. That decides between frames, and the covariance is
+   that of the last step.
 """
 
 from dataclasses import dataclass, replace
@@ -28,7 +30,7 @@ _BENDING, _MOST_BENDING = 0.02, 0.6
 """Standard deviation of radial distortion, 0.7 % in the corners, and the most that is tried."""
 _TEMPER = 0.3
 """Segments are not independent: each counts as this part of one."""
-_PAIRS, _CANDIDATES, _REFINED = 4000, 36, 10
+_PAIRS, _CANDIDATES, _REFINED, _POLISHED = 4000, 36, 10, 6
 _ORTHOGONAL_RAD = np.radians(5.0)
 _ANY, _EACH = 0.4, 0.2
 """Shares of segments that point anywhere, and to each of three directions."""
@@ -49,9 +51,10 @@ class Frame:
     """Three orthogonal directions seen by a camera.
 
     directions: (3, 3), columns are the world's right, down and forward in camera axes. focal: in long sides of the picture.
-    axes: for each segment 0, 1 or 2 by its direction, or -1. score: in nats, against segments that point anywhere. found: which directions
-    have more segments than chance gives. bending: radial distortion (`Segments.straightened`). covariance: (5, 5) of a turn about the
-    camera's axes in radians, of the bending and of the logarithm of the focal length; None before it is refined.
+    axes: for each segment 0, 1 or 2 by its direction, or -1. score: in nats, against segments that point anywhere; evidence: the same with
+    the noise that the frame's own segments show. found: which directions have more segments than chance gives. bending: radial distortion
+    (`Segments.straightened`). covariance: (5, 5) of a turn about the camera's axes in radians, of the bending and of the logarithm of the
+    focal length; None before it is refined.
     """
 
     directions: Directions
@@ -59,6 +62,7 @@ class Frame:
     axes: Axes
     score: float
     found: tuple[bool, ...] = (True, True, True)
+    evidence: float = -np.inf
     bending: float = 0.0
     covariance: Float64[np.ndarray, "5 5"] | None = None
 
@@ -85,9 +89,11 @@ def vanishing_points(directions: Float64[np.ndarray, "*frames 3 3"], focal: np.n
     return rows
 
 
-def _gains(segments: Segments, points: Float64[np.ndarray, "*points 3"]) -> Float64[np.ndarray, "*points segments"]:
+def _gains(
+    segments: Segments, points: Float64[np.ndarray, "*points 3"], sigma: np.ndarray | None = None
+) -> Float64[np.ndarray, "*points segments"]:
     """Return how much likelier than anywhere each segment is if it is of each point: a ratio of densities."""
-    sigma = segments.sigma_rad
+    sigma = segments.sigma_rad if sigma is None else sigma
     return np.sqrt(np.pi / 2.0) / sigma * np.exp(-0.5 * (angles_to(segments, points) / sigma) ** 2)
 
 
@@ -135,7 +141,8 @@ def best_frames(segments: Segments, rng: np.random.Generator, focal: float | Non
             refined.append(frame)
         if len(refined) == _REFINED:
             break
-    return sorted(refined, key=lambda each: -each.score)
+    refined.sort(key=lambda each: -each.score)
+    return sorted((polished(segments, each, focal) for each in refined[:_POLISHED]), key=lambda each: -each.evidence)
 
 
 def frames_of(
@@ -236,15 +243,21 @@ def refine(segments: Segments, frame: Frame, focal: float | None = None) -> Fram
 
 
 def polished(segments: Segments, frame: Frame, focal: float | None = None) -> Frame:
-    """Return the frame fitted once more to the same segments, weighted by how far off they are, with the covariance of that."""
+    """Return the frame fitted again to its segments, weighted by how far off they are, with the covariance and evidence of that."""
+    noise = (POINT_NOISE, BENDING_RAD)
     for _ in range(2):
         used = frame.axes != NOBODY
         if used.sum() < 3:
             return frame
         straight = segments.straightened(frame.bending)
         off = angles_to(straight, vanishing_points(frame.directions, frame.focal))[frame.axes[used], np.flatnonzero(used)]
-        frame = fit(segments, frame, focal, _noise(off, segments.length[used]))
-    return frame
+        noise = _noise(off, segments.length[used])
+        frame = fit(segments, frame, focal, noise)
+    straight, found = segments.straightened(frame.bending), np.flatnonzero(frame.found)
+    sigma = np.hypot(2.0 * noise[0] / segments.length, noise[1])
+    gains = _gains(straight, vanishing_points(frame.directions, frame.focal)[found], sigma).max(axis=0, initial=0.0)
+    evidence = _TEMPER * np.log(_ANY + _EACH * gains).sum() - priors(frame.directions, frame.focal, focal is not None)
+    return replace(frame, evidence=float(evidence))
 
 
 def _noise(off_rad: Float64[np.ndarray, " used"], length: Float64[np.ndarray, " used"]) -> tuple[float, float]:
