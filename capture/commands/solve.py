@@ -21,7 +21,7 @@ HELP = "\n\n".join(
         "A focal length that EXIF or --focal-length states is taken, and compared with what the lines say. Without either it is solved, "
         "and guessed where the lines do not tell it. The whole picture is needed: one that was cropped has another middle.",
         "Where lines are few, give some by hand: --line X1,Y1,X2,Y2,y for an upright edge, x and z for level edges along two directions "
-        "that are square to one another (which is which is yours to choose). They replace what is found along their direction.",
+        "that are square to one another (which is which is yours to choose). They decide; what is found counts where it agrees.",
         "--out is read by `mrbokeh.solving`; look at --picture before you trust a camera of low confidence.",
         "Example:  mrbokeh capture solve room.jpg --out camera.json --picture grid.png",
         "Example:  mrbokeh capture solve room.jpg --out camera.json --height 1.6",

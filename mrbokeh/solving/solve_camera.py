@@ -30,7 +30,7 @@ _WIDEST = 2.4
 _FEWEST, _REFUSED, _LITTLE, _MUCH = 8, 25.0, 50.0, 90.0
 """Segments, and evidence in nats, below which a camera is refused, doubtful, and not sure."""
 _MOST_ROLL_DEG, _MOST_SD_DEG, _LOW_SD_DEG, _HIGH_SD_DEG = 20.0, 4.0, 1.5, 0.7
-_TRIED = 8
+_TRIED, _ALONE = 8, 2
 _TOLD = 0.2
 """Standard deviation of the logarithm of a focal length beyond which segments do not tell it."""
 _LONG_FOCAL, _LONGEST_TOLD = 1.9, 3.0
@@ -57,10 +57,10 @@ class Line:
 def solve_camera(
     rgb: Float32[np.ndarray, "height width 3"], focal_length_px: float | None = None, lines: Sequence[Line] = (), *, seed: int = 0
 ) -> SolvedCamera:
-    """Solve the camera of a scene-linear picture, which nobody cropped. focal_length_px: if it is known. lines: instead of what is found.
+    """Solve the camera of a scene-linear picture, which nobody cropped.
 
-    Three orthogonal directions are looked for, of which one is vertical (Manhattan world; Coughlan and Yuille, 1999). Raises InputError
-    if the picture does not tell, with what to do.
+    focal_length_px: if it is known. lines: edges told by hand, which decide over what is found. Three orthogonal directions are looked for,
+    of which one is vertical (Manhattan world; Coughlan and Yuille, 1999). Raises InputError if the picture does not tell.
     """
     height_px, width_px = rgb.shape[:2]
     side_px = max(width_px, height_px)
@@ -203,7 +203,7 @@ def _from_lines(lines: Sequence[Line], segments: Segments, known: float | None, 
     axes = np.array([AXES.index(each.axis) for each in lines])
     everything = told.joined(segments)
     frames = [each for focal in ([known] if known else [None, USUAL_FOCAL]) for each in _candidates(told, axes, segments, focal)]
-    frames = sorted((_named(each, told, axes) for each in frames), key=lambda each: _misfit(each, told, axes))[:_TRIED]
+    frames = sorted((_named(each, told, axes) for each in frames), key=lambda each: _misfit(each, told, axes) - each.score)[:_TRIED]
     fitted = [_fitted_to_lines(everything, each, axes, known) for each in frames]
     if not fitted:
         few = f"{len(lines)} lines are" if len(lines) > 1 else "one line is"
@@ -254,11 +254,12 @@ def _named(frame: Frame, told: Segments, axes: np.ndarray) -> Frame:
 
 
 def _fitted_to_lines(segments: Segments, frame: Frame, axes: np.ndarray, focal: float | None) -> Frame:
-    """Return the frame fitted to the first segments, whose directions are told, and to others of the directions left."""
+    """Return the frame fitted to the first segments, whose directions are told, and to others that agree, first of the directions left."""
     count = len(axes)
-    for _ in range(4):
+    for turn in range(5):
         seen = scored(segments, frame, focal is not None).axes
-        seen[np.isin(seen, axes)] = NOBODY
+        if turn < _ALONE:
+            seen[np.isin(seen, axes)] = NOBODY
         seen[:count] = axes
         frame = fit(segments, replace(frame, axes=seen), focal)
     return replace(frame, score=scored(segments, frame, focal is not None).score - _misfit(frame, segments.chosen(np.arange(count)), axes))
