@@ -12,6 +12,7 @@ EVERYDAY = {
     "capture poses": "overwrite images out mapper",
     "capture plan": "near far image-width focal-length f-number sensor-width out",
     "capture matchmove": "out board overwrite",
+    "capture solve": "out picture height length line focal-length sensor-width overwrite",
     "capture scale": "ruler distance-at nearest board distance",
     "capture dataset": "out licence test overwrite",
     "train fit": "out preset minutes overwrite",

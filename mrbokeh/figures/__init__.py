@@ -1,1 +1,1 @@
-"""Pictures of lenses, kernels and stacks for people to look at."""
+"""Pictures of lenses, kernels, stacks and solved cameras for people to look at."""

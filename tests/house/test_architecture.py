@@ -17,7 +17,7 @@ LEVELS = (
     {"compositing", "refocus", "demo"},
     {"scene", "depth", "checks", "figures", "lens_measuring"},
     {"renderers", "stacks", "distortion"},
-    {"layering", "psf_models", "tracking"},
+    {"layering", "psf_models", "tracking", "solving"},
     {"optics", "video"},
     {"images"},
     {"system"},

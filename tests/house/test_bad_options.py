@@ -45,6 +45,7 @@ BASES = {
     "track convert": "camera.json out.chan",
     "track clip": f"{LIVE}/clip.mp4 --board {LIVE}/board.json --calibrate --out track.json",
     "capture plan": "lens.json --near 0.5 --far 3 --image-width 640",
+    "capture solve": "photo.png --out solved.json",
     "capture ingest": "photographs --out scene",
     "capture process": "photographs --out scene",
     "capture merge": "stack",

@@ -89,6 +89,7 @@ EXCEPTIONS = {
     "--layer": "the viewfinder shows one",
     "--white-balance": "in the words of what develops: the camera, or LibRaw",
     "--out": "each command names what it makes",
+    "--height": "an object's may be in pixels; a camera's above the ground is in metres",
 }
 """Options whose type or unit may differ between commands."""
 
