@@ -276,6 +276,7 @@ def _bare(layer: Layer) -> Layer:
 
 
 if TYPE_CHECKING:
+    from mrbokeh.commands._composite_kept import KeptParts
     from mrbokeh.scene.staging.filming import Filming
     from mrbokeh.scene.staging.scene_description import Lighting
     from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples
@@ -294,16 +295,22 @@ LayersFor = Callable[[Plate], list[Layer]]
 
 
 def layers_by(
-    virtual: VirtualOptions, standing: ObjectOptions, rendering: RenderingOptions, first: Plate, bundle: CaptureBundle | None
+    virtual: VirtualOptions,
+    standing: ObjectOptions,
+    rendering: RenderingOptions,
+    first: Plate,
+    bundle: CaptureBundle | None,
+    kept: "KeptParts | None" = None,
 ) -> LayersFor:
-    """Return the layers of the options. first: the plate on whose pixel the object stands. Raises InputError if there is nothing to
-    insert.
+    """Return the layers of the options. first: the plate on whose pixel the object stands. kept: from earlier pictures of the photograph.
+
+    Raises InputError if there is nothing to insert.
     """
     files = _FileLayers.of(virtual.layer or (), virtual.object_names)
     still = [*files.flat, *(bundle.layers if bundle else ())]
     rendered = []
     if standing.object_ is not None:
-        rendered.append(_object_layers(standing.object_, standing, rendering, first))
+        rendered.append(_object_layers(standing.object_, standing, rendering, first, kept))
     if virtual.scene is not None:
         rendered.append(_scene_layers(virtual.scene, virtual.camera, rendering))
     if not still and not rendered and not files.deep:
@@ -357,7 +364,9 @@ class _FileLayers:
         return interleaved(self.deep, layers)
 
 
-def _object_layers(glb: Path, options: ObjectOptions, rendering: RenderingOptions, first: Plate) -> LayersFor:
+def _object_layers(
+    glb: Path, options: ObjectOptions, rendering: RenderingOptions, first: Plate, kept: "KeptParts | None" = None
+) -> LayersFor:
     from mrbokeh.scene.staging.scene_description import OneObject
 
     if options.at and options.at_pixel:
@@ -378,11 +387,11 @@ def _object_layers(glb: Path, options: ObjectOptions, rendering: RenderingOption
         height_m=_height_m(options.height, first, stands_at_m[2]),
         turn_rad=math.radians(options.turn),
         world_from_camera=world_from_camera,
-        light=_light(options, first, foot_px, world_from_camera),
+        light=_light(options, first, foot_px, world_from_camera, kept),
         shadow=shadow,
     )
     filming = replace(rendering.of_photograph.filming(), catches=catches, caught_share=shadow)
-    filmed = _filmed(one.described(), filming, rendering.time, lambda plate: one.seen_by(plate.camera))
+    filmed = _filmed(one.described(), filming, rendering.time, lambda plate: one.seen_by(plate.camera), kept)
     if not options.at_pixel:
         return filmed
 
@@ -415,7 +424,9 @@ def _upright(options: ObjectOptions, plate: Plate, foot_px: tuple[float, float])
     return found
 
 
-def _light(options: ObjectOptions, plate: Plate, foot_px: tuple[float, float], world_from_camera: np.ndarray) -> "Lighting":
+def _light(
+    options: ObjectOptions, plate: Plate, foot_px: tuple[float, float], world_from_camera: np.ndarray, kept: "KeptParts | None"
+) -> "Lighting":
     """Return the light of an object: its panorama, even light, or what the photograph tells of it."""
     from mrbokeh.compositing.plate_light import picture_light
     from mrbokeh.scene.staging.scene_description import Lighting
@@ -426,7 +437,8 @@ def _light(options: ObjectOptions, plate: Plate, foot_px: tuple[float, float], w
         )
     if options.environment or options.plain:
         return Lighting(options.environment, exposure=options.exposure)
-    made = picture_light(plate, foot_px, world_from_camera, None if options.sun is None else _sun_degrees(options.sun))
+    lit = picture_light if kept is None else kept.light
+    made = lit(plate, foot_px, world_from_camera, None if options.sun is None else _sun_degrees(options.sun))
     guess(
         "the object's light is guessed from the photograph (--exposure makes it brighter or darker, --sun RIGHT,ABOVE says where most "
         "of it comes from, --environment PANORAMA replaces it, --plain leaves it even and without a shadow)"
@@ -474,10 +486,19 @@ def _scene_layers(path: Path, camera: Path | None, rendering: RenderingOptions) 
     return _filmed(description, rendering.of_photograph.filming(), rendering.time, seen_by)
 
 
-def _filmed(description: SceneDescription, filming: "Filming", time_s: float, seen_by: Callable[[Plate], Camera]) -> LayersFor:
+def _filmed(
+    description: SceneDescription,
+    filming: "Filming",
+    time_s: float,
+    seen_by: Callable[[Plate], Camera],
+    kept: "KeptParts | None" = None,
+) -> LayersFor:
     from mrbokeh.scene.staging.filming import FilmedLayers
 
-    filmed = FilmedLayers(filming, description)
+    if kept is None:
+        filmed = FilmedLayers(filming, description)
+    else:
+        filmed = FilmedLayers(kept.filming(filming), description, assets=kept.assets, renderer=kept.renderer(filming))
 
     def layers(plate: Plate) -> list[Layer]:
         sharp_rgb = plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb

@@ -39,7 +39,8 @@ class Filming:
 
     backend: a name of `mrbokeh.scene.choose`. samples: paths per pixel of "mitsuba". distortion: of the plate's lens. catches:
     "shadow", as dark as the scene says, or "light": all that the objects change on the ground (`mrbokeh.scene.light_change`), of which
-    caught_share (0 to 1) is shown. shutter: motion blur; None for none.
+    caught_share (0 to 1) is shown, computed in at most change_px pixels (more where lights throw shadows). shutter: motion blur; None
+    for none.
     """
 
     backend: str = "auto"
@@ -49,6 +50,7 @@ class Filming:
     caught_share: float = 1.0
     distortion: LensDistortion = field(default_factory=LensDistortion)
     shutter: ShutterTiming | None = None
+    change_px: int = _MOST_PX
 
     def __post_init__(self) -> None:
         if self.catches not in CATCHES:
@@ -73,9 +75,17 @@ def _at_most(camera: Camera, pixels: int) -> Camera:
 class FilmedLayers:
     """A scene before a plate's camera. Backends keep what they prepared, so one of these serves all frames."""
 
-    def __init__(self, filming: Filming, description: SceneDescription, threads: int = 0) -> None:
-        self._filming, self._renderer = filming, filming.renderer(threads)
-        self._staged = StagedScene.load(description, Assets(), moment_s=0.0)
+    def __init__(
+        self,
+        filming: Filming,
+        description: SceneDescription,
+        threads: int = 0,
+        assets: Assets | None = None,
+        renderer: SceneRenderer | None = None,
+    ) -> None:
+        """Open the scene. assets, renderer: of an earlier picture, whose files and prepared scenes are used again."""
+        self._filming, self._renderer = filming, renderer or filming.renderer(threads)
+        self._staged = StagedScene.load(description, assets or Assets(), moment_s=0.0)
 
     @property
     def changes_by_itself(self) -> bool:
@@ -157,7 +167,7 @@ class FilmedLayers:
         if self._filming.backend == "mitsuba":
             return light_change(self._renderer, scene, camera, catcher, samples=self._filming.samples)
         finer = _FINER if scene.lighting[0] else 1
-        some, samples = _at_most(camera, _MOST_PX * finer), max(1, self._filming.samples * 2 // (1 + finer))
+        some, samples = _at_most(camera, self._filming.change_px * finer), max(1, self._filming.samples * 2 // (1 + finer))
         change = light_change(self._renderer, scene, some, catcher, samples=samples)
         seen = replace(change, ratio=np.minimum(change.ratio + np.float32(_UNSEEN), np.float32(1.0)))
         return seen.enlarged(camera.height_px, camera.width_px)

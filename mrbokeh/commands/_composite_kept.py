@@ -1,0 +1,58 @@
+"""What several pictures of one photograph have in common, so that the second is made sooner: opened files, prepared scenes, light."""
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mrbokeh.compositing.plate import Plate
+from mrbokeh.compositing.plate_light import picture_light
+from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
+from mrbokeh.scene.staging.staged_scene import Assets
+
+if TYPE_CHECKING:
+    from mrbokeh.scene import SceneRenderer
+    from mrbokeh.scene.light import Environment, Light
+    from mrbokeh.scene.staging.filming import Filming
+
+SunDegrees = tuple[float, float]
+
+_DRAFT_EDGES, _DRAFT_SAMPLES, _DRAFT_PX = 4, 16, 4_000
+
+
+@dataclass
+class KeptParts:
+    """Parts that are kept from picture to picture; for one thread and one photograph.
+
+    draft: while True, pictures are made in a hurry, as while an object is dragged: the last place's light serves every place, edges have
+    fewer steps, and light on the ground is computed in few pixels.
+    """
+
+    assets: Assets = field(default_factory=Assets)
+    draft: bool = False
+    _renderers: "dict[tuple[str, int, bool], SceneRenderer]" = field(default_factory=dict)
+    _light: "tuple[tuple[object, ...], tuple[Environment, tuple[Light, ...]]] | None" = None
+
+    def renderer(self, filming: "Filming") -> "SceneRenderer":
+        """Return the renderer of these settings, with what it prepared for earlier pictures."""
+        key = (filming.backend, filming.samples if filming.backend == "mitsuba" else 0, filming.denoise)
+        if key not in self._renderers:
+            self._renderers[key] = filming.renderer()
+        whole = self._renderers[key]
+        return whole.with_quality(_DRAFT_EDGES) if self.draft and isinstance(whole, EmbreeRaycaster) else whole
+
+    def filming(self, filming: "Filming") -> "Filming":
+        """Return the settings of a draft while one is made."""
+        return replace(filming, samples=_DRAFT_SAMPLES, change_px=_DRAFT_PX) if self.draft and filming.backend != "mitsuba" else filming
+
+    def light(
+        self, plate: Plate, foot_px: tuple[float, float], world_from_camera: np.ndarray, sun_degrees: SunDegrees | None
+    ) -> "tuple[Environment, tuple[Light, ...]]":
+        """Return `picture_light`, the very same objects for the same place, because renderers keep what they prepared for them."""
+        height_px, width_px = plate.rgb.shape[:2]
+        turned = (sun_degrees, world_from_camera.tobytes(), id(plate.rgb))
+        place = None if self.draft else (foot_px[0] / width_px, foot_px[1] / height_px)
+        if self._light is None or self._light[0][:3] != turned or (place is not None and self._light[0][3] != place):
+            made = picture_light(plate, foot_px, world_from_camera, sun_degrees)
+            self._light = (*turned, (foot_px[0] / width_px, foot_px[1] / height_px)), made
+        return self._light[1]
