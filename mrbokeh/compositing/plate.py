@@ -11,7 +11,7 @@ Every insertion owes these (tests/compositing/test_compositing.py asks all of th
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -124,29 +124,55 @@ def open_plate(
         return _stack_plate(photo, slice_index, lens, focus_m)
     if slice_index is not None:
         raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}: leave it out")
-    photograph, phone = read_photograph(photo).stating(facts or {}), _phone(photo)
+    photograph, phone = read_photograph(photo), phone_photo(photo)
+    held = held_lens(photo, photograph, phone, LensWishes(lens, focus_m, facts or {}, guessing))
+    plate = with_own_alpha(plate_of(photograph.rgb, held.lens), photo, read_alpha(photo, photograph.orientation))
+    if phone is None:
+        return replace(plate, focus_known=held.focus_known)
+    original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
+    is_focus_guessed = phone.focus is not None and bool(phone.focus.note) and lens is None and focus_m is None
+    note = f"{photo}: {phone.depth.note}" + (f"; {phone.focus.note}" if phone.focus is not None and is_focus_guessed else "")
+    return replace(with_depth(plate, photo, DepthSettings()), sharp_rgb=original, blur_from=held.blur_from, depth_note=note)
+
+
+@dataclass(frozen=True)
+class LensWishes:
+    """Lens that a photograph is to have, as `open_plate` takes it."""
+
+    lens: Lens | None = None
+    focus_m: float | None = None
+    facts: Mapping[str, float] = field(default_factory=dict)
+    guessing: bool = False
+
+
+@dataclass(frozen=True)
+class HeldLens:
+    """Lens of a photograph. blur_from, focus_known: as in `Plate`."""
+
+    lens: Lens
+    blur_from: str = ""
+    focus_known: bool = True
+
+
+def held_lens(photo: Path, photograph: Photograph, phone: PhonePhoto | None, wishes: LensWishes) -> HeldLens:
+    """Return the lens of a photograph in a file, by what the file states and what is wished; only the size of its rgb counts."""
+    lens, focus_m = wishes.lens, wishes.focus_m
+    photograph = photograph.stating(wishes.facts)
     blur_from, focus_known = "", True
-    is_focus_guessed = phone is not None and phone.focus is not None and bool(phone.focus.note) and lens is None and focus_m is None
-    if guessing and lens is None and phone is None:
+    if wishes.guessing and lens is None and phone is None:
         photograph, guesses = photograph.guessing()
         guess(f"{photo} does not tell its lens, which is guessed: {guesses}" if guesses else "")
         focus_known = focus_m is not None or photograph.focus_distance_m is not None
         photograph = photograph if focus_known else replace(photograph, focus_distance_m=float("inf"))
-    if lens is None and not facts and phone is not None and phone.focus is not None and phone.focus.blur_at_infinity is not None:
+    if lens is None and not wishes.facts and phone is not None and phone.focus is not None and phone.focus.blur_at_infinity is not None:
         photograph, blur_from = _with_the_phones_blur(photograph, phone.focus, photo), "the phone's own blur"
     elif phone is not None and phone.focus is not None and photograph.focus_distance_m is None:
         photograph = replace(photograph, focus_distance_m=phone.focus.focus_distance_m)
     lens = photograph.lens(photo, focus_m) if lens is None else lens_for_photograph(lens, photograph, photo)
-    focused = lens if focus_m is None else lens.focused_at(focus_m)
-    plate = with_own_alpha(plate_of(photograph.rgb, focused), photo, read_alpha(photo, photograph.orientation))
-    if phone is None:
-        return replace(plate, focus_known=focus_known)
-    original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
-    note = f"{photo}: {phone.depth.note}" + (f"; {phone.focus.note}" if phone.focus is not None and is_focus_guessed else "")
-    return replace(with_depth(plate, photo, DepthSettings()), sharp_rgb=original, blur_from=blur_from, depth_note=note)
+    return HeldLens(lens if focus_m is None else lens.focused_at(focus_m), blur_from, focus_known)
 
 
-def _phone(photo: Path) -> PhonePhoto | None:
+def phone_photo(photo: Path) -> PhonePhoto | None:
     """Return what a phone put into its photograph; None, with one line, if that is damaged."""
     try:
         return read_phone_photo(photo)
