@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mrbokeh.compositing.plate import Plate
-from mrbokeh.compositing.plate_light import picture_light
+from mrbokeh.compositing.plate_light import Surroundings, surroundings_of
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.staging.staged_scene import Assets
 
@@ -31,7 +31,8 @@ class KeptParts:
     assets: Assets = field(default_factory=Assets)
     draft: bool = False
     _renderers: "dict[tuple[str, int, bool], SceneRenderer]" = field(default_factory=dict)
-    _light: "tuple[tuple[object, ...], tuple[Environment, tuple[Light, ...]]] | None" = None
+    _around: tuple[object, Surroundings] | None = None
+    _light: "tuple[object, tuple[Environment, tuple[Light, ...]]] | None" = None
 
     def renderer(self, filming: "Filming") -> "SceneRenderer":
         """Return the renderer of these settings, with what it prepared for earlier pictures."""
@@ -49,10 +50,10 @@ class KeptParts:
         self, plate: Plate, foot_px: tuple[float, float], world_from_camera: np.ndarray, sun_degrees: SunDegrees | None
     ) -> "tuple[Environment, tuple[Light, ...]]":
         """Return `picture_light`, the very same objects for the same place, because renderers keep what they prepared for them."""
-        height_px, width_px = plate.rgb.shape[:2]
-        turned = (sun_degrees, world_from_camera.tobytes(), id(plate.rgb))
-        place = None if self.draft else (foot_px[0] / width_px, foot_px[1] / height_px)
-        if self._light is None or self._light[0][:3] != turned or (place is not None and self._light[0][3] != place):
-            made = picture_light(plate, foot_px, world_from_camera, sun_degrees)
-            self._light = (*turned, (foot_px[0] / width_px, foot_px[1] / height_px)), made
+        key = (plate.rgb.shape, foot_px, world_from_camera.tobytes())
+        if self._around is None or (self._around[0] != key and not self.draft):
+            self._around = key, surroundings_of(plate, foot_px, world_from_camera)
+        lit_by = (self._around[0], sun_degrees)
+        if self._light is None or self._light[0] != lit_by:
+            self._light = lit_by, self._around[1].light(sun_degrees)
         return self._light[1]

@@ -124,13 +124,17 @@ def open_plate(
         return _stack_plate(photo, slice_index, lens, focus_m)
     if slice_index is not None:
         raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}: leave it out")
-    photograph, phone = read_photograph(photo), phone_photo(photo)
-    held = held_lens(photo, photograph, phone, LensWishes(lens, focus_m, facts or {}, guessing))
+    return photograph_plate(photo, read_photograph(photo), phone_photo(photo), LensWishes(lens, focus_m, facts or {}, guessing))
+
+
+def photograph_plate(photo: Path, photograph: Photograph, phone: PhonePhoto | None, wishes: "LensWishes") -> Plate:
+    """Return the plate of a photograph that was read from its file, with what a phone put into it."""
+    held = held_lens(photo, photograph, phone, wishes)
     plate = with_own_alpha(plate_of(photograph.rgb, held.lens), photo, read_alpha(photo, photograph.orientation))
     if phone is None:
         return replace(plate, focus_known=held.focus_known)
     original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
-    is_focus_guessed = phone.focus is not None and bool(phone.focus.note) and lens is None and focus_m is None
+    is_focus_guessed = phone.focus is not None and bool(phone.focus.note) and wishes.lens is None and wishes.focus_m is None
     note = f"{photo}: {phone.depth.note}" + (f"; {phone.focus.note}" if phone.focus is not None and is_focus_guessed else "")
     return replace(with_depth(plate, photo, DepthSettings()), sharp_rgb=original, blur_from=held.blur_from, depth_note=note)
 

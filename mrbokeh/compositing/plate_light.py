@@ -7,6 +7,7 @@ as a whole for grey (exposure meters do), near the foot as well as over the fram
 """
 
 import math
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -34,6 +35,23 @@ Rgb = Float32[np.ndarray, "height width 3"]
 Triple = Float[np.ndarray, "3"]
 
 
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """Light around a pixel of a photograph. seen: panorama of what the photograph shows. white: what a white surface there sends."""
+
+    seen: Float[np.ndarray, "rows columns 3"]
+    white: Triple
+
+    def light(self, sun_degrees: tuple[float, float] | None = None) -> tuple[Environment, tuple[Light, ...]]:
+        """Return the panorama with light from above, and the main light where it is told; see `picture_light`."""
+        if sun_degrees is None:
+            return Environment(_lit_from_above(self.seen, self.white)), ()
+        right, above = (math.radians(each) for each in sun_degrees)
+        travels = (-math.sin(right) * math.cos(above), math.sin(above), -math.cos(right) * math.cos(above))
+        red, green, blue = (math.pi * _SUNLIT * self.white / max(math.sin(above), 0.1)).tolist()
+        return Environment(_lit_from_above(self.seen, (1.0 - _SUNLIT) * self.white)), (sun(travels, (red, green, blue)),)
+
+
 def picture_light(
     plate: Plate, foot_px: tuple[float, float], world_from_camera: Float[np.ndarray, "3 3"], sun_degrees: tuple[float, float] | None = None
 ) -> tuple[Environment, tuple[Light, ...]]:
@@ -42,15 +60,14 @@ def picture_light(
     foot_px: where the object stands. world_from_camera: rotation of the camera in that world. sun_degrees: where the main light comes
     from: degrees to the right of the view, and above the horizon; its share of the light on the ground is a little more than half.
     """
+    return surroundings_of(plate, foot_px, world_from_camera).light(sun_degrees)
+
+
+def surroundings_of(plate: Plate, foot_px: tuple[float, float], world_from_camera: Float[np.ndarray, "3 3"]) -> Surroundings:
+    """Return the light around a pixel of a photograph before a main light is told."""
     small = _small(plate)
     white = white_at(small, foot_px[0] / plate.rgb.shape[1], foot_px[1] / plate.rgb.shape[0])
-    seen = _panorama_of(small, plate, world_from_camera)
-    if sun_degrees is None:
-        return Environment(_lit_from_above(seen, white)), ()
-    right, above = (math.radians(each) for each in sun_degrees)
-    travels = (-math.sin(right) * math.cos(above), math.sin(above), -math.cos(right) * math.cos(above))
-    red, green, blue = (math.pi * _SUNLIT * white / max(math.sin(above), 0.1)).tolist()
-    return Environment(_lit_from_above(seen, (1.0 - _SUNLIT) * white)), (sun(travels, (red, green, blue)),)
+    return Surroundings(_panorama_of(small, plate, world_from_camera), white)
 
 
 def white_at(picture: Rgb, x_share: float, y_share: float) -> Triple:

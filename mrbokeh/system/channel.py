@@ -12,6 +12,7 @@ import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, redirect_stdout, suppress
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -75,13 +76,14 @@ class _Warnings(logging.Handler):
 
 
 _channel = Channel()
+_apart: ContextVar[Channel | None] = ContextVar("apart", default=None)
 _UNFINISHED: set[Path] = set()
 """Temporary files and folders under way, which a process that leaves at once removes."""
 
 
 def channel() -> Channel:
-    """Return the channel of the command that runs."""
-    return _channel
+    """Return the channel of the command that runs, or that of this thread's block `apart`."""
+    return _apart.get() or _channel
 
 
 @contextmanager
@@ -100,6 +102,16 @@ def opened() -> Iterator[Channel]:
 
 
 @contextmanager
+def apart() -> Iterator[Channel]:
+    """Open a quiet channel for what this thread says in the block, as a server that answers several at once does."""
+    token = _apart.set(Channel(quiet=True))
+    try:
+        yield channel()
+    finally:
+        _apart.reset(token)
+
+
+@contextmanager
 def object_on_stdout(wanted: bool) -> Iterator[Any]:
     """Send what is printed in the block to standard error, if wanted; yield what is standard output outside of it."""
     out = sys.stdout
@@ -108,21 +120,21 @@ def object_on_stdout(wanted: bool) -> Iterator[Any]:
 
 
 def write_object(file: Any, exit_code: int, error: str) -> None:
-    print(json.dumps(_channel.document(exit_code, error), indent=2), file=file, flush=True)
+    print(json.dumps(channel().document(exit_code, error), indent=2), file=file, flush=True)
 
 
 def say(text: str, err: bool = False) -> None:
     """Say what is good to know. err: on standard error, as progress and warnings are."""
-    _channel.said(text)
-    if not _channel.quiet:
+    channel().said(text)
+    if not channel().quiet:
         print(text, file=sys.stderr if err else sys.stdout, flush=True)
 
 
 def tell(text: str, known: Mapping[str, Any] | None = None, **figures: Any) -> None:
     """Say what the command is for. known, figures: for --json, what the result rests on and what was measured; units in their names."""
-    _channel.said(text)
-    _channel.known |= known or {}
-    _channel.figures |= figures
+    channel().said(text)
+    channel().known |= known or {}
+    channel().figures |= figures
     print(text, flush=True)
 
 
@@ -130,24 +142,24 @@ def show(renderable: Any, **figures: Any) -> None:
     """Show a table of rich, as `tell` does a line."""
     from rich.console import Console
 
-    _channel.figures |= figures
+    channel().figures |= figures
     console, logged = Console(highlight=False), Console(width=200, force_terminal=False)
     console.print(renderable, soft_wrap=not console.is_terminal)
     with logged.capture() as text:
         logged.print(renderable, soft_wrap=True)
-    _channel.said(text.get())
+    channel().said(text.get())
 
 
 def warn(text: str) -> None:
     """Say that something may not be as the user wants it."""
-    _channel.warnings.append(text)
+    channel().warnings.append(text)
     say(f"warning: {text}", err=True)
 
 
 def guess(text: str, short: str = "") -> None:
     """Say once what is guessed. short: what is said in its place, where the whole of it was said before, by another command."""
-    if text and text not in _channel.guessed:
-        _channel.guessed.append(text)
+    if text and text not in channel().guessed:
+        channel().guessed.append(text)
         say(short or text)
 
 
@@ -160,7 +172,7 @@ def finished(temporary: Path, path: Path | None) -> None:
     """Note that a temporary has become the result `path`, or nothing. Results in the temporary folder of another are not counted."""
     _UNFINISHED.discard(temporary)
     if path is not None and not any(folder in path.parents for folder in tuple(_UNFINISHED)):
-        _channel.outputs.append(path)
+        channel().outputs.append(path)
 
 
 def remove_unfinished() -> None:

@@ -1,0 +1,1 @@
+"""Studio: one object placed in one photograph on a page, with the command line that makes the same picture."""

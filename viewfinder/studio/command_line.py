@@ -1,0 +1,124 @@
+"""Options of a state in the groups of `mrbokeh composite`, the command line that says the same, and the same for a smaller picture."""
+
+import math
+import os
+import shlex
+from collections.abc import Iterator
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+from mrbokeh.commands._composite_options import LensOptions, ObjectOptions, PlateOptions, RenderingOptions, ResultOptions
+from mrbokeh.commands._insertion_options import ColourOptions, LensFacts, LookGroup, VirtualOptions
+from mrbokeh.system.errors import InputError
+from viewfinder.studio.state import StudioState
+
+
+@dataclass(frozen=True)
+class CompositeOptions:
+    """Options of one run of `mrbokeh composite`, in its own groups."""
+
+    photo: Path
+    taken: PlateOptions = field(default_factory=PlateOptions)
+    virtual: VirtualOptions = field(default_factory=VirtualOptions)
+    standing: ObjectOptions = field(default_factory=ObjectOptions)
+    rendering: RenderingOptions = field(default_factory=RenderingOptions)
+    look: LookGroup = field(default_factory=LookGroup)
+    optics: LensOptions = field(default_factory=LensOptions)
+    facts: LensFacts = field(default_factory=LensFacts)
+    colour: ColourOptions = field(default_factory=ColourOptions)
+    result: ResultOptions = field(default_factory=ResultOptions)
+
+    def scaled(self, scale: float) -> "CompositeOptions":
+        """Return the options for the photograph made smaller: all that counts pixels is multiplied by a scale."""
+        if scale == 1.0:
+            return self
+        height = self.standing.height
+        if height is not None and height.endswith("px"):
+            height = f"{scale * float(height.removesuffix('px')):.9g}px"
+        standing = replace(self.standing, at_pixel=_scaled(self.standing.at_pixel, scale), height=height)
+        focus_at = self.optics.focus_at and ",".join(str(int(scale * float(each))) for each in self.optics.focus_at.split(","))
+        return replace(self, standing=standing, optics=replace(self.optics, focus_at=focus_at))
+
+
+def options_of(state: StudioState) -> CompositeOptions:
+    """Return the options of a complete state. Raises InputError if a photograph, an object or its place is missing."""
+    if state.photo is None:
+        raise InputError("there is no photograph yet: drop one on the page, or give PHOTO on the command line")
+    if state.object is None:
+        raise InputError("there is no object yet: drop a GLB file on the page, choose a shipped one, or give --object")
+    if state.at_px is None:
+        raise InputError("the object has no place yet: click into the photograph where it is to stand")
+    standing = ObjectOptions(
+        object_=state.object,
+        at_pixel=_numbers(state.at_px),
+        height=state.height,
+        turn=state.turn_deg,
+        pitch=state.pitch_deg,
+        camera_height=state.camera_height_m,
+        sun=None if state.sun_deg is None else _numbers(state.sun_deg),
+        exposure=state.exposure,
+        shadow=state.shadow,
+        plain=state.plain,
+    )
+    focus_at = None if state.focus_at_px is None else ",".join(str(int(each)) for each in state.focus_at_px)
+    return CompositeOptions(
+        photo=state.photo,
+        standing=standing,
+        look=LookGroup(grain="auto" if state.grain else None),
+        optics=LensOptions(lens=state.lens, focus=state.focus_m, focus_at=focus_at),
+        facts=LensFacts(focal_length_mm=state.focal_length_mm, f_number=state.f_number, sensor_width_mm=state.sensor_width_mm),
+    )
+
+
+def words_of(options: CompositeOptions, out: Path) -> list[str]:
+    """Return the words after `mrbokeh`, for a result at `out`; what has its default is left out."""
+    groups = (getattr(options, each.name) for each in fields(options) if each.name != "photo")
+    said = [word for group in groups for word in _said(group)]
+    return ["composite", _file(options.photo), *said, "--out", _file(out)]
+
+
+def command_line(options: CompositeOptions, out: Path) -> str:
+    """Return the command line as one types it in a shell."""
+    return shlex.join(["mrbokeh", *words_of(options, out)])
+
+
+def _said(group: Any) -> Iterator[str]:
+    """Yield the words of a group's options that differ from their defaults."""
+    hints, plain = get_type_hints(type(group), include_extras=True), type(group)()
+    for each in fields(group):
+        value = getattr(group, each.name)
+        if value == getattr(plain, each.name):
+            continue
+        option = _option(each.name, hints[each.name])
+        for one in value if isinstance(value, list | tuple) else [value]:
+            yield from [option] if one is True else [option, _word(one)]
+
+
+def _option(name: str, hint: Any) -> str:
+    """Return the option of a field: its first declared name, or its own."""
+    declared = [word for each in get_args(hint) for word in getattr(each, "param_decls", None) or () if word.startswith("--")]
+    return declared[0] if declared else f"--{name.rstrip('_').replace('_', '-')}"
+
+
+def _word(value: Any) -> str:
+    return _file(value) if isinstance(value, Path) else f"{value:.9g}" if isinstance(value, float) else str(value)
+
+
+def _file(path: Path) -> str:
+    """Return a path from the working folder if it lies in it, so that a command line stays short; one that looks like an option is whole."""
+    shown = os.path.relpath(path) if path.is_absolute() and path.is_relative_to(Path.cwd()) else str(path)
+    return str(path.absolute()) if shown.startswith("-") else shown
+
+
+def _numbers(values: tuple[float, ...]) -> str:
+    return ",".join(f"{each:.9g}" for each in values)
+
+
+def _scaled(pair: str | None, scale: float) -> str | None:
+    return pair and _numbers(tuple(scale * float(each) for each in pair.split(",")))
+
+
+def preview_scale(width_px: int, height_px: int, most_px: float) -> float:
+    """Return the scale at which a picture has at most so many pixels; 1 if it has no more."""
+    return min(1.0, math.sqrt(most_px / (width_px * height_px)))

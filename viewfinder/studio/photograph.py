@@ -1,0 +1,169 @@
+"""OpenedPhotograph: a photograph read once, made smaller for previews, with the lens of any state and the camera that its lines tell."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+from mrbokeh.commands._composite_parts import on_level_ground, pair_of
+from mrbokeh.commands._insertion_options import focused_at_pixel, require_one_focus
+from mrbokeh.compositing.plate import HeldLens, LensWishes, Plate, held_lens, phone_photo, photograph_plate
+from mrbokeh.depth.phone_depth import PhonePhoto
+from mrbokeh.optics.camera import camera_of_lens
+from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.base import Renderer
+from mrbokeh.renderers.choose import lens_and_renderer
+from mrbokeh.scene.staging.scene_description import looking_down
+from mrbokeh.scene.staging.staged_scene import modified_s
+from mrbokeh.solving.solve_camera import solve_camera
+from mrbokeh.solving.solved_camera import GUESSED, SolvedCamera
+from mrbokeh.stacks.photograph import Photograph, read_photograph
+from mrbokeh.system.errors import InputError
+from viewfinder.studio.command_line import CompositeOptions, options_of, preview_scale
+from viewfinder.studio.state import StudioState
+
+MOST_PX = 1e6
+"""Pixels of the largest preview."""
+_FULL_FRAME_MM = 36.0
+
+
+@dataclass
+class OpenedPhotograph:
+    """Photograph in memory, at most MOST_PX of it. told: what its file states, with the size of the whole but none of its light."""
+
+    path: Path
+    told: Photograph
+    phone: PhonePhoto | None
+    plate: Plate
+    _smaller: dict[tuple[int, int], Plate] = field(default_factory=dict)
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of the whole photograph."""
+        return self.told.rgb.shape[1], self.told.rgb.shape[0]
+
+    @property
+    def has_depth(self) -> bool:
+        return self.plate.depth_m is not None
+
+    def scale(self, most_px: float) -> float:
+        """Return the scale of a preview of at most so many pixels."""
+        return preview_scale(*self.size_px, min(most_px, MOST_PX))
+
+    def plate_for(self, options: CompositeOptions, most_px: float) -> tuple[Plate, Renderer]:
+        """Return the plate that `mrbokeh composite` opens by these options, made smaller, and the renderer of its blur."""
+        require_one_focus(focus=options.optics.focus, focus_at=options.optics.focus_at)
+        lens, renderer = _lens_of(options.optics.lens, modified_s(options.optics.lens) if options.optics.lens else 0.0)
+        lens = lens and options.facts.on(lens, renderer)
+        stated, guessing = {} if lens else options.facts.given, not options.standing.plain
+        small, focus_at = self._at(most_px), options.optics.focus_at
+        focus_m = options.optics.focus if focus_at is None else 1.0
+        held = held_lens(self.path, self.told, self.phone, LensWishes(lens, focus_m, stated, guessing))
+        plate = _with_lens(small, held)
+        if focus_at is None:
+            return plate, renderer
+        focused = focused_at_pixel(plate.lens, plate.depth_m, options.scaled(self.scale(most_px)).optics.focus_at or "")
+        return _with_lens(small, replace(held, lens=focused)), renderer
+
+    def _at(self, most_px: float) -> Plate:
+        """Return the plate with at most so many pixels; of the sizes asked for the last few are kept."""
+        width_px, height_px = (max(1, round(self.scale(most_px) * each)) for each in self.size_px)
+        if (height_px, width_px) == self.plate.rgb.shape[:2]:
+            return self.plate
+        if (width_px, height_px) not in self._smaller:
+            for size_px in list(self._smaller)[:-3]:
+                del self._smaller[size_px]
+            self._smaller[width_px, height_px] = shrunk(self.plate, width_px, height_px)
+        return self._smaller[width_px, height_px]
+
+
+def open_photograph(path: Path) -> tuple[OpenedPhotograph, Float32[np.ndarray, "height width 3"]]:
+    """Read a photograph; return it, and the light of the whole. Raises InputError where it is none."""
+    if path.is_dir():
+        raise InputError(f"{path} is a folder, but the studio takes one photograph: put an object into a stack by `mrbokeh composite`")
+    photograph, phone = read_photograph(path), phone_photo(path)
+    height_px, width_px = photograph.rgb.shape[:2]
+    whole = photograph_plate(path, photograph, phone, LensWishes(lens=Lens.default()))
+    scale = preview_scale(width_px, height_px, MOST_PX)
+    small = whole if scale == 1.0 else shrunk(whole, round(scale * width_px), round(scale * height_px))
+    dark = np.broadcast_to(np.float32(0.0), photograph.rgb.shape)
+    return OpenedPhotograph(path, replace(photograph, rgb=dark), phone, small), photograph.rgb
+
+
+def shrunk(plate: Plate, width_px: int, height_px: int) -> Plate:
+    """Return the plate with fewer pixels; depth is picked, as a mean of two surfaces is none."""
+    size_px = (width_px, height_px)
+
+    def by(method: int) -> Callable[[np.ndarray | None], np.ndarray | None]:
+        return lambda plane: None if plane is None else np.ascontiguousarray(cv2.resize(plane, size_px, interpolation=method))
+
+    mean, picked = by(cv2.INTER_AREA), by(cv2.INTER_NEAREST)
+    rgb = mean(plate.rgb)
+    assert rgb is not None
+    return replace(
+        plate,
+        rgb=rgb,
+        depth_m=picked(plate.depth_m),
+        camera=plate.camera.resized(*size_px),
+        sharp_rgb=mean(plate.sharp_rgb),
+        near_alpha=mean(plate.near_alpha),
+        alpha=mean(plate.alpha),
+    )
+
+
+def _with_lens(plate: Plate, held: HeldLens) -> Plate:
+    camera = camera_of_lens(held.lens, plate.rgb.shape[1], plate.rgb.shape[0])
+    return replace(plate, lens=held.lens, camera=camera, blur_from=held.blur_from, focus_known=held.focus_known)
+
+
+@lru_cache(maxsize=8)
+def _lens_of(path: Path | None, _changed_s: float) -> tuple[Lens | None, Renderer]:
+    """Return lens and renderer of a lens file, read again when it changed."""
+    return lens_and_renderer(path, None)
+
+
+def solved(photograph: Photograph) -> SolvedCamera:
+    """Return the camera that a photograph's lines tell, with the focal length that it states. Raises InputError if they do not tell."""
+    height_px, width_px = photograph.rgb.shape[:2]
+    focal_px = None
+    if photograph.focal_length_mm is not None and photograph.sensor_width_mm is not None:
+        stated_px = photograph.focal_length_mm / photograph.sensor_width_mm * width_px
+        focal_px = stated_px if 0.3 < stated_px / max(height_px, width_px) < 30.0 else None
+    return solve_camera(photograph.rgb, focal_px).of_sensor(photograph.sensor_width_mm)
+
+
+def with_solved_camera(state: StudioState, opened: OpenedPhotograph, camera: SolvedCamera) -> StudioState:
+    """Return the state with how the camera was held, and its field of view where the file does not state it, if nobody chose them."""
+    if opened.has_depth:
+        return state
+    if state.pitch_deg is None:
+        state = replace(state, pitch_deg=round(camera.pitch_deg, 2))
+    stated = opened.told.focal_length_mm is not None and opened.told.sensor_width_mm is not None
+    chosen = state.lens is not None or state.focal_length_mm is not None or state.sensor_width_mm is not None
+    if stated or chosen or camera.focal_length_source == GUESSED:
+        return state
+    width_mm = _FULL_FRAME_MM * camera.width_px / max(camera.width_px, camera.height_px)
+    focal_mm = camera.focal_length_px / camera.width_px * width_mm
+    return replace(state, focal_length_mm=float(f"{focal_mm:.4g}"), sensor_width_mm=float(f"{width_mm:.4g}"))
+
+
+def placed(state: StudioState, opened: OpenedPhotograph) -> StudioState:
+    """Return a complete state with the metres that `mrbokeh composite` would guess, so that they stay while the object is moved."""
+    if not state.is_complete or state.plain or (state.height is not None and (state.camera_height_m is not None or opened.has_depth)):
+        return state
+    options = options_of(state)
+    plate, _renderer = opened.plate_for(options, MOST_PX)
+    standing = options.scaled(opened.scale(MOST_PX)).standing
+    quarter_px = 0.25 * plate.rgb.shape[0]
+    if plate.depth_m is not None:
+        depth_m = plate.point_under_pixel_m(*pair_of(standing.at_pixel))[2]
+        return replace(state, height=f"{plate.length_m(quarter_px, depth_m):.3g}")
+    plate, on_ground = on_level_ground(plate, standing)
+    foot_m = np.array([float(each) for each in (on_ground.at or "").split(",")])
+    eyes_m = float((looking_down(np.radians(on_ground.pitch or 0.0)) @ foot_m)[1])
+    height = state.height or f"{plate.length_m(quarter_px, foot_m[2]):.3g}"
+    return replace(state, camera_height_m=state.camera_height_m or float(f"{eyes_m:.4g}"), height=height)

@@ -1,0 +1,173 @@
+"""Previews: a state as a picture by the functions of `mrbokeh composite`, in a thread that makes only the newest picture asked for."""
+
+import logging
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from threading import Condition, Thread
+from typing import Any
+
+import cv2
+import numpy as np
+from jaxtyping import Float32
+
+from mrbokeh.commands._composite_kept import KeptParts
+from mrbokeh.commands._composite_parts import blur_told, layers_by, nothing_seen, on_level_ground, pair_of, placing_warning
+from mrbokeh.compositing.choose import best_mode, insertion_of
+from mrbokeh.compositing.ground import with_ground_behind
+from mrbokeh.compositing.plate_look.finishing import finished, finishing_of
+from mrbokeh.images.color import srgb_codes
+from mrbokeh.images.layer import Layer
+from mrbokeh.system.channel import apart, guess, warn
+from mrbokeh.system.errors import InputError
+from viewfinder.studio.command_line import CompositeOptions
+from viewfinder.studio.photograph import MOST_PX, OpenedPhotograph
+
+_log = logging.getLogger(__name__)
+
+DRAFT_S = 0.12
+"""Time that a draft should take; drafts get as many pixels as that allows."""
+_FEWEST_PX, _MOST_DRAFT_PX, _FIRST_PX = 6e4, 5e5, 2e5
+_DRAFT_QUALITY, _QUALITY = 80, 92
+
+
+@dataclass(frozen=True)
+class Preview:
+    """Picture of a state. told: box of the object in shares of the picture, its blur in words, what was guessed, warnings, and time."""
+
+    rgb: Float32[np.ndarray, "height width 3"]
+    told: dict[str, Any]
+
+
+def preview_of(photograph: OpenedPhotograph, options: CompositeOptions, kept: KeptParts, most_px: float = MOST_PX) -> Preview:
+    """Return the picture that `mrbokeh composite` makes by these options, of the photograph made smaller. Raises InputError.
+
+    Where the photograph has no more than most_px, and kept makes no draft, it is the very same picture.
+    """
+    with apart() as words:
+        plate, renderer = photograph.plate_for(options, most_px)
+        small = options.scaled(photograph.scale(most_px))
+        standing = small.standing
+        guess(plate.depth_note)
+        if plate.depth_m is None and not standing.plain:
+            plate, standing = on_level_ground(plate, standing)
+        layers_for = layers_by(small.virtual, standing, small.rendering, plate, None, kept)
+        mode = best_mode(plate)
+        finishing = finishing_of(small.look.wanted, plate.rgb, photograph.path)
+        sharp = layers_for(plate)
+        if not any((layer.alpha > 0).any() for layer in sharp):
+            nothing_seen(options.standing, small.virtual)
+        if standing.at_pixel:
+            plate = with_ground_behind(plate, pair_of(standing.at_pixel), sharp)
+        if warning := placing_warning(sharp, plate, mode, options.standing.height):
+            warn(warning)
+        inserted = finished(insertion_of(mode).insert(plate, sharp, renderer), plate, finishing)
+        blur, _known, figures = blur_told(plate, sharp)
+        told = {
+            "box": _box(sharp[0]),
+            "blur": blur,
+            "focus_m": plate.lens.focus_distance_m if np.isfinite(plate.lens.focus_distance_m) else None,
+            "f_number": plate.lens.f_number,
+            "coc_px": [float(each) / photograph.scale(most_px) for each in figures.get("coc_px", ())],
+            "guessed": list(words.guessed),
+            "warnings": list(dict.fromkeys(words.warnings)),
+        }
+    return Preview(inserted.rgb, told)
+
+
+def _box(layer: Layer) -> list[float] | None:
+    """Return left, top, right and bottom of what a layer shows, in shares of the picture; None if it shows nothing."""
+    rows, columns = np.nonzero(layer.alpha > 0.5)
+    if not len(rows):
+        return None
+    height, width = layer.alpha.shape
+    sides = (columns.min() / width, rows.min() / height, (columns.max() + 1) / width, (rows.max() + 1) / height)
+    return [float(each) for each in sides]
+
+
+def jpeg_of(rgb: Float32[np.ndarray, "height width 3"], quality: int = _QUALITY) -> bytes:
+    """Return linear light as a JPEG, as `mrbokeh composite` encodes it for a screen."""
+    codes = srgb_codes(rgb, np.uint8)
+    return cv2.imencode(".jpg", np.ascontiguousarray(codes[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+
+
+@dataclass
+class Wish:
+    """Picture that a page waits for; its answer is (what is told, JPEG), or None where a newer wish of the page took its place."""
+
+    photograph: OpenedPhotograph
+    options: CompositeOptions
+    most_px: float
+    draft: bool
+    answer: "Future[tuple[dict[str, Any], bytes] | None]" = field(default_factory=Future)
+
+
+class Previewer:
+    """A thread that answers wishes, of each page only the newest; pages take turns. name: of the thread."""
+
+    def __init__(self, name: str = "studio previews") -> None:
+        self._waiting: dict[str, Wish] = {}
+        self._changed = Condition()
+        self._ended = False
+        self._kept: tuple[OpenedPhotograph, KeptParts] | None = None
+        self._draft_px, self._slow = _FIRST_PX, 0
+        self._thread = Thread(target=self._work, name=name, daemon=True)
+        self._thread.start()
+
+    def ask(self, page: str, wish: Wish) -> "Future[tuple[dict[str, Any], bytes] | None]":
+        """Put a wish in the place of the page's last one, unless that is being made already."""
+        with self._changed:
+            dropped = self._waiting.pop(page, None)
+            self._waiting[page] = wish
+            self._changed.notify()
+        if dropped is not None:
+            dropped.answer.set_result(None)
+        return wish.answer
+
+    def close(self) -> None:
+        with self._changed:
+            self._ended = True
+            self._changed.notify()
+        self._thread.join(3.0)
+
+    def _work(self) -> None:
+        while (wish := self._next()) is not None:
+            try:
+                made: Callable[[], None] = lambda done=self._made(wish), asked=wish: asked.answer.set_result(done)  # type: ignore[misc]
+            except InputError as error:
+                made = lambda refused=error, asked=wish: asked.answer.set_exception(refused)  # type: ignore[misc]
+            except Exception as error:
+                _log.exception("a preview failed")
+                fault = InputError(f"this is a fault of mrbokeh ({type(error).__name__}); the terminal says more")
+                made = lambda refused=fault, asked=wish: asked.answer.set_exception(refused)  # type: ignore[misc]
+            made()
+
+    def _next(self) -> Wish | None:
+        with self._changed:
+            while not self._waiting and not self._ended:
+                self._changed.wait()
+            return None if self._ended else self._waiting.pop(next(iter(self._waiting)))
+
+    def _made(self, wish: Wish) -> tuple[dict[str, Any], bytes]:
+        if self._kept is None or self._kept[0] is not wish.photograph:
+            self._kept = wish.photograph, KeptParts()
+        kept, began_s = self._kept[1], time.perf_counter()
+        kept.draft = wish.draft
+        most_px = min(wish.most_px, self._draft_px) if wish.draft else wish.most_px
+        preview = preview_of(wish.photograph, wish.options, kept, most_px)
+        jpeg = jpeg_of(preview.rgb, _DRAFT_QUALITY if wish.draft else _QUALITY)
+        took_s = time.perf_counter() - began_s
+        if wish.draft:
+            self._adapt(took_s)
+        size_px = [preview.rgb.shape[1], preview.rgb.shape[0]]
+        return preview.told | {"ms": round(1e3 * took_s), "size_px": size_px, "draft": wish.draft}, jpeg
+
+    def _adapt(self, took_s: float) -> None:
+        """Choose the next draft's size by what the last one took, in steps, as a new size has to be prepared."""
+        if took_s > 1.5 * DRAFT_S:
+            self._slow += 1
+        self._slow = 0 if took_s < 1.2 * DRAFT_S else self._slow
+        step = 0.5 if self._slow > 1 else 2.0 if took_s < 0.4 * DRAFT_S else 1.0
+        if step != 1.0:
+            self._draft_px, self._slow = float(np.clip(step * self._draft_px, _FEWEST_PX, _MOST_DRAFT_PX)), 0

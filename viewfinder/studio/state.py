@@ -1,0 +1,152 @@
+"""StudioState: everything that decides what the studio's picture looks like, as plain values, checked when they come from outside."""
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from mrbokeh.system.errors import InputError
+
+Pair = tuple[float, float]
+
+_DIGITS = 6
+"""Significant digits of numbers: the command line shows them all, so that it makes the very same picture."""
+
+
+@dataclass(frozen=True)
+class StudioState:
+    """State of the studio; None leaves a thing to the command's own default.
+
+    at_px: where the object stands, in pixels of the whole photograph. height: metres such as "0.3", or pixels such as "120px".
+    focus_at_px: the pixel that is in focus, where the photograph has depth; focus_m otherwise. sun_deg: where the main light comes from,
+    degrees to the right of the view and above the horizon. grain: put the photograph's grain on the object. plain: guess neither light
+    nor ground.
+    """
+
+    photo: Path | None = None
+    object: Path | None = None
+    lens: Path | None = None
+    at_px: Pair | None = None
+    height: str | None = None
+    turn_deg: float = 0.0
+    pitch_deg: float | None = None
+    camera_height_m: float | None = None
+    focal_length_mm: float | None = None
+    sensor_width_mm: float | None = None
+    f_number: float | None = None
+    focus_m: float | None = None
+    focus_at_px: Pair | None = None
+    sun_deg: Pair | None = None
+    shadow: float | None = None
+    exposure: float = 1.0
+    grain: bool = False
+    plain: bool = False
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether there is a photograph, an object, and a place for it."""
+        return self.photo is not None and self.object is not None and self.at_px is not None
+
+    def document(self) -> dict[str, Any]:
+        """Return what JSON keeps: every value by its name."""
+        values = {each.name: getattr(self, each.name) for each in fields(self)}
+        return {
+            name: list(value) if isinstance(value, tuple) else str(value) if isinstance(value, Path) else value
+            for name, value in values.items()
+        }
+
+
+def state_of(document: Any) -> StudioState:
+    """Return the state of a document of a page or a project file. Raises InputError that names the first value that cannot be meant."""
+    if not isinstance(document, Mapping):
+        raise InputError(f"expected the state of the studio as an object of names and values, got {type(document).__name__}")
+    unknown = sorted(set(map(str, document)) - set(_CHECKS))
+    if unknown:
+        raise InputError(f"the state of the studio has no {unknown[0]!r}: expected {', '.join(_CHECKS)}")
+    given = {name: _CHECKS[name](name, value) for name, value in document.items() if value is not None}
+    state = StudioState(**given)
+    if state.focus_m is not None and state.focus_at_px is not None:
+        raise InputError("focus_m and focus_at_px both say where the focus lies: leave one of them out")
+    if state.sun_deg is not None and state.plain:
+        raise InputError("sun_deg adds a main light, and plain takes all guessed light away: leave one of them out")
+    return state
+
+
+def _path(name: str, value: Any) -> Path:
+    if not isinstance(value, str) or not value or "\0" in value or len(value) > 4096:
+        raise InputError(f"expected {name} to be the name of a file, got {_shown(value)}")
+    return Path(value)
+
+
+def _number(low: float, high: float) -> Callable[[str, Any], float]:
+    """Return a check for numbers from low up to high."""
+
+    def checked(name: str, value: Any) -> float:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and low <= value <= high):
+            raise InputError(f"expected {name} to be a number from {low:g} to {high:g}, got {_shown(value)}")
+        return _rounded(float(value))
+
+    return checked
+
+
+def _pair(first: tuple[float, float], second: tuple[float, float]) -> Callable[[str, Any], Pair]:
+    """Return a check for two numbers in two ranges."""
+
+    def checked(name: str, value: Any) -> Pair:
+        if not isinstance(value, list | tuple) or len(value) != 2:
+            raise InputError(f"expected {name} to be two numbers, got {_shown(value)}")
+        return _number(*first)(f"{name}[0]", value[0]), _number(*second)(f"{name}[1]", value[1])
+
+    return checked
+
+
+def _flag(name: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise InputError(f"expected {name} to be true or false, got {_shown(value)}")
+    return value
+
+
+def _height(name: str, value: Any) -> str:
+    """Return a height as --height takes it."""
+    text = value.strip() if isinstance(value, str) else ""
+    unit = "px" if text.endswith("px") else ""
+    try:
+        number = float(text.removesuffix("px"))
+    except ValueError:
+        number = math.nan
+    if not 0.0 < number <= 1e6:
+        raise InputError(f"expected {name} in metres above 0 such as 0.3, or in pixels such as 120px, got {_shown(value)}")
+    return f"{number:.{_DIGITS}g}{unit}"
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{_DIGITS}g}")
+
+
+def _shown(value: Any) -> str:
+    return repr(value)[:60]
+
+
+_PIXELS = (0.0, 200_000.0)
+_CHECKS: dict[str, Callable[[str, Any], Any]] = {
+    "photo": _path,
+    "object": _path,
+    "lens": _path,
+    "at_px": _pair(_PIXELS, _PIXELS),
+    "height": _height,
+    "turn_deg": _number(-100_000.0, 100_000.0),
+    "pitch_deg": _number(-89.0, 89.0),
+    "camera_height_m": _number(0.001, 10_000.0),
+    "focal_length_mm": _number(0.1, 10_000.0),
+    "sensor_width_mm": _number(0.1, 500.0),
+    "f_number": _number(0.1, 1000.0),
+    "focus_m": _number(0.001, 1e6),
+    "focus_at_px": _pair(_PIXELS, _PIXELS),
+    "sun_deg": _pair((-360.0, 360.0), (0.1, 90.0)),
+    "shadow": _number(0.0, 1.0),
+    "exposure": _number(0.0, 1000.0),
+    "grain": _flag,
+    "plain": _flag,
+}
+"""Checks of what comes from a page or a file, by the names of the state's values."""
