@@ -63,6 +63,7 @@ SUB_COMMANDS = {
     "check": SubCommand("mrbokeh.commands.check", "Find what is wrong in composites: NaN, leaks, lost light, flicker."),
     "track": SubCommand("mrbokeh.commands.track", "The camera of every frame of a clip, and its files."),
     "viewfinder": SubCommand("viewfinder.cli", "Stream a camera with virtual objects in it to a browser."),
+    "studio": SubCommand("viewfinder.studio.cli", "Place an object in a photograph in the browser."),
     "blender-addon": SubCommand("mrbokeh.commands.blender_addon", "Write the add-on that exports scenes from Blender."),
     "demo": SubCommand("mrbokeh.commands.demo", "The whole pipeline on shipped photographs, with a report."),
     "doctor": SubCommand("mrbokeh.commands.doctor", "What is installed, what is missing, and what it would enable."),

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: e3d9d0a77dcd3f7d8ed94b39a853adf0e4399830f2558e781c4e27d941b4a396
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: b8a85062879c2cbce67bfc01e518f30ca88dd1571d76e8c670766e39ad26af79
 "use strict";
 (() => {
   // src/model.ts

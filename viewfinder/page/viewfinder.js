@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: e3d9d0a77dcd3f7d8ed94b39a853adf0e4399830f2558e781c4e27d941b4a396
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: b8a85062879c2cbce67bfc01e518f30ca88dd1571d76e8c670766e39ad26af79
 "use strict";
 (() => {
   // src/model.ts
@@ -510,7 +510,8 @@
         const [a, b] = [...fingers.values()];
         const [c, d] = before;
         const factor = Math.hypot(a.x - b.x, a.y - b.y) / Math.max(1, Math.hypot(c.x - d.x, c.y - d.y));
-        gestures.pinch(factor, (a.x + b.x) / 2, (a.y + b.y) / 2, dx / 2, dy / 2);
+        const turned = Math.atan2(b.y - a.y, b.x - a.x) - Math.atan2(d.y - c.y, d.x - c.x);
+        gestures.pinch(factor, (a.x + b.x) / 2, (a.y + b.y) / 2, dx / 2, dy / 2, (turned * 180 / Math.PI + 540) % 360 - 180);
       }
     });
     const end = (event) => {
@@ -527,7 +528,7 @@
     element.addEventListener("pointercancel", end);
     element.addEventListener("wheel", (event) => {
       event.preventDefault();
-      gestures.pinch(Math.exp(-event.deltaY / 400), event.clientX, event.clientY, 0, 0);
+      gestures.pinch(Math.exp(-event.deltaY / 400), event.clientX, event.clientY, 0, 0, event.deltaX / 8);
     }, { passive: false });
   }
   var MOST = 8;

@@ -13,7 +13,7 @@ for (const folder of ["src", "static"]) {
 }
 
 await build({
-  entryPoints: { viewfinder: "src/main.ts", camera: "src/camera.ts" },
+  entryPoints: { viewfinder: "src/main.ts", camera: "src/camera.ts", studio: "src/studio.ts" },
   bundle: true,
   format: "iife",
   target: ["chrome100", "safari15.4", "firefox100"],

@@ -68,15 +68,15 @@ LARGEST_MESSAGE = 1024
 LARGEST_BODY = 65536
 
 
-async def message_body(request: web.Request) -> bytes:
-    """Read the body of a request; one beyond LARGEST_MESSAGE is refused (413) before it is read whole."""
-    if (request.content_length or 0) > LARGEST_MESSAGE:
-        raise web.HTTPRequestEntityTooLarge(max_size=LARGEST_MESSAGE, actual_size=request.content_length or 0)
+async def message_body(request: web.Request, most: int = LARGEST_MESSAGE) -> bytes:
+    """Read the body of a request; one beyond so many bytes is refused (413) before it is read whole."""
+    if (request.content_length or 0) > most:
+        raise web.HTTPRequestEntityTooLarge(max_size=most, actual_size=request.content_length or 0)
     body = bytearray()
     async for chunk in request.content.iter_any():
         body += chunk
-        if len(body) > LARGEST_MESSAGE:
-            raise web.HTTPRequestEntityTooLarge(max_size=LARGEST_MESSAGE, actual_size=len(body))
+        if len(body) > most:
+            raise web.HTTPRequestEntityTooLarge(max_size=most, actual_size=len(body))
     return bytes(body)
 
 
@@ -92,7 +92,7 @@ def _refuse(word: str) -> None:
     raise ValueError(word)
 
 
-_PAGE_PATHS = frozenset({"/", "/viewfinder.js", "/style.css", "/camera", "/camera.js", "/obs"})
+_PAGE_PATHS = frozenset({"/", "/viewfinder.js", "/style.css", "/camera", "/camera.js", "/obs", "/studio.js", "/studio.css"})
 # The page for OBS is one file, with its script in it.
 _INLINE_PATHS = frozenset({"/obs"})
 _VIEW_PATHS = frozenset({"state", "stream", "whep", "matte", "obs"})

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from ipaddress import IPv4Address
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from aiohttp import web
 
@@ -20,7 +20,6 @@ from mrbokeh.system.errors import InputError, MissingExtraError
 from viewfinder.options import ListeningOptions
 from viewfinder.server.access import LOOPBACK_NAMES, Access, is_loopback
 from viewfinder.server.sessions import Role, Sessions
-from viewfinder.server.site import Site
 
 # Routers of mobile networks and Tailscale use 100.64.0.0/10, which is neither private nor public.
 _SHARED = (IPv4Address("100.64.0.0"), IPv4Address("100.127.255.255"))
@@ -36,6 +35,13 @@ class Interface(NamedTuple):
 
     name: str
     address: str
+
+
+@runtime_checkable
+class Served(Protocol):
+    """Site whose routes are served."""
+
+    def application(self) -> web.Application: ...
 
 
 class Tls(NamedTuple):
@@ -59,16 +65,20 @@ class Endpoint:
         """Sessions of a network; None where only this machine is let in, and everybody on it."""
         return self.access.sessions
 
-    def announce(self, what: str, url: str) -> None:
-        """Print where `what` is shown. An address with a token is good for one device; the next one is printed when it was used."""
+    def announce(self, what: str, url: str, roles: Sequence[Role] = tuple(Role)) -> None:
+        """Print where `what` is shown, and to whom of these roles it is offered.
+
+        An address with a token is good for one device; the next one is printed when it was used.
+        """
         if self.sessions is None:
             tell(f"{what}: {url} (Ctrl-C stops it)")
             return
         sessions = self.sessions
         tell(f"{what} (Ctrl-C stops it)")
-        for role in (Role.VIEW, Role.CONTROL):
+        for role in roles:
             self._invite(url, sessions, role)
-        tell(f"for OBS, as a browser source: {url}obs#token={sessions.standing_token(Role.VIEW)}")
+        if Role.VIEW in roles:
+            tell(f"for OBS, as a browser source: {url}obs#token={sessions.standing_token(Role.VIEW)}")
         sessions.renewed = lambda role: self._invite(url, sessions, role)
 
     def announce_camera(self, url: str) -> None:
@@ -113,7 +123,7 @@ def on_stop(stop: Callable[[], object]) -> None:
 
 
 @contextlib.asynccontextmanager
-async def serving_site(site: Site, host: str, port: int, tls: Tls | None = None) -> AsyncIterator[str]:
+async def serving_site(site: Served, host: str, port: int, tls: Tls | None = None) -> AsyncIterator[str]:
     """Serve a site inside the block; gives the address of the page, without a token. Port 0 takes a free one.
 
     With TLS the address has a name that the certificate covers; that it leads to this machine is the user's care.

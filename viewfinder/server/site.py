@@ -1,6 +1,6 @@
 """Site: everything that one viewfinder shows to browsers: its page, its routes, and parts that may be missing."""
 
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from typing import Protocol, runtime_checkable
@@ -23,8 +23,9 @@ PAGE = {
 }
 
 
-def page_routes() -> list[web.RouteDef]:
-    return [web.get(path, _handler(name, content_type)) for path, (name, content_type) in PAGE.items()]
+def page_routes(page: Mapping[str, tuple[str, str]] = PAGE) -> list[web.RouteDef]:
+    """Return the routes of a page's files, by their paths: (name, content type)."""
+    return [web.get(path, _handler(name, content_type)) for path, (name, content_type) in page.items()]
 
 
 def _handler(name: str, content_type: str) -> Callable[[web.Request], Awaitable[web.Response]]:

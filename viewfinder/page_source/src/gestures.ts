@@ -8,8 +8,8 @@ export interface Gestures {
   dragStart(x_px: number, y_px: number): void;
   drag(x_px: number, y_px: number, dx_px: number, dy_px: number): void;
   dragEnd(): void;
-  /** factor: of the distance of the fingers since the last call, about the point between them, which moved by (dx, dy). */
-  pinch(factor: number, x_px: number, y_px: number, dx_px: number, dy_px: number): void;
+  /** factor: of the distance of the fingers since the last call, about the point between them, which moved by (dx, dy). turn_deg: clockwise. */
+  pinch(factor: number, x_px: number, y_px: number, dx_px: number, dy_px: number, turn_deg: number): void;
   twice(): void;
 }
 
@@ -21,7 +21,7 @@ interface Finger {
   y: number;
 }
 
-/** Listen on an element whose touch-action is none. A wheel pinches too. */
+/** Listen on an element whose touch-action is none. A wheel pinches too, a level one turns. */
 export function listen(element: HTMLElement, gestures: Gestures): void {
   const fingers = new Map<number, Finger>();
   let start: Finger = { x: 0, y: 0 };
@@ -52,7 +52,8 @@ export function listen(element: HTMLElement, gestures: Gestures): void {
       const [a, b] = [...fingers.values()] as [Finger, Finger];
       const [c, d] = before as [Finger, Finger];
       const factor = Math.hypot(a.x - b.x, a.y - b.y) / Math.max(1, Math.hypot(c.x - d.x, c.y - d.y));
-      gestures.pinch(factor, (a.x + b.x) / 2, (a.y + b.y) / 2, dx / 2, dy / 2);
+      const turned = Math.atan2(b.y - a.y, b.x - a.x) - Math.atan2(d.y - c.y, d.x - c.x);
+      gestures.pinch(factor, (a.x + b.x) / 2, (a.y + b.y) / 2, dx / 2, dy / 2, (((turned * 180) / Math.PI + 540) % 360) - 180);
     }
   });
 
@@ -70,7 +71,7 @@ export function listen(element: HTMLElement, gestures: Gestures): void {
   element.addEventListener("pointercancel", end);
   element.addEventListener("wheel", (event) => {
     event.preventDefault();
-    gestures.pinch(Math.exp(-event.deltaY / 400), event.clientX, event.clientY, 0, 0);
+    gestures.pinch(Math.exp(-event.deltaY / 400), event.clientX, event.clientY, 0, 0, event.deltaX / 8);
   }, { passive: false });
 }
 

@@ -1,0 +1,870 @@
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: b8a85062879c2cbce67bfc01e518f30ca88dd1571d76e8c670766e39ad26af79
+"use strict";
+(() => {
+  // src/model.ts
+  var Model = class extends EventTarget {
+    state = null;
+    shown = null;
+    way = "";
+    sentence = "";
+    silence = 0;
+    failing = false;
+    setState(state) {
+      this.state = state;
+      this.dispatchEvent(new Event("state"));
+    }
+    show(frame) {
+      this.shown = frame;
+      if (this.failing) this.say("");
+      this.dispatchEvent(new Event("frame"));
+    }
+    setWay(way) {
+      this.way = way;
+      this.dispatchEvent(new Event("way"));
+    }
+    /** Show a sentence; forSeconds null keeps it until another one comes. */
+    say(sentence, forSeconds = null) {
+      clearTimeout(this.silence);
+      this.failing = false;
+      this.sentence = sentence;
+      this.dispatchEvent(new Event("sentence"));
+      if (forSeconds !== null) this.silence = window.setTimeout(() => this.say(""), 1e3 * forSeconds);
+    }
+    /** The stream stands still for a reason, until the next picture. */
+    fail(sentence) {
+      this.say(sentence);
+      this.failing = true;
+    }
+    get mayControl() {
+      return this.state?.role === "control";
+    }
+  };
+  var model = new Model();
+
+  // src/server.ts
+  async function enter() {
+    const token = new URLSearchParams(location.hash.slice(1)).get("token");
+    if (token === null) return;
+    history.replaceState(null, "", location.pathname + location.search);
+    const answer = await fetch("/enter", posted({ token }));
+    if (!answer.ok && (await fetch("/state")).status === 401) throw new Error(await sentenceOf(answer));
+  }
+  async function sentenceOf(answer) {
+    const text = await answer.text();
+    try {
+      return JSON.parse(text).error ?? answer.statusText;
+    } catch {
+      return text.slice(0, 200) || `the viewfinder answered ${answer.status}`;
+    }
+  }
+  function posted(message) {
+    return { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(message) };
+  }
+
+  // src/studio_model.ts
+  var RESTS_MS = 250;
+  var SENTENCE_MS = 8e3;
+  var pageName = `p${Math.random().toString(36).slice(2)}`;
+  var Studio = class extends EventTarget {
+    told = null;
+    shown = null;
+    sentence = "";
+    /** Pictures that reached the screen, and how long the last draft took from the change to the screen. */
+    counts = { drafts: 0, whole: 0, draft_ms: 0, whole_ms: 0 };
+    pixels = 1e6;
+    local = {};
+    sending = {};
+    sends = Promise.resolve();
+    changes = 0;
+    drafting = false;
+    resting;
+    quiet;
+    /** The state as this page sees it now. */
+    get state() {
+      return this.told && { ...this.told.state, ...this.sending, ...this.local };
+    }
+    get isComplete() {
+      const state = this.state;
+      return Boolean(this.told?.photo && state?.photo && state.object && state.at_px);
+    }
+    /** Whether something of this page is not in the server's state yet. */
+    get isChanging() {
+      return Object.keys(this.local).length + Object.keys(this.sending).length > 0;
+    }
+    say(sentence, stays = false) {
+      this.sentence = sentence;
+      clearTimeout(this.quiet);
+      if (sentence && !stays) this.quiet = setTimeout(() => this.say(""), SENTENCE_MS);
+      this.dispatchEvent(new Event("sentence"));
+    }
+    /** Change the state on this page; it is drawn at once, and kept by `commit`. */
+    change(changes) {
+      Object.assign(this.local, changes);
+      this.dispatchEvent(new Event("state"));
+      this.draw();
+    }
+    /** Keep what was changed: one step of the history. */
+    commit(changes = {}) {
+      if (Object.keys(changes).length) this.change(changes);
+      this.sends = this.sends.then(async () => {
+        if (!Object.keys(this.local).length) return;
+        this.sending = this.local;
+        this.local = {};
+        const told = await this.post("/state", { changes: this.sending });
+        this.sending = {};
+        if (told) this.take(told);
+        else this.dispatchEvent(new Event("state"));
+      });
+      return this.sends;
+    }
+    async step(by) {
+      await this.commit();
+      const told = await this.post("/history", { step: by });
+      if (told) this.take(told);
+    }
+    /** Take over what the server tells; a state that others changed is drawn. */
+    take(told) {
+      if (this.told && told.number < this.told.number) return;
+      const before = JSON.stringify([this.told?.state, this.told?.photo]);
+      this.told = told;
+      if (told.problem) this.say(told.problem, true);
+      this.dispatchEvent(new Event("told"));
+      if (JSON.stringify([told.state, told.photo]) !== before) {
+        this.dispatchEvent(new Event("state"));
+        this.draw();
+      }
+    }
+    /** Keep asking for news. */
+    async follow() {
+      for (; ; ) {
+        try {
+          const answer = await fetch(`/state${this.told ? `?after=${this.told.number}` : ""}`);
+          if (!answer.ok) throw new Error(await sentenceOf(answer));
+          const told = await answer.json();
+          if (this.sentence.startsWith("the studio does not answer")) this.say("");
+          if (this.told && told.number < this.told.number) this.told = null;
+          this.take(told);
+        } catch (problem) {
+          const why = problem instanceof TypeError ? "" : ` (${problem.message})`;
+          this.say(`the studio does not answer${why}: nothing is lost, this page tries again`, true);
+          await new Promise((done) => setTimeout(done, 1e3));
+          if (this.told) this.told.number = -1;
+        }
+      }
+    }
+    async post(path, message) {
+      try {
+        const answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(message) });
+        if (answer.ok) return await answer.json();
+        this.say(await sentenceOf(answer));
+      } catch {
+        this.say("the studio does not answer: nothing is lost, try again");
+      }
+      return null;
+    }
+    async upload(file) {
+      const kind = /\.(glb|gltf)$/i.test(file.name) ? "object" : "photo";
+      const most = this.told?.largest[kind] ?? Infinity;
+      if (file.size > most) return this.say(`${file.name} is larger than the ${most >> 20} MB that the studio takes: give it on the command line`);
+      this.say(`sending ${file.name} ...`, true);
+      try {
+        const answer = await fetch(`/upload?kind=${kind}&name=${encodeURIComponent(file.name)}`, { method: "POST", body: file });
+        if (!answer.ok) return this.say(await sentenceOf(answer));
+        this.say(kind === "object" && !this.state?.at_px ? "click into the photograph where the object is to stand" : "");
+        this.take(await answer.json());
+      } catch {
+        this.say(`${file.name} did not arrive: the studio does not answer`);
+      }
+    }
+    /** Ask for a picture: a draft as soon as the last one is there, the whole one when the hand rests. */
+    draw() {
+      this.changes++;
+      clearTimeout(this.resting);
+      if (!this.isComplete) return;
+      void this.draft();
+      this.resting = setTimeout(() => void this.whole(this.changes), RESTS_MS);
+    }
+    async draft() {
+      if (this.drafting) return;
+      this.drafting = true;
+      for (let drawn = -1; drawn !== this.changes; ) {
+        drawn = this.changes;
+        await this.ask(true, drawn);
+      }
+      this.drafting = false;
+    }
+    async whole(change) {
+      if (change === this.changes) await this.ask(false, change);
+    }
+    async ask(draft, change) {
+      const began = performance.now();
+      const message = { changes: { ...this.sending, ...this.local }, draft, pixels: this.pixels, page: pageName };
+      try {
+        const answer = await fetch("/preview", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(message) });
+        if (answer.status === 204) return;
+        if (!answer.ok) return this.say(await sentenceOf(answer), true);
+        const body = await answer.arrayBuffer();
+        const length = new DataView(body).getUint32(0);
+        const shown = JSON.parse(new TextDecoder().decode(new Uint8Array(body, 4, length)));
+        const bitmap = await createImageBitmap(new Blob([new Uint8Array(body, 4 + length)], { type: "image/jpeg" }));
+        if (!draft && change !== this.changes) return;
+        this.shown = shown;
+        this.say(shown.warnings[0] ?? "", true);
+        this.counts[draft ? "drafts" : "whole"]++;
+        this.counts[draft ? "draft_ms" : "whole_ms"] = Math.round(performance.now() - began);
+        this.dispatchEvent(new CustomEvent("picture", { detail: bitmap }));
+      } catch {
+        this.say("the studio does not answer: nothing is lost, this page tries again", true);
+      }
+    }
+  };
+  var studio = new Studio();
+
+  // src/studio_panel.ts
+  var byId = (id) => document.getElementById(id);
+  var F_NUMBERS = [1, 1.2, 1.4, 1.8, 2, 2.2, 2.4, 2.8, 3.2, 3.5, 4, 4.5, 5, 5.6, 6.3, 7.1, 8, 9, 10, 11, 13, 14, 16, 18, 20, 22, 25, 29, 32];
+  var LONG_FORMATS = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers" };
+  var DEFAULT_SUN = [-60, 40];
+  var nearestF = (f_number) => {
+    const apart = F_NUMBERS.map((each) => Math.abs(Math.log(each / f_number)));
+    return apart.indexOf(Math.min(...apart));
+  };
+  var degrees = (value) => `${value}°`;
+  var SLIDERS = [
+    { id: "turn", read: (s) => s.turn_deg, write: (turn_deg) => ({ turn_deg }), shown: (v) => degrees(Math.round(v)) },
+    {
+      id: "f_number",
+      read: (s) => nearestF(s.f_number ?? studio.told?.photo?.lens_f_number ?? 8),
+      write: (value) => ({ f_number: F_NUMBERS[Math.min(value, F_NUMBERS.length - 1)] }),
+      shown: (_v, s) => `f/${Number((s.f_number ?? studio.told?.photo?.lens_f_number ?? 8).toPrecision(3))}`
+    },
+    { id: "sun_right", read: (s) => s.sun_deg?.[0] ?? DEFAULT_SUN[0], write: (v) => sun([v, above()]), shown: (v, s) => s.sun_deg ? degrees(v) : "" },
+    { id: "sun_above", read: (s) => s.sun_deg?.[1] ?? DEFAULT_SUN[1], write: (v) => sun([right(), v]), shown: (v, s) => s.sun_deg ? degrees(v) : "" },
+    {
+      id: "exposure",
+      read: (s) => Math.log2(Math.max(s.exposure, 1e-3)),
+      write: (v) => ({ exposure: Number((2 ** v).toPrecision(4)) }),
+      shown: (v) => `${v > 0 ? "+" : ""}${v.toFixed(1)} stops`
+    },
+    { id: "shadow", read: (s) => s.shadow ?? 1, write: (v) => ({ shadow: v === 1 ? null : v }), shown: (v) => `${Math.round(100 * v)} %` },
+    { id: "pitch", read: (s) => s.pitch_deg ?? 0, write: (pitch_deg) => ({ pitch_deg }), shown: (v) => degrees(v) }
+  ];
+  var right = () => studio.state?.sun_deg?.[0] ?? DEFAULT_SUN[0];
+  var above = () => studio.state?.sun_deg?.[1] ?? DEFAULT_SUN[1];
+  var sun = (sun_deg) => ({ sun_deg, plain: false });
+  var NUMBERS = [
+    { id: "focus", name: "focus_m", also: { focus_at_px: null } },
+    { id: "camera_height", name: "camera_height_m" },
+    { id: "focal_length", name: "focal_length_mm" },
+    { id: "sensor_width", name: "sensor_width_mm" }
+  ];
+  var Panel = class {
+    constructor() {
+      for (const each of SLIDERS) this.slider(each);
+      for (const each of NUMBERS) this.number(each.id, each.name, each.also ?? {});
+      this.height();
+      this.switches();
+      this.dome();
+      this.result();
+      this.files();
+      const react = (id, changes) => byId(id).addEventListener("click", () => void studio.commit(changes()));
+      react("focus_auto", () => ({ focus_m: null, focus_at_px: null }));
+      react("f_number_auto", () => ({ f_number: null }));
+      react("camera_found", () => ({ pitch_deg: studio.told?.camera?.pitch_deg ?? studio.state.pitch_deg }));
+      byId("object").addEventListener("change", (event) => void studio.commit({ object: event.target.value || null, height: null }));
+      for (const [id, by] of [["undo", -1], ["redo", 1]]) byId(id).addEventListener("click", () => void studio.step(by));
+      studio.addEventListener("told", () => this.told());
+      studio.addEventListener("state", () => this.state());
+      studio.addEventListener("picture", () => this.shown());
+      studio.addEventListener("sentence", () => byId("message").textContent = studio.sentence);
+    }
+    slider(each) {
+      const input = byId(each.id);
+      if (each.id === "f_number") input.max = String(F_NUMBERS.length - 1);
+      input.addEventListener("input", () => studio.change(each.write(input.valueAsNumber)));
+      input.addEventListener("change", () => void studio.commit(each.write(input.valueAsNumber)));
+    }
+    number(id, name, also) {
+      const input = byId(id);
+      input.addEventListener("change", () => {
+        const value = input.value === "" ? null : input.valueAsNumber;
+        if (value !== null && !(value > 0)) return studio.say("give a number above 0, or nothing for automatic");
+        void studio.commit({ [name]: value, ...also });
+      });
+    }
+    height() {
+      const input = byId("height");
+      input.addEventListener("change", () => void studio.commit({ height: input.value.trim().replace(",", ".") || null }));
+    }
+    switches() {
+      const auto = byId("sun_auto");
+      auto.addEventListener("change", () => void studio.commit(auto.checked ? { sun_deg: null } : sun([right(), above()])));
+      const grain = byId("grain");
+      grain.addEventListener("change", () => void studio.commit({ grain: grain.checked }));
+      const plain = byId("plain");
+      plain.addEventListener("change", () => void studio.commit(plain.checked ? { plain: true, sun_deg: null } : { plain: false }));
+    }
+    /** The handle on the dome: the middle is overhead, the rim the horizon, up is ahead. */
+    dome() {
+      const dome = byId("dome");
+      const moved = (event) => {
+        const box = dome.getBoundingClientRect();
+        const [x, y] = [(event.clientX - box.left) / box.width * 220 - 110, (event.clientY - box.top) / box.height * 220 - 110];
+        const high = Math.max(2, Math.round(90 - 0.9 * Math.min(100, Math.hypot(x, y))));
+        studio.change(sun([Math.round(Math.atan2(x, -y) * 180 / Math.PI), high]));
+      };
+      dome.addEventListener("pointerdown", (event) => {
+        dome.setPointerCapture(event.pointerId);
+        moved(event);
+      });
+      dome.addEventListener("pointermove", (event) => event.buttons && moved(event));
+      dome.addEventListener("pointerup", () => void studio.commit());
+    }
+    result() {
+      byId("copy").addEventListener("click", () => {
+        const text = byId("command").textContent ?? "";
+        const done = () => studio.say("the command is copied");
+        navigator.clipboard?.writeText(text).then(done, () => studio.say("the browser does not let this page copy: select the command by hand"));
+        if (!navigator.clipboard) getSelection()?.selectAllChildren(byId("command"));
+      });
+    }
+    files() {
+      for (const id of ["open_photo", "open_object"]) {
+        const input = byId(id);
+        input.addEventListener("change", () => {
+          for (const file of input.files ?? []) void studio.upload(file);
+          input.value = "";
+        });
+      }
+      const drop = byId("drop");
+      addEventListener("dragover", (event) => {
+        event.preventDefault();
+        drop.hidden = false;
+      });
+      addEventListener("dragleave", (event) => event.relatedTarget === null && (drop.hidden = true));
+      addEventListener("drop", async (event) => {
+        event.preventDefault();
+        drop.hidden = true;
+        for (const file of event.dataTransfer?.files ?? []) await studio.upload(file);
+      });
+    }
+    /** What the server tells beside the state. */
+    told() {
+      const told = studio.told;
+      byId("undo").disabled = !told.can_undo;
+      byId("redo").disabled = !told.can_redo;
+      byId("camera_told").textContent = told.photo?.has_depth ? "The photograph has depth: the ground slopes as that says." : told.camera?.told ?? (told.photo ? "The camera is looked for in the picture's lines." : "");
+      byId("camera_found").disabled = told.camera?.pitch_deg === void 0;
+      byId("kept").textContent = `Everything is kept in ${told.project}`;
+      this.choices();
+      this.saves(told.saves);
+      this.state();
+    }
+    choices() {
+      const told = studio.told;
+      const select = byId("object");
+      const wanted = ["", ...told.objects.map((each) => each.path)];
+      if (wanted.join("\n") !== [...select.options].map((each) => each.value).join("\n")) {
+        const names = ["choose one", ...told.objects.map((each) => each.name)];
+        select.replaceChildren(...wanted.map((path, i) => new Option(names[i], path)));
+      }
+      const lenses = byId("lenses");
+      if (lenses.dataset.shown !== JSON.stringify(told.lenses)) {
+        lenses.dataset.shown = JSON.stringify(told.lenses);
+        lenses.querySelectorAll("label").forEach((each) => each.remove());
+        lenses.append(lensChoice("", "as the photograph tells", null), ...told.lenses.map((each, i) => lensChoice(each.path, each.name, i)));
+      }
+      const formats = byId("formats");
+      if (!formats.childElementCount) {
+        for (const format of told.formats) {
+          const button = document.createElement("button");
+          button.textContent = LONG_FORMATS[format] ?? format;
+          button.dataset.format = format;
+          button.addEventListener("click", async () => {
+            await studio.commit();
+            const answer = await studio.post("/save", { format });
+            if (answer) studio.take(answer);
+          });
+          formats.append(button);
+        }
+      }
+    }
+    saves(saves) {
+      byId("saves").replaceChildren(...saves.map(saveLine));
+    }
+    state() {
+      const state = studio.state;
+      if (!state) return;
+      for (const each of SLIDERS) {
+        const input = byId(each.id);
+        const value = each.read(state);
+        if (document.activeElement !== input || input.valueAsNumber !== value) input.value = String(value);
+        const output = input.closest("label").querySelector("output");
+        output.textContent = each.shown(value, state);
+        input.setAttribute("aria-valuetext", output.textContent);
+      }
+      for (const { id, name } of NUMBERS) this.fill(id, state[name] === null ? "" : String(state[name]));
+      this.fill("height", state.height ?? "");
+      byId("object").value = state.object ?? "";
+      byId("sun_auto").checked = state.sun_deg === null;
+      byId("grain").checked = state.grain;
+      byId("plain").checked = state.plain;
+      document.querySelectorAll("input[name=lens]").forEach((each) => each.checked = each.value === (state.lens ?? ""));
+      const [turn, high] = state.sun_deg ?? DEFAULT_SUN;
+      const reach = (90 - high) / 0.9;
+      const lamp = byId("lamp");
+      lamp.setAttribute("cx", String(reach * Math.sin(turn * Math.PI / 180)));
+      lamp.setAttribute("cy", String(-reach * Math.cos(turn * Math.PI / 180)));
+      byId("dome").classList.toggle("off", state.sun_deg === null);
+      byId("command").textContent = (studio.isChanging ? studio.shown?.command : studio.told?.command) ?? "Place an object first.";
+      document.querySelectorAll("#formats button").forEach((each) => each.disabled = !studio.isComplete);
+      byId("focus_told").textContent = focusTold(state);
+    }
+    fill(id, text) {
+      const input = byId(id);
+      if (document.activeElement !== input) input.value = text;
+    }
+    shown() {
+      const shown = studio.shown;
+      byId("guessed").replaceChildren(
+        ...[...shown.guessed, ...shown.warnings].map((sentence) => Object.assign(document.createElement("li"), { textContent: sentence }))
+      );
+      if (studio.isChanging) byId("command").textContent = shown.command ?? "";
+      if (studio.state) byId("focus_told").textContent = focusTold(studio.state);
+    }
+  };
+  function focusTold(state) {
+    const shown = studio.shown;
+    if (!shown || !studio.isComplete) return "Click Focus here, then what is to be in focus.";
+    const from = state.focus_m !== null || state.focus_at_px !== null ? "as chosen" : studio.told?.photo?.focus_m ? "as the photograph states" : "on the object";
+    const at = shown.focus_m === null ? "infinity" : `${Number(shown.focus_m.toPrecision(3))} m`;
+    const [least, most] = [shown.coc_px[0], shown.coc_px[1]];
+    const blur = least === void 0 || most === void 0 ? "" : `; the object is blurred by ${least.toFixed(1)} to ${most.toFixed(1)} px of the photograph`;
+    return `Focused at ${at}, ${from}${blur}.`;
+  }
+  function lensChoice(path, name, number) {
+    const label = document.createElement("label");
+    const input = Object.assign(document.createElement("input"), { type: "radio", name: "lens", value: path });
+    input.addEventListener("change", () => void studio.commit({ lens: path || null }));
+    label.append(input);
+    if (number !== null) label.append(Object.assign(document.createElement("img"), { src: `/lens/${number}`, alt: "shape of its bokeh" }));
+    label.append(name);
+    return label;
+  }
+  function saveLine(save) {
+    const line = document.createElement("li");
+    if (save.state === "running") {
+      const cancel = Object.assign(document.createElement("button"), { textContent: `Cancel ${save.name}` });
+      cancel.addEventListener("click", () => void studio.post("/cancel", { number: save.number }));
+      const bar = document.createElement("progress");
+      bar.setAttribute("aria-label", `making ${save.name}`);
+      line.append(`making ${save.name} ... `, bar, cancel);
+    } else if (save.state === "done") {
+      const link = Object.assign(document.createElement("a"), { href: `/saved/${save.number}`, textContent: `Download ${save.name}` });
+      link.setAttribute("download", save.name);
+      line.append(link, ` (${save.seconds} s) ${save.path}`);
+    } else {
+      line.append(`${save.name}: ${save.state === "failed" ? save.sentence : "cancelled"}`);
+    }
+    return line;
+  }
+
+  // src/gestures.ts
+  var TAP_PX = 10;
+  var TWICE_MS = 300;
+  function listen(element, gestures) {
+    const fingers = /* @__PURE__ */ new Map();
+    let start2 = { x: 0, y: 0 };
+    let kind = "none";
+    let lastTap_ms = -Infinity;
+    element.addEventListener("pointerdown", (event) => {
+      element.setPointerCapture(event.pointerId);
+      fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+      if (kind === "drag") gestures.dragEnd();
+      start2 = { x: event.clientX, y: event.clientY };
+      kind = fingers.size === 1 ? "tap" : "pinch";
+    });
+    element.addEventListener("pointermove", (event) => {
+      const finger = fingers.get(event.pointerId);
+      if (!finger) return;
+      const before = [...fingers.values()].map((each) => ({ ...each }));
+      const [dx, dy] = [event.clientX - finger.x, event.clientY - finger.y];
+      [finger.x, finger.y] = [event.clientX, event.clientY];
+      if (kind === "tap" && Math.hypot(finger.x - start2.x, finger.y - start2.y) > TAP_PX) {
+        kind = "drag";
+        gestures.dragStart(start2.x, start2.y);
+        gestures.drag(finger.x, finger.y, finger.x - start2.x, finger.y - start2.y);
+      } else if (kind === "drag") {
+        gestures.drag(finger.x, finger.y, dx, dy);
+      } else if (kind === "pinch" && fingers.size === 2) {
+        const [a, b] = [...fingers.values()];
+        const [c, d] = before;
+        const factor = Math.hypot(a.x - b.x, a.y - b.y) / Math.max(1, Math.hypot(c.x - d.x, c.y - d.y));
+        const turned = Math.atan2(b.y - a.y, b.x - a.x) - Math.atan2(d.y - c.y, d.x - c.x);
+        gestures.pinch(factor, (a.x + b.x) / 2, (a.y + b.y) / 2, dx / 2, dy / 2, (turned * 180 / Math.PI + 540) % 360 - 180);
+      }
+    });
+    const end = (event) => {
+      if (!fingers.delete(event.pointerId)) return;
+      if (kind === "drag") gestures.dragEnd();
+      if (kind === "tap" && event.type === "pointerup") {
+        if (event.timeStamp - lastTap_ms < TWICE_MS) gestures.twice();
+        else gestures.tap(event.clientX, event.clientY);
+        lastTap_ms = event.timeStamp;
+      }
+      if (kind !== "pinch" || fingers.size === 0) kind = "none";
+    };
+    element.addEventListener("pointerup", end);
+    element.addEventListener("pointercancel", end);
+    element.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      gestures.pinch(Math.exp(-event.deltaY / 400), event.clientX, event.clientY, 0, 0, event.deltaX / 8);
+    }, { passive: false });
+  }
+
+  // src/studio_ground.ts
+  var CELLS = 16;
+  var EYES_M = 1.5;
+  var Ground = class {
+    constructor(photo, focal_px, state) {
+      this.photo = photo;
+      this.focal_px = focal_px;
+      const pitch = state.plain ? 0 : (state.pitch_deg ?? 0) * Math.PI / 180;
+      [this.cos, this.sin] = [Math.cos(pitch), Math.sin(pitch)];
+      this.high_m = state.camera_height_m ?? EYES_M;
+    }
+    photo;
+    focal_px;
+    cos;
+    sin;
+    high_m;
+    /** Row of the horizon. */
+    get horizon_px() {
+      return this.photo.height_px / 2 - this.focal_px * this.sin / this.cos;
+    }
+    /** Distance along the view of the ground under a pixel, null above the horizon. */
+    distance_m(y_px) {
+      const falls = this.cos * (y_px - this.photo.height_px / 2) / this.focal_px + this.sin;
+      return falls > 1e-6 ? this.high_m / falls : null;
+    }
+    /** The pixel, or the nearest below the horizon and within the photograph. */
+    within([x, y]) {
+      const { width_px, height_px } = this.photo;
+      const top = Math.max(0, this.horizon_px + 4e-3 * height_px);
+      return [Math.min(width_px - 1, Math.max(0, x)), Math.min(height_px - 1, Math.max(Math.min(top, height_px - 1), y))];
+    }
+    /** Side of a cell of the grid, metres: 1, 2 or 5 of a power of ten, near a third of the camera's height. */
+    get cell_m() {
+      const wanted = this.high_m / 3;
+      const power = 10 ** Math.floor(Math.log10(wanted));
+      return power * (wanted / power >= 5 ? 5 : wanted / power >= 2 ? 2 : 1);
+    }
+    /** The grid as the path of an SVG in pixels of the photograph. */
+    grid() {
+      const cell = this.cell_m;
+      const lines = [];
+      const nearest = 0.15 * this.high_m;
+      for (let i = -CELLS; i <= CELLS; i++) {
+        this.line(lines, [i * cell, -CELLS * cell], [i * cell, 3 * CELLS * cell], nearest);
+      }
+      for (let j = -CELLS; j <= 3 * CELLS; j++) {
+        this.line(lines, [-CELLS * cell, j * cell], [CELLS * cell, j * cell], nearest);
+      }
+      return lines.join("");
+    }
+    /** A circle on the ground about a pixel, as the path of an SVG. */
+    circle([x_px, y_px], radius_m) {
+      const z_m = this.distance_m(y_px);
+      if (z_m === null) return "";
+      const x_m = (x_px - this.photo.width_px / 2) / this.focal_px * z_m;
+      const ahead_m = -this.sin * ((y_px - this.photo.height_px / 2) / this.focal_px * z_m) + this.cos * z_m;
+      const points = Array.from({ length: 33 }, (_, i) => {
+        const turn = i / 32 * 2 * Math.PI;
+        return this.seen(x_m + radius_m * Math.cos(turn), ahead_m + radius_m * Math.sin(turn));
+      });
+      if (points.some((each) => each[2] <= 0)) return "";
+      return points.map(([x, y], i) => `${i ? "L" : "M"}${x.toFixed(1)} ${y.toFixed(1)}`).join("");
+    }
+    /** Pixel and depth of a point of the ground. */
+    seen(x_m, ahead_m) {
+      const y = this.cos * this.high_m - this.sin * ahead_m;
+      const z = this.sin * this.high_m + this.cos * ahead_m;
+      return [this.photo.width_px / 2 + this.focal_px * x_m / z, this.photo.height_px / 2 + this.focal_px * y / z, z];
+    }
+    line(lines, [x0, a0], [x1, a1], nearest_m) {
+      const z0 = this.sin * this.high_m + this.cos * a0;
+      const z1 = this.sin * this.high_m + this.cos * a1;
+      if (z0 < nearest_m && z1 < nearest_m) return;
+      const cut = (x, a, z, x2, a2, z2) => {
+        if (z >= nearest_m) return [x, a];
+        const share = (nearest_m - z) / (z2 - z);
+        return [x + share * (x2 - x), a + share * (a2 - a)];
+      };
+      const [p, q] = [this.seen(...cut(x0, a0, z0, x1, a1, z1)), this.seen(...cut(x1, a1, z1, x0, a0, z0))];
+      lines.push(`M${p[0].toFixed(1)} ${p[1].toFixed(1)}L${q[0].toFixed(1)} ${q[1].toFixed(1)}`);
+    }
+  };
+  function groundOf(photo, state) {
+    return photo && state && photo.focal_px !== null && !photo.has_depth && !state.plain ? new Ground(photo, photo.focal_px, state) : null;
+  }
+
+  // src/studio_picture.ts
+  var NUDGES_REST_MS = 500;
+  var LOUPE_PX = 240;
+  var DRAWN_AGAIN_MS = 900;
+  var byId2 = (id) => document.getElementById(id);
+  function scaledHeight(height, factor) {
+    if (height === null) return null;
+    const unit = height.endsWith("px") ? "px" : "";
+    return `${Number((parseFloat(height) * factor).toPrecision(6))}${unit}`;
+  }
+  var within180 = (turn_deg) => ((turn_deg + 180) % 360 + 360) % 360 - 180;
+  var PictureStage = class {
+    stage = byId2("stage");
+    picture = byId2("picture");
+    before = byId2("before");
+    ground = byId2("ground");
+    loupe = byId2("loupe");
+    photoName = "";
+    from = null;
+    moved = [0, 0];
+    later;
+    quiet;
+    constructor() {
+      new ResizeObserver(() => this.fit()).observe(byId2("room"));
+      studio.addEventListener("told", () => this.fit());
+      studio.addEventListener("state", () => this.mark());
+      studio.addEventListener("picture", (event) => this.show(event.detail));
+      this.gestures();
+      this.keys();
+      this.buttons();
+    }
+    /** Make the picture as large as the window allows, and load the photograph when it is another one. */
+    fit() {
+      const photo = studio.told?.photo ?? null;
+      this.stage.hidden = !photo;
+      byId2("welcome").hidden = Boolean(photo);
+      const badge = byId2("badge");
+      badge.hidden = !studio.told?.busy;
+      badge.textContent = studio.told?.busy ? `${studio.told.busy} ...` : "";
+      if (!photo) return;
+      const room = byId2("room").getBoundingClientRect();
+      const scale = Math.min(room.width / photo.width_px, room.height / photo.height_px);
+      this.stage.style.width = `${photo.width_px * scale}px`;
+      this.stage.style.height = `${photo.height_px * scale}px`;
+      studio.pixels = Math.max(4e4, photo.width_px * photo.height_px * (scale * devicePixelRatio) ** 2);
+      const name = `${photo.name} ${studio.told?.state.photo} ${photo.width_px}`;
+      if (name !== this.photoName) {
+        this.photoName = name;
+        this.before.src = `/photo?of=${encodeURIComponent(name)}`;
+        this.before.decode().then(() => studio.isComplete || this.showPhotograph()).catch(() => void 0);
+      }
+      this.mark();
+    }
+    showPhotograph() {
+      this.picture.width = this.before.naturalWidth;
+      this.picture.height = this.before.naturalHeight;
+      this.picture.getContext("2d").drawImage(this.before, 0, 0);
+    }
+    show(bitmap) {
+      this.picture.width = bitmap.width;
+      this.picture.height = bitmap.height;
+      this.picture.getContext("2d").drawImage(bitmap, 0, 0);
+      bitmap.close();
+      this.mark();
+    }
+    /** Draw grid, horizon, the object's foot and its box. */
+    mark() {
+      const [photo, state] = [studio.told?.photo ?? null, studio.state];
+      const ground = groundOf(photo, state);
+      const wanted = byId2("grid").getAttribute("aria-pressed") === "true";
+      this.stage.classList.toggle("placed", Boolean(state?.at_px));
+      this.ground.replaceChildren();
+      if (photo) this.ground.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
+      if (photo && ground && state && wanted) {
+        const y = ground.horizon_px;
+        this.path("", ground.grid());
+        this.path("horizon", `M0 ${y}H${photo.width_px}`);
+        if (state.at_px) this.path("foot", ground.circle(state.at_px, ground.cell_m / 2));
+        this.words(`one square: ${ground.cell_m} m`, photo.width_px * 0.015, photo.height_px * 0.985, photo.width_px / this.stage.clientWidth);
+      }
+      if (photo && !studio.isComplete && this.before.complete && this.before.naturalWidth) this.showPhotograph();
+      const box = byId2("box");
+      const sides = studio.isComplete ? studio.shown?.box : null;
+      box.hidden = !sides;
+      if (sides) {
+        const [left, top, right2, bottom] = sides.map((each) => 100 * each);
+        Object.assign(box.style, { left: `${left}%`, top: `${top}%`, width: `${right2 - left}%`, height: `${bottom - top}%` });
+      }
+      this.stage.classList.remove("resting");
+      clearTimeout(this.quiet);
+      this.quiet = setTimeout(() => this.stage.classList.add("resting"), DRAWN_AGAIN_MS);
+    }
+    path(kind, data) {
+      const path = document.createElementNS("http://www.w3.org/2000/svg", "path");
+      path.setAttribute("d", data);
+      path.setAttribute("vector-effect", "non-scaling-stroke");
+      if (kind) path.setAttribute("class", kind);
+      this.ground.append(path);
+    }
+    words(text, x, y, scale) {
+      const words = document.createElementNS("http://www.w3.org/2000/svg", "text");
+      words.textContent = text;
+      words.setAttribute("transform", `translate(${x} ${y}) scale(${scale})`);
+      this.ground.append(words);
+    }
+    /** The pixel of the photograph under a point of the window. */
+    pixel(x, y) {
+      const box = this.stage.getBoundingClientRect();
+      const photo = studio.told.photo;
+      return [(x - box.left) / box.width * photo.width_px, (y - box.top) / box.height * photo.height_px];
+    }
+    inside(at_px) {
+      const photo = studio.told.photo;
+      const ground = groundOf(photo, studio.state);
+      const [x, y] = ground ? ground.within(at_px) : at_px;
+      const within = (value, most) => Math.round(100 * Math.min(most - 1, Math.max(0, value))) / 100;
+      return [within(x, photo.width_px), within(y, photo.height_px)];
+    }
+    gestures() {
+      listen(this.stage, {
+        tap: (x, y) => this.tapped(x, y),
+        twice: () => void 0,
+        dragStart: (x, y) => {
+          this.from = studio.state?.at_px ?? this.inside(this.pixel(x, y));
+          this.moved = [0, 0];
+          this.stage.classList.add("dragging");
+        },
+        drag: (_x, _y, dx, dy) => {
+          if (!this.from || !studio.state?.object) return;
+          const scale = studio.told.photo.width_px / this.stage.clientWidth;
+          this.moved = [this.moved[0] + dx * scale, this.moved[1] + dy * scale];
+          studio.change({ at_px: this.inside([this.from[0] + this.moved[0], this.from[1] + this.moved[1]]) });
+        },
+        dragEnd: () => {
+          this.from = null;
+          this.stage.classList.remove("dragging");
+          void studio.commit();
+        },
+        pinch: (factor, _x, _y, _dx, _dy, turn_deg) => this.shape(factor, turn_deg)
+      });
+    }
+    tapped(x, y) {
+      this.stage.focus();
+      if (!studio.told?.photo) return;
+      if (this.stage.classList.contains("focusing")) return this.focusAt(x, y);
+      if (!studio.state?.object) return studio.say("choose an object first: in the list at the right, or drop a GLB file");
+      void studio.commit({ at_px: this.inside(this.pixel(x, y)) });
+    }
+    /** Scale and turn the object, and keep that once the hand rests. */
+    shape(factor, turn_deg) {
+      const state = studio.state;
+      if (!state?.at_px) return;
+      const turned = turn_deg ? { turn_deg: Number(within180(state.turn_deg + turn_deg).toFixed(2)) } : {};
+      studio.change({ height: scaledHeight(state.height, factor), ...turned });
+      this.commitLater();
+    }
+    commitLater() {
+      clearTimeout(this.later);
+      this.later = setTimeout(() => void studio.commit(), NUDGES_REST_MS);
+    }
+    /** Focus where one clicked: on the object, on the ground there, or on what the depth shows. */
+    focusAt(x, y) {
+      const photo = studio.told.photo;
+      const at_px = this.inside(this.pixel(x, y));
+      byId2("focus_here").click();
+      if (photo.has_depth) return void studio.commit({ focus_at_px: at_px, focus_m: null });
+      const ground = groundOf(photo, studio.state);
+      if (!ground) return studio.say("the plain ground has no distance to focus on: turn Plain off, or type the metres");
+      const box = studio.shown?.box;
+      const [u, v] = [at_px[0] / photo.width_px, at_px[1] / photo.height_px];
+      const onObject = box && u >= box[0] && u <= box[2] && v >= box[1] && v <= box[3];
+      const metres = ground.distance_m(onObject && studio.state?.at_px ? studio.state.at_px[1] : at_px[1]);
+      if (metres === null) return studio.say("the sky has no distance: click on the ground or the object");
+      void studio.commit({ focus_m: Number(metres.toPrecision(4)), focus_at_px: null, camera_height_m: ground.high_m });
+    }
+    keys() {
+      this.stage.addEventListener("keydown", (event) => {
+        const state = studio.state;
+        if (event.ctrlKey || event.metaKey || event.altKey || !state?.at_px) return;
+        const [x, y] = state.at_px;
+        const step = event.shiftKey ? 10 : 1;
+        const moves = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+        const shapes = { "+": [1.05, 0], "=": [1.05, 0], "-": [1 / 1.05, 0], "[": [1, -step], "]": [1, step], "{": [1, -10], "}": [1, 10] };
+        const [move, shape] = [moves[event.key], shapes[event.key]];
+        if (move) {
+          studio.change({ at_px: this.inside([x + step * move[0], y + step * move[1]]) });
+          this.commitLater();
+        } else if (shape) this.shape(...shape);
+        else return;
+        event.preventDefault();
+      });
+      document.addEventListener("keydown", (event) => {
+        if (event.key === "Escape" && this.stage.classList.contains("focusing")) byId2("focus_here").click();
+        if (!(event.ctrlKey || event.metaKey) || event.target.matches?.("input[type=text], input[type=number]")) return;
+        const key = event.key.toLowerCase();
+        if (key !== "z" && key !== "y") return;
+        event.preventDefault();
+        void studio.step(key === "y" || event.shiftKey ? 1 : -1);
+      });
+    }
+    buttons() {
+      const pressed = (id, told) => {
+        const button = byId2(id);
+        button.addEventListener("click", () => {
+          const on = button.getAttribute("aria-pressed") !== "true";
+          button.setAttribute("aria-pressed", String(on));
+          told(on);
+        });
+      };
+      pressed("grid", () => this.mark());
+      pressed("focus_here", (on) => {
+        this.stage.classList.toggle("focusing", on);
+        studio.say(on ? "click what is to be in focus: the object, or a place on the ground" : "", on);
+      });
+      pressed("magnify", (on) => this.loupe.hidden = !on);
+      this.stage.addEventListener("pointermove", (event) => !this.loupe.hidden && this.magnify(event));
+      const hold = byId2("hold_before");
+      const show = (on) => {
+        this.before.hidden = !on;
+      };
+      hold.addEventListener("pointerdown", () => show(true));
+      for (const end of ["pointerup", "pointercancel", "pointerleave", "blur"]) hold.addEventListener(end, () => show(false));
+      hold.addEventListener("keydown", (event) => (event.key === " " || event.key === "Enter") && show(true));
+      hold.addEventListener("keyup", () => show(false));
+    }
+    /** Show the preview under the pointer with one pixel of the photograph to one of the screen. */
+    magnify(event) {
+      const box = this.stage.getBoundingClientRect();
+      const [x, y] = [event.clientX - box.left, event.clientY - box.top];
+      const photo = studio.told.photo;
+      const shown = this.picture.width / photo.width_px;
+      const side = LOUPE_PX * shown;
+      const context = this.loupe.getContext("2d");
+      context.fillRect(0, 0, LOUPE_PX, LOUPE_PX);
+      context.drawImage(
+        this.picture,
+        x / box.width * this.picture.width - side / 2,
+        y / box.height * this.picture.height - side / 2,
+        side,
+        side,
+        0,
+        0,
+        LOUPE_PX,
+        LOUPE_PX
+      );
+      const left = Math.min(box.width - LOUPE_PX, Math.max(0, x + 20));
+      const top = Math.min(box.height - LOUPE_PX, Math.max(0, y - LOUPE_PX - 20));
+      Object.assign(this.loupe.style, { left: `${left}px`, top: `${top}px` });
+    }
+  };
+
+  // src/studio.ts
+  async function start() {
+    await enter();
+    const [picture, panel] = [new PictureStage(), new Panel()];
+    Object.assign(window, { studio, parts: { picture, panel } });
+    await studio.follow();
+  }
+  start().catch((problem) => studio.say(problem instanceof Error ? problem.message : "the studio does not answer", true));
+})();

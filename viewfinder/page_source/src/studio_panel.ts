@@ -1,0 +1,282 @@
+// The panel: fields for everything of the state, the light's dome, the command line and the saves.
+import { type Pair, type Save, type State, studio } from "./studio_model";
+
+const byId = <T extends Element>(id: string): T => document.getElementById(id) as unknown as T;
+const F_NUMBERS = [1, 1.2, 1.4, 1.8, 2, 2.2, 2.4, 2.8, 3.2, 3.5, 4, 4.5, 5, 5.6, 6.3, 7.1, 8, 9, 10, 11, 13, 14, 16, 18, 20, 22, 25, 29, 32];
+const LONG_FORMATS: Record<string, string> = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers" };
+const DEFAULT_SUN: Pair = [-60, 40];
+
+interface Slider {
+  id: string;
+  read: (state: State) => number;
+  write: (value: number) => Partial<State>;
+  shown: (value: number, state: State) => string;
+}
+
+const nearestF = (f_number: number): number => {
+  const apart = F_NUMBERS.map((each) => Math.abs(Math.log(each / f_number)));
+  return apart.indexOf(Math.min(...apart));
+};
+const degrees = (value: number): string => `${value}°`;
+
+const SLIDERS: Slider[] = [
+  { id: "turn", read: (s) => s.turn_deg, write: (turn_deg) => ({ turn_deg }), shown: (v) => degrees(Math.round(v)) },
+  {
+    id: "f_number",
+    read: (s) => nearestF(s.f_number ?? studio.told?.photo?.lens_f_number ?? 8),
+    write: (value) => ({ f_number: F_NUMBERS[Math.min(value, F_NUMBERS.length - 1)]! }),
+    shown: (_v, s) => `f/${Number((s.f_number ?? studio.told?.photo?.lens_f_number ?? 8).toPrecision(3))}`,
+  },
+  { id: "sun_right", read: (s) => s.sun_deg?.[0] ?? DEFAULT_SUN[0], write: (v) => sun([v, above()]), shown: (v, s) => (s.sun_deg ? degrees(v) : "") },
+  { id: "sun_above", read: (s) => s.sun_deg?.[1] ?? DEFAULT_SUN[1], write: (v) => sun([right(), v]), shown: (v, s) => (s.sun_deg ? degrees(v) : "") },
+  {
+    id: "exposure",
+    read: (s) => Math.log2(Math.max(s.exposure, 1e-3)),
+    write: (v) => ({ exposure: Number((2 ** v).toPrecision(4)) }),
+    shown: (v) => `${v > 0 ? "+" : ""}${v.toFixed(1)} stops`,
+  },
+  { id: "shadow", read: (s) => s.shadow ?? 1, write: (v) => ({ shadow: v === 1 ? null : v }), shown: (v) => `${Math.round(100 * v)} %` },
+  { id: "pitch", read: (s) => s.pitch_deg ?? 0, write: (pitch_deg) => ({ pitch_deg }), shown: (v) => degrees(v) },
+];
+
+const right = (): number => studio.state?.sun_deg?.[0] ?? DEFAULT_SUN[0];
+const above = (): number => studio.state?.sun_deg?.[1] ?? DEFAULT_SUN[1];
+/** A told light takes the plain, even one away. */
+const sun = (sun_deg: Pair): Partial<State> => ({ sun_deg, plain: false });
+
+const NUMBERS: { id: string; name: keyof State; also?: Partial<State> }[] = [
+  { id: "focus", name: "focus_m", also: { focus_at_px: null } },
+  { id: "camera_height", name: "camera_height_m" },
+  { id: "focal_length", name: "focal_length_mm" },
+  { id: "sensor_width", name: "sensor_width_mm" },
+];
+
+export class Panel {
+  constructor() {
+    for (const each of SLIDERS) this.slider(each);
+    for (const each of NUMBERS) this.number(each.id, each.name, each.also ?? {});
+    this.height();
+    this.switches();
+    this.dome();
+    this.result();
+    this.files();
+    const react = (id: string, changes: () => Partial<State>): void => byId(id).addEventListener("click", () => void studio.commit(changes()));
+    react("focus_auto", () => ({ focus_m: null, focus_at_px: null }));
+    react("f_number_auto", () => ({ f_number: null }));
+    react("camera_found", () => ({ pitch_deg: studio.told?.camera?.pitch_deg ?? studio.state!.pitch_deg }));
+    byId("object").addEventListener("change", (event) => void studio.commit({ object: (event.target as HTMLSelectElement).value || null, height: null }));
+    for (const [id, by] of [["undo", -1], ["redo", 1]] as const) byId(id).addEventListener("click", () => void studio.step(by));
+    studio.addEventListener("told", () => this.told());
+    studio.addEventListener("state", () => this.state());
+    studio.addEventListener("picture", () => this.shown());
+    studio.addEventListener("sentence", () => (byId("message").textContent = studio.sentence));
+  }
+
+  private slider(each: Slider): void {
+    const input = byId<HTMLInputElement>(each.id);
+    if (each.id === "f_number") input.max = String(F_NUMBERS.length - 1);
+    input.addEventListener("input", () => studio.change(each.write(input.valueAsNumber)));
+    input.addEventListener("change", () => void studio.commit(each.write(input.valueAsNumber)));
+  }
+
+  private number(id: string, name: keyof State, also: Partial<State>): void {
+    const input = byId<HTMLInputElement>(id);
+    input.addEventListener("change", () => {
+      const value = input.value === "" ? null : input.valueAsNumber;
+      if (value !== null && !(value > 0)) return studio.say("give a number above 0, or nothing for automatic");
+      void studio.commit({ [name]: value, ...also });
+    });
+  }
+
+  private height(): void {
+    const input = byId<HTMLInputElement>("height");
+    input.addEventListener("change", () => void studio.commit({ height: input.value.trim().replace(",", ".") || null }));
+  }
+
+  private switches(): void {
+    const auto = byId<HTMLInputElement>("sun_auto");
+    auto.addEventListener("change", () => void studio.commit(auto.checked ? { sun_deg: null } : sun([right(), above()])));
+    const grain = byId<HTMLInputElement>("grain");
+    grain.addEventListener("change", () => void studio.commit({ grain: grain.checked }));
+    const plain = byId<HTMLInputElement>("plain");
+    plain.addEventListener("change", () => void studio.commit(plain.checked ? { plain: true, sun_deg: null } : { plain: false }));
+  }
+
+  /** The handle on the dome: the middle is overhead, the rim the horizon, up is ahead. */
+  private dome(): void {
+    const dome = byId<SVGSVGElement>("dome");
+    const moved = (event: PointerEvent): void => {
+      const box = dome.getBoundingClientRect();
+      const [x, y] = [((event.clientX - box.left) / box.width) * 220 - 110, ((event.clientY - box.top) / box.height) * 220 - 110];
+      const high = Math.max(2, Math.round(90 - 0.9 * Math.min(100, Math.hypot(x, y))));
+      studio.change(sun([Math.round((Math.atan2(x, -y) * 180) / Math.PI), high]));
+    };
+    dome.addEventListener("pointerdown", (event) => {
+      dome.setPointerCapture(event.pointerId);
+      moved(event);
+    });
+    dome.addEventListener("pointermove", (event) => event.buttons && moved(event));
+    dome.addEventListener("pointerup", () => void studio.commit());
+  }
+
+  private result(): void {
+    byId("copy").addEventListener("click", () => {
+      const text = byId("command").textContent ?? "";
+      const done = (): void => studio.say("the command is copied");
+      navigator.clipboard?.writeText(text).then(done, () => studio.say("the browser does not let this page copy: select the command by hand"));
+      if (!navigator.clipboard) getSelection()?.selectAllChildren(byId("command"));
+    });
+  }
+
+  private files(): void {
+    for (const id of ["open_photo", "open_object"]) {
+      const input = byId<HTMLInputElement>(id);
+      input.addEventListener("change", () => {
+        for (const file of input.files ?? []) void studio.upload(file);
+        input.value = "";
+      });
+    }
+    const drop = byId<HTMLElement>("drop");
+    addEventListener("dragover", (event) => {
+      event.preventDefault();
+      drop.hidden = false;
+    });
+    addEventListener("dragleave", (event) => event.relatedTarget === null && (drop.hidden = true));
+    addEventListener("drop", async (event) => {
+      event.preventDefault();
+      drop.hidden = true;
+      for (const file of event.dataTransfer?.files ?? []) await studio.upload(file);
+    });
+  }
+
+  /** What the server tells beside the state. */
+  private told(): void {
+    const told = studio.told!;
+    byId<HTMLButtonElement>("undo").disabled = !told.can_undo;
+    byId<HTMLButtonElement>("redo").disabled = !told.can_redo;
+    byId("camera_told").textContent = told.photo?.has_depth
+      ? "The photograph has depth: the ground slopes as that says."
+      : told.camera?.told ?? (told.photo ? "The camera is looked for in the picture's lines." : "");
+    byId<HTMLButtonElement>("camera_found").disabled = told.camera?.pitch_deg === undefined;
+    byId("kept").textContent = `Everything is kept in ${told.project}`;
+    this.choices();
+    this.saves(told.saves);
+    this.state();
+  }
+
+  private choices(): void {
+    const told = studio.told!;
+    const select = byId<HTMLSelectElement>("object");
+    const wanted = ["", ...told.objects.map((each) => each.path)];
+    if (wanted.join("\n") !== [...select.options].map((each) => each.value).join("\n")) {
+      const names = ["choose one", ...told.objects.map((each) => each.name)];
+      select.replaceChildren(...wanted.map((path, i) => new Option(names[i], path)));
+    }
+    const lenses = byId<HTMLElement>("lenses");
+    if (lenses.dataset.shown !== JSON.stringify(told.lenses)) {
+      lenses.dataset.shown = JSON.stringify(told.lenses);
+      lenses.querySelectorAll("label").forEach((each) => each.remove());
+      lenses.append(lensChoice("", "as the photograph tells", null), ...told.lenses.map((each, i) => lensChoice(each.path, each.name, i)));
+    }
+    const formats = byId<HTMLElement>("formats");
+    if (!formats.childElementCount) {
+      for (const format of told.formats) {
+        const button = document.createElement("button");
+        button.textContent = LONG_FORMATS[format] ?? format;
+        button.dataset.format = format;
+        button.addEventListener("click", async () => {
+          await studio.commit();
+          const answer = await studio.post("/save", { format });
+          if (answer) studio.take(answer);
+        });
+        formats.append(button);
+      }
+    }
+  }
+
+  private saves(saves: Save[]): void {
+    byId("saves").replaceChildren(...saves.map(saveLine));
+  }
+
+  private state(): void {
+    const state = studio.state;
+    if (!state) return;
+    for (const each of SLIDERS) {
+      const input = byId<HTMLInputElement>(each.id);
+      const value = each.read(state);
+      if (document.activeElement !== input || input.valueAsNumber !== value) input.value = String(value);
+      const output = input.closest("label")!.querySelector("output")!;
+      output.textContent = each.shown(value, state);
+      input.setAttribute("aria-valuetext", output.textContent);
+    }
+    for (const { id, name } of NUMBERS) this.fill(id, state[name] === null ? "" : String(state[name]));
+    this.fill("height", state.height ?? "");
+    byId<HTMLSelectElement>("object").value = state.object ?? "";
+    byId<HTMLInputElement>("sun_auto").checked = state.sun_deg === null;
+    byId<HTMLInputElement>("grain").checked = state.grain;
+    byId<HTMLInputElement>("plain").checked = state.plain;
+    document.querySelectorAll<HTMLInputElement>("input[name=lens]").forEach((each) => (each.checked = each.value === (state.lens ?? "")));
+    const [turn, high] = state.sun_deg ?? DEFAULT_SUN;
+    const reach = (90 - high) / 0.9;
+    const lamp = byId<SVGCircleElement>("lamp");
+    lamp.setAttribute("cx", String(reach * Math.sin((turn * Math.PI) / 180)));
+    lamp.setAttribute("cy", String(-reach * Math.cos((turn * Math.PI) / 180)));
+    byId("dome").classList.toggle("off", state.sun_deg === null);
+    byId("command").textContent = (studio.isChanging ? studio.shown?.command : studio.told?.command) ?? "Place an object first.";
+    document.querySelectorAll<HTMLButtonElement>("#formats button").forEach((each) => (each.disabled = !studio.isComplete));
+    byId("focus_told").textContent = focusTold(state);
+  }
+
+  private fill(id: string, text: string): void {
+    const input = byId<HTMLInputElement>(id);
+    if (document.activeElement !== input) input.value = text;
+  }
+
+  private shown(): void {
+    const shown = studio.shown!;
+    byId("guessed").replaceChildren(
+      ...[...shown.guessed, ...shown.warnings].map((sentence) => Object.assign(document.createElement("li"), { textContent: sentence })),
+    );
+    if (studio.isChanging) byId("command").textContent = shown.command ?? "";
+    if (studio.state) byId("focus_told").textContent = focusTold(studio.state);
+  }
+}
+
+/** How the lens is focused, and how much the object is blurred by that. */
+function focusTold(state: State): string {
+  const shown = studio.shown;
+  if (!shown || !studio.isComplete) return "Click Focus here, then what is to be in focus.";
+  const from = state.focus_m !== null || state.focus_at_px !== null ? "as chosen" : studio.told?.photo?.focus_m ? "as the photograph states" : "on the object";
+  const at = shown.focus_m === null ? "infinity" : `${Number(shown.focus_m.toPrecision(3))} m`;
+  const [least, most] = [shown.coc_px[0], shown.coc_px[1]];
+  const blur = least === undefined || most === undefined ? "" : `; the object is blurred by ${least.toFixed(1)} to ${most.toFixed(1)} px of the photograph`;
+  return `Focused at ${at}, ${from}${blur}.`;
+}
+
+function lensChoice(path: string, name: string, number: number | null): HTMLLabelElement {
+  const label = document.createElement("label");
+  const input = Object.assign(document.createElement("input"), { type: "radio", name: "lens", value: path });
+  input.addEventListener("change", () => void studio.commit({ lens: path || null }));
+  label.append(input);
+  if (number !== null) label.append(Object.assign(document.createElement("img"), { src: `/lens/${number}`, alt: "shape of its bokeh" }));
+  label.append(name);
+  return label;
+}
+
+function saveLine(save: Save): HTMLLIElement {
+  const line = document.createElement("li");
+  if (save.state === "running") {
+    const cancel = Object.assign(document.createElement("button"), { textContent: `Cancel ${save.name}` });
+    cancel.addEventListener("click", () => void studio.post("/cancel", { number: save.number }));
+    const bar = document.createElement("progress");
+    bar.setAttribute("aria-label", `making ${save.name}`);
+    line.append(`making ${save.name} ... `, bar, cancel);
+  } else if (save.state === "done") {
+    const link = Object.assign(document.createElement("a"), { href: `/saved/${save.number}`, textContent: `Download ${save.name}` });
+    link.setAttribute("download", save.name);
+    line.append(link, ` (${save.seconds} s) ${save.path}`);
+  } else {
+    line.append(`${save.name}: ${save.state === "failed" ? save.sentence : "cancelled"}`);
+  }
+  return line;
+}

@@ -1,0 +1,278 @@
+// The picture: fitted to the window, with the ground over it, and everything that hands do on it.
+import { listen } from "./gestures";
+import { groundOf } from "./studio_ground";
+import { type Pair, studio } from "./studio_model";
+
+const NUDGES_REST_MS = 500;
+const LOUPE_PX = 240;
+const DRAWN_AGAIN_MS = 900;
+
+const byId = <T extends Element>(id: string): T => document.getElementById(id) as unknown as T;
+
+/** The height, scaled; its unit stays. */
+export function scaledHeight(height: string | null, factor: number): string | null {
+  if (height === null) return null;
+  const unit = height.endsWith("px") ? "px" : "";
+  return `${Number((parseFloat(height) * factor).toPrecision(6))}${unit}`;
+}
+
+/** Degrees from -180 to 180. */
+export const within180 = (turn_deg: number): number => ((((turn_deg + 180) % 360) + 360) % 360) - 180;
+
+export class PictureStage {
+  private readonly stage = byId<HTMLElement>("stage");
+  private readonly picture = byId<HTMLCanvasElement>("picture");
+  private readonly before = byId<HTMLImageElement>("before");
+  private readonly ground = byId<SVGSVGElement>("ground");
+  private readonly loupe = byId<HTMLCanvasElement>("loupe");
+  private photoName = "";
+  private from: Pair | null = null;
+  private moved: Pair = [0, 0];
+  private later: ReturnType<typeof setTimeout> | undefined;
+  private quiet: ReturnType<typeof setTimeout> | undefined;
+
+  constructor() {
+    new ResizeObserver(() => this.fit()).observe(byId("room"));
+    studio.addEventListener("told", () => this.fit());
+    studio.addEventListener("state", () => this.mark());
+    studio.addEventListener("picture", (event) => this.show((event as CustomEvent<ImageBitmap>).detail));
+    this.gestures();
+    this.keys();
+    this.buttons();
+  }
+
+  /** Make the picture as large as the window allows, and load the photograph when it is another one. */
+  private fit(): void {
+    const photo = studio.told?.photo ?? null;
+    this.stage.hidden = !photo;
+    byId<HTMLElement>("welcome").hidden = Boolean(photo);
+    const badge = byId<HTMLElement>("badge");
+    badge.hidden = !studio.told?.busy;
+    badge.textContent = studio.told?.busy ? `${studio.told.busy} ...` : "";
+    if (!photo) return;
+    const room = byId<HTMLElement>("room").getBoundingClientRect();
+    const scale = Math.min(room.width / photo.width_px, room.height / photo.height_px);
+    this.stage.style.width = `${photo.width_px * scale}px`;
+    this.stage.style.height = `${photo.height_px * scale}px`;
+    studio.pixels = Math.max(4e4, photo.width_px * photo.height_px * (scale * devicePixelRatio) ** 2);
+    const name = `${photo.name} ${studio.told?.state.photo} ${photo.width_px}`;
+    if (name !== this.photoName) {
+      this.photoName = name;
+      this.before.src = `/photo?of=${encodeURIComponent(name)}`;
+      this.before.decode().then(() => studio.isComplete || this.showPhotograph()).catch(() => undefined);
+    }
+    this.mark();
+  }
+
+  private showPhotograph(): void {
+    this.picture.width = this.before.naturalWidth;
+    this.picture.height = this.before.naturalHeight;
+    this.picture.getContext("2d")!.drawImage(this.before, 0, 0);
+  }
+
+  private show(bitmap: ImageBitmap): void {
+    this.picture.width = bitmap.width;
+    this.picture.height = bitmap.height;
+    this.picture.getContext("2d")!.drawImage(bitmap, 0, 0);
+    bitmap.close();
+    this.mark();
+  }
+
+  /** Draw grid, horizon, the object's foot and its box. */
+  private mark(): void {
+    const [photo, state] = [studio.told?.photo ?? null, studio.state];
+    const ground = groundOf(photo, state);
+    const wanted = byId<HTMLElement>("grid").getAttribute("aria-pressed") === "true";
+    this.stage.classList.toggle("placed", Boolean(state?.at_px));
+    this.ground.replaceChildren();
+    if (photo) this.ground.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
+    if (photo && ground && state && wanted) {
+      const y = ground.horizon_px;
+      this.path("", ground.grid());
+      this.path("horizon", `M0 ${y}H${photo.width_px}`);
+      if (state.at_px) this.path("foot", ground.circle(state.at_px, ground.cell_m / 2));
+      this.words(`one square: ${ground.cell_m} m`, photo.width_px * 0.015, photo.height_px * 0.985, photo.width_px / this.stage.clientWidth);
+    }
+    if (photo && !studio.isComplete && this.before.complete && this.before.naturalWidth) this.showPhotograph();
+    const box = byId<HTMLElement>("box");
+    const sides = studio.isComplete ? studio.shown?.box : null;
+    box.hidden = !sides;
+    if (sides) {
+      const [left, top, right, bottom] = sides.map((each) => 100 * each) as [number, number, number, number];
+      Object.assign(box.style, { left: `${left}%`, top: `${top}%`, width: `${right - left}%`, height: `${bottom - top}%` });
+    }
+    this.stage.classList.remove("resting");
+    clearTimeout(this.quiet);
+    this.quiet = setTimeout(() => this.stage.classList.add("resting"), DRAWN_AGAIN_MS);
+  }
+
+  private path(kind: string, data: string): void {
+    const path = document.createElementNS("http://www.w3.org/2000/svg", "path");
+    path.setAttribute("d", data);
+    path.setAttribute("vector-effect", "non-scaling-stroke");
+    if (kind) path.setAttribute("class", kind);
+    this.ground.append(path);
+  }
+
+  private words(text: string, x: number, y: number, scale: number): void {
+    const words = document.createElementNS("http://www.w3.org/2000/svg", "text");
+    words.textContent = text;
+    words.setAttribute("transform", `translate(${x} ${y}) scale(${scale})`);
+    this.ground.append(words);
+  }
+
+  /** The pixel of the photograph under a point of the window. */
+  private pixel(x: number, y: number): Pair {
+    const box = this.stage.getBoundingClientRect();
+    const photo = studio.told!.photo!;
+    return [((x - box.left) / box.width) * photo.width_px, ((y - box.top) / box.height) * photo.height_px];
+  }
+
+  private inside(at_px: Pair): Pair {
+    const photo = studio.told!.photo!;
+    const ground = groundOf(photo, studio.state);
+    const [x, y] = ground ? ground.within(at_px) : at_px;
+    const within = (value: number, most: number): number => Math.round(100 * Math.min(most - 1, Math.max(0, value))) / 100;
+    return [within(x, photo.width_px), within(y, photo.height_px)];
+  }
+
+  private gestures(): void {
+    listen(this.stage, {
+      tap: (x, y) => this.tapped(x, y),
+      twice: () => undefined,
+      dragStart: (x, y) => {
+        this.from = studio.state?.at_px ?? this.inside(this.pixel(x, y));
+        this.moved = [0, 0];
+        this.stage.classList.add("dragging");
+      },
+      drag: (_x, _y, dx, dy) => {
+        if (!this.from || !studio.state?.object) return;
+        const scale = studio.told!.photo!.width_px / this.stage.clientWidth;
+        this.moved = [this.moved[0] + dx * scale, this.moved[1] + dy * scale];
+        studio.change({ at_px: this.inside([this.from[0] + this.moved[0], this.from[1] + this.moved[1]]) });
+      },
+      dragEnd: () => {
+        this.from = null;
+        this.stage.classList.remove("dragging");
+        void studio.commit();
+      },
+      pinch: (factor, _x, _y, _dx, _dy, turn_deg) => this.shape(factor, turn_deg),
+    });
+  }
+
+  private tapped(x: number, y: number): void {
+    this.stage.focus();
+    if (!studio.told?.photo) return;
+    if (this.stage.classList.contains("focusing")) return this.focusAt(x, y);
+    if (!studio.state?.object) return studio.say("choose an object first: in the list at the right, or drop a GLB file");
+    void studio.commit({ at_px: this.inside(this.pixel(x, y)) });
+  }
+
+  /** Scale and turn the object, and keep that once the hand rests. */
+  private shape(factor: number, turn_deg: number): void {
+    const state = studio.state;
+    if (!state?.at_px) return;
+    const turned = turn_deg ? { turn_deg: Number(within180(state.turn_deg + turn_deg).toFixed(2)) } : {};
+    studio.change({ height: scaledHeight(state.height, factor), ...turned });
+    this.commitLater();
+  }
+
+  private commitLater(): void {
+    clearTimeout(this.later);
+    this.later = setTimeout(() => void studio.commit(), NUDGES_REST_MS);
+  }
+
+  /** Focus where one clicked: on the object, on the ground there, or on what the depth shows. */
+  private focusAt(x: number, y: number): void {
+    const photo = studio.told!.photo!;
+    const at_px = this.inside(this.pixel(x, y));
+    byId<HTMLElement>("focus_here").click();
+    if (photo.has_depth) return void studio.commit({ focus_at_px: at_px, focus_m: null });
+    const ground = groundOf(photo, studio.state);
+    if (!ground) return studio.say("the plain ground has no distance to focus on: turn Plain off, or type the metres");
+    const box = studio.shown?.box;
+    const [u, v] = [at_px[0] / photo.width_px, at_px[1] / photo.height_px];
+    const onObject = box && u >= box[0] && u <= box[2] && v >= box[1] && v <= box[3];
+    const metres = ground.distance_m(onObject && studio.state?.at_px ? studio.state.at_px[1] : at_px[1]);
+    if (metres === null) return studio.say("the sky has no distance: click on the ground or the object");
+    void studio.commit({ focus_m: Number(metres.toPrecision(4)), focus_at_px: null, camera_height_m: ground.high_m });
+  }
+
+  private keys(): void {
+    this.stage.addEventListener("keydown", (event) => {
+      const state = studio.state;
+      if (event.ctrlKey || event.metaKey || event.altKey || !state?.at_px) return;
+      const [x, y] = state.at_px;
+      const step = event.shiftKey ? 10 : 1;
+      const moves: Record<string, Pair> = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, -1], ArrowDown: [0, 1] };
+      const shapes: Record<string, [number, number]> = { "+": [1.05, 0], "=": [1.05, 0], "-": [1 / 1.05, 0], "[": [1, -step], "]": [1, step], "{": [1, -10], "}": [1, 10] };
+      const [move, shape] = [moves[event.key], shapes[event.key]];
+      if (move) {
+        studio.change({ at_px: this.inside([x + step * move[0], y + step * move[1]]) });
+        this.commitLater();
+      } else if (shape) this.shape(...shape);
+      else return;
+      event.preventDefault();
+    });
+    document.addEventListener("keydown", (event) => {
+      if (event.key === "Escape" && this.stage.classList.contains("focusing")) byId<HTMLElement>("focus_here").click();
+      if (!(event.ctrlKey || event.metaKey) || (event.target as Element).matches?.("input[type=text], input[type=number]")) return;
+      const key = event.key.toLowerCase();
+      if (key !== "z" && key !== "y") return;
+      event.preventDefault();
+      void studio.step(key === "y" || event.shiftKey ? 1 : -1);
+    });
+  }
+
+  private buttons(): void {
+    const pressed = (id: string, told: (on: boolean) => void): void => {
+      const button = byId<HTMLElement>(id);
+      button.addEventListener("click", () => {
+        const on = button.getAttribute("aria-pressed") !== "true";
+        button.setAttribute("aria-pressed", String(on));
+        told(on);
+      });
+    };
+    pressed("grid", () => this.mark());
+    pressed("focus_here", (on) => {
+      this.stage.classList.toggle("focusing", on);
+      studio.say(on ? "click what is to be in focus: the object, or a place on the ground" : "", on);
+    });
+    pressed("magnify", (on) => (this.loupe.hidden = !on));
+    this.stage.addEventListener("pointermove", (event) => !this.loupe.hidden && this.magnify(event));
+    const hold = byId<HTMLElement>("hold_before");
+    const show = (on: boolean): void => {
+      this.before.hidden = !on;
+    };
+    hold.addEventListener("pointerdown", () => show(true));
+    for (const end of ["pointerup", "pointercancel", "pointerleave", "blur"]) hold.addEventListener(end, () => show(false));
+    hold.addEventListener("keydown", (event) => (event.key === " " || event.key === "Enter") && show(true));
+    hold.addEventListener("keyup", () => show(false));
+  }
+
+  /** Show the preview under the pointer with one pixel of the photograph to one of the screen. */
+  private magnify(event: PointerEvent): void {
+    const box = this.stage.getBoundingClientRect();
+    const [x, y] = [event.clientX - box.left, event.clientY - box.top];
+    const photo = studio.told!.photo!;
+    const shown = this.picture.width / photo.width_px;
+    const side = LOUPE_PX * shown;
+    const context = this.loupe.getContext("2d")!;
+    context.fillRect(0, 0, LOUPE_PX, LOUPE_PX);
+    context.drawImage(
+      this.picture,
+      (x / box.width) * this.picture.width - side / 2,
+      (y / box.height) * this.picture.height - side / 2,
+      side,
+      side,
+      0,
+      0,
+      LOUPE_PX,
+      LOUPE_PX,
+    );
+    const left = Math.min(box.width - LOUPE_PX, Math.max(0, x + 20));
+    const top = Math.min(box.height - LOUPE_PX, Math.max(0, y - LOUPE_PX - 20));
+    Object.assign(this.loupe.style, { left: `${left}px`, top: `${top}px` });
+  }
+}
+

@@ -1,0 +1,49 @@
+"""`mrbokeh studio`: one object placed in one photograph, in a browser."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mrbokeh.system.channel import say
+from viewfinder.cli import InterfaceOption, LanOption, PortOption, QrOption, TlsKeyOption, TlsOption
+from viewfinder.options import ListeningOptions
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command()
+def studio(
+    photo: Annotated[
+        Path | None,
+        typer.Argument(metavar="PHOTO", help="A photograph (RAW, JPEG, HEIC, TIFF, PNG), or the .json project of an earlier time."),
+    ] = None,
+    object_: Annotated[Path | None, typer.Option("--object", help="GLB file to render and put in.")] = None,
+    lens: Annotated[
+        list[Path] | None, typer.Option(help="LENS.json, or NETWORK.onnx (repeat: the page switches between them); else the photograph's.")
+    ] = None,
+    project: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.json", help="Keep everything here, and go on with what is there. Default: PHOTO's name + .studio.json."),
+    ] = None,
+    pictures: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for saved pictures and for files dropped on the page.")] = Path(),
+    port: PortOption = 8080,
+    lan: LanOption = False,
+    interface: InterfaceOption = None,
+    tls: TlsOption = None,
+    tls_key: TlsKeyOption = None,
+    qr: QrOption = True,
+) -> None:
+    """Place an object in a photograph with the mouse or a finger, see it with the lens's blur, and save it; Ctrl-C ends it.
+
+    Every state shows the `mrbokeh composite` command that makes the same picture. Without PHOTO the page asks for one.
+
+    Example: mrbokeh studio photo.jpg --object cake.glb
+
+    Example: mrbokeh studio photo.studio.json --lan
+    """
+    say("mrbokeh studio starts")
+    from viewfinder.studio.running import StudioOptions, serve
+
+    listening = ListeningOptions(port=port, lan=lan, interface=interface, tls=tls, tls_key=tls_key, qr=qr)
+    serve(StudioOptions(photo, object_, tuple(lens or ()), project=project, pictures=pictures, listening=listening))

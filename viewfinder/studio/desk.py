@@ -1,0 +1,275 @@
+"""Desk: what all pages of one studio share: the project, the opened photograph, its solved camera, and news of every change."""
+
+import asyncio
+import logging
+import re
+from collections.abc import AsyncIterator, Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mrbokeh.system.channel import apart, say
+from mrbokeh.system.errors import InputError
+from viewfinder.studio.project import Project
+from viewfinder.studio.saving import Saves
+from viewfinder.studio.state import StudioState, state_of
+
+if TYPE_CHECKING:
+    from mrbokeh.solving.solved_camera import SolvedCamera
+    from viewfinder.studio.photograph import OpenedPhotograph
+
+_log = logging.getLogger(__name__)
+
+LARGEST = {"photo": 300 << 20, "object": 200 << 20}
+"""Bytes of what is dropped on the page."""
+_OBJECTS = (".glb",)
+_KEPT_PHOTOGRAPHS = 2
+
+
+class Desk:
+    """Shared state of one studio. All methods belong to the event loop's thread; what takes long is done in others."""
+
+    def __init__(self, project: Project, pictures: Path) -> None:
+        self.project, self.saves = project, Saves(pictures, self.tell_all)
+        self.uploads = pictures / "studio_files"
+        self.problem = ""
+        self.busy = ""
+        self._number = 0
+        self._changed = asyncio.Event()
+        self._opened: dict[Path, OpenedPhotograph] = {}
+        self._cameras: dict[Path, dict[str, Any]] = {}
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    @property
+    def state(self) -> StudioState:
+        return self.project.state
+
+    @property
+    def photograph(self) -> "OpenedPhotograph | None":
+        """The opened photograph of the state, None while there is none."""
+        return None if self.state.photo is None else self._opened.get(self.state.photo)
+
+    @property
+    def number(self) -> int:
+        """Number of the newest news."""
+        return self._number
+
+    def tell_all(self) -> None:
+        """Let every page know that something changed."""
+        self._number += 1
+        self._changed.set()
+        self._changed = asyncio.Event()
+
+    async def news_after(self, number: int, wait_s: float) -> None:
+        """Wait until there is news after a number, or for so long."""
+        if self._number <= number:
+            changed = self._changed
+            try:
+                await asyncio.wait_for(changed.wait(), wait_s)
+            except TimeoutError:
+                return
+
+    def start(self) -> None:
+        """Open the photograph of the state, if there is one."""
+        if self.state.photo is not None:
+            self._begin(self._open(self.state.photo))
+
+    async def close(self) -> None:
+        for task in self._tasks:
+            task.cancel()
+        await self.saves.close()
+
+    def changed_state(self, changes: Any) -> StudioState:
+        """Return the state with changes of a page, which may name only files that are offered. Raises InputError."""
+        if not isinstance(changes, Mapping):
+            raise InputError(f"expected the changes of the state as names and values, got {type(changes).__name__}")
+        document = self.state.document() | {str(name): value for name, value in changes.items()}
+        state = state_of(document)
+        for name, known in (("object", self.project.objects), ("lens", self.project.lenses), ("photo", [self.state.photo])):
+            if (path := getattr(state, name)) is not None and path not in known:
+                raise InputError(f"the page may choose only what it was offered, but {name} is {str(path)[:60]!r}: drop the file on it")
+        return state
+
+    async def change(self, changes: Any) -> None:
+        """Take changes of a page over, complete what follows from them, and keep the project."""
+        self.project.add(self.changed_state(changes))
+        self._keep()
+        await self._complete()
+
+    async def step(self, by: Any) -> None:
+        """Undo or redo."""
+        if by not in (-1, 1):
+            raise InputError(f"expected a step of -1 or 1, got {str(by)[:20]!r}")
+        self.project.step(int(by))
+        self._keep()
+        if self.state.photo is not None and self.photograph is None:
+            self._begin(self._open(self.state.photo))
+
+    async def upload(self, kind: str, name: str, body: AsyncIterator[bytes]) -> None:
+        """Keep a file that was dropped on the page, if it is what it should be. Raises InputError."""
+        if kind not in LARGEST:
+            raise InputError(f"expected a photograph or an object (photo, object), got {kind[:20]!r}")
+        if kind == "object" and Path(name).suffix.lower() not in _OBJECTS:
+            raise InputError(f"{name[:80]!r} is no GLB file: export the object as .glb (glTF binary) and drop that")
+        self.uploads.mkdir(parents=True, exist_ok=True)
+        path = _free(self.uploads / _harmless(name))
+        try:
+            await _received(path, body, LARGEST[kind])
+            await asyncio.to_thread(_require_glb if kind == "object" else self._require_photograph, path)
+        except BaseException:
+            path.unlink(missing_ok=True)
+            raise
+        if kind == "object":
+            self.project.offer(path)
+            self.project.add(replace(self.state, object=path, height=None))
+            self._keep()
+            await self._complete()
+        else:
+            self.project.add(StudioState(photo=path, object=self.state.object, lens=self.state.lens))
+            self._keep()
+            self._begin(self._open(path))
+
+    def _require_photograph(self, path: Path) -> None:
+        from viewfinder.studio.photograph import open_photograph
+
+        with apart():
+            open_photograph(path)
+
+    def _keep(self) -> None:
+        """Write the project and tell the pages."""
+        try:
+            self.project.write()
+            self.problem = ""
+        except OSError as error:
+            self.problem = f"the project could not be kept in {self.project.path} ({error.strerror}): make room, or the last changes are lost"
+        self.tell_all()
+
+    def _begin(self, work: Any) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _open(self, path: Path) -> None:
+        """Open a photograph, then look for its camera."""
+        self.busy = "opening the photograph"
+        self.tell_all()
+        try:
+            opened, camera = await asyncio.to_thread(_opened_photograph, path)
+            while len(self._opened) >= _KEPT_PHOTOGRAPHS:
+                del self._opened[next(iter(self._opened))]
+            self._opened[path] = opened
+            await self._complete()
+            self.busy = "looking for the camera in the picture's lines" if path not in self._cameras else ""
+            self.tell_all()
+            if path not in self._cameras:
+                found = await asyncio.to_thread(camera)
+                self._cameras[path] = {"told": found} if isinstance(found, str) else _camera_told(found)
+                if not isinstance(found, str):
+                    self._take_camera(path, found)
+        except InputError as error:
+            self.problem = str(error)
+        except Exception as error:
+            _log.exception("opening the photograph failed")
+            self.problem = f"this is a fault of mrbokeh ({type(error).__name__}); the terminal says more"
+        self.busy = ""
+        self.tell_all()
+
+    def _take_camera(self, path: Path, camera: "SolvedCamera") -> None:
+        """Give the state the camera, if it is still that of the photograph and nobody chose another."""
+        from viewfinder.studio.photograph import with_solved_camera
+
+        opened = self._opened.get(path)
+        if opened is not None and self.state.photo == path:
+            self.project.amend(lambda state: with_solved_camera(state, opened, camera))
+            self._keep()
+
+    async def _complete(self) -> None:
+        """Give a complete state the metres that follow from it."""
+        opened, before = self.photograph, self.state
+        if opened is None or not before.is_complete:
+            return
+        completed = await asyncio.to_thread(_placed, before, opened)
+        if completed != before and self.state == before:
+            self.project.amend(lambda _state: completed)
+            self._keep()
+
+    def camera_told(self) -> dict[str, Any] | None:
+        """Return what the picture's lines tell of its camera, or why they do not; None while they are looked at."""
+        return None if self.state.photo is None else self._cameras.get(self.state.photo)
+
+
+def _opened_photograph(path: Path) -> "tuple[OpenedPhotograph, Callable[[], SolvedCamera | str]]":
+    """Return the photograph, and what looks for its camera: it returns the camera, or the sentence why there is none."""
+    from viewfinder.studio.photograph import open_photograph, solved
+
+    with apart() as words:
+        opened, rgb = open_photograph(path)
+    for warning in words.warnings:
+        say(f"warning: {warning}", err=True)
+
+    def camera() -> "SolvedCamera | str":
+        try:
+            return solved(replace(opened.told, rgb=rgb))
+        except InputError as error:
+            return str(error)
+
+    return opened, camera
+
+
+def _placed(state: StudioState, opened: "OpenedPhotograph") -> StudioState:
+    """Return the state with its metres; as it is, where they cannot be told, which the preview then says."""
+    from viewfinder.studio.photograph import placed
+
+    with apart():
+        try:
+            return placed(state, opened)
+        except InputError:
+            return state
+
+
+def _camera_told(camera: "SolvedCamera") -> dict[str, Any]:
+    sd = f" ± {camera.pitch_sd_deg:.1f}" if camera.pitch_sd_deg > 0.05 else ""
+    way = "down" if camera.pitch_deg >= 0 else "up"
+    told = f"by the picture's lines the camera looks {way} by {abs(camera.pitch_deg):.1f}{sd}°, {camera.focal_length_35mm:.0f} mm on full frame"
+    rolled = f"; it was rolled by {camera.roll_deg:+.1f}°" if abs(camera.roll_deg) > 0.5 else ""
+    return {
+        "told": f"{told}{rolled} ({camera.confidence} confidence)",
+        "pitch_deg": round(camera.pitch_deg, 2),
+        "roll_deg": round(camera.roll_deg, 2),
+        "confidence": camera.confidence,
+    }
+
+
+def _require_glb(path: Path) -> None:
+    """Raise InputError if a file holds no object that can be drawn."""
+    from mrbokeh.scene.gltf.gltf_loader import GltfAsset
+
+    if path.read_bytes()[:4] != b"glTF":
+        raise InputError(f"{path.name} is no GLB file (it does not begin with glTF): export the object as .glb")
+    if not GltfAsset(path).scene_at(0.0).drawn_meshes:
+        raise InputError(f"{path.name} holds nothing that can be drawn: export its meshes too")
+
+
+def _harmless(name: str) -> str:
+    """Return the name of a dropped file without folders and odd characters."""
+    kept = re.sub(r"[^\w.-]+", "_", Path(name.replace("\\", "/")).name).lstrip(".-")
+    return kept[-80:] or "dropped"
+
+
+def _free(path: Path) -> Path:
+    """Return the path, or one with a number if that exists."""
+    numbered = (path.with_name(f"{path.stem}_{number}{path.suffix}") for number in range(2, 100_000))
+    return path if not path.exists() else next(each for each in numbered if not each.exists())
+
+
+async def _received(path: Path, body: AsyncIterator[bytes], most: int) -> None:
+    """Write what comes into a file. Raises InputError if it is empty or larger than allowed."""
+    size = 0
+    with path.open("xb") as file:
+        async for part in body:
+            size += len(part)
+            if size > most:
+                raise InputError(f"{path.name} is larger than the {most >> 20} MB that the studio takes: give it on the command line")
+            file.write(part)
+    if size == 0:
+        raise InputError(f"{path.name} is empty: drop another file")

@@ -1,0 +1,95 @@
+"""Running studio, from its options to the address of its page."""
+
+import asyncio
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import mrbokeh
+from mrbokeh.optics.lens_file import read_lens
+from mrbokeh.system.channel import say
+from mrbokeh.system.errors import InputError, require_file
+from viewfinder.options import ListeningOptions
+from viewfinder.server.endpoint import on_stop, open_endpoint, serving_site
+from viewfinder.server.sessions import Role
+from viewfinder.studio.desk import Desk
+from viewfinder.studio.project import Project, read_project
+from viewfinder.studio.site import StudioSite
+from viewfinder.studio.state import StudioState
+
+SHIPPED = Path(mrbokeh.__file__).parent / "demo_data" / "objects"
+_SUFFIX = ".studio.json"
+
+
+@dataclass(frozen=True)
+class StudioOptions:
+    """Options of `mrbokeh studio`. photo: may be a project file; None lets the page ask."""
+
+    photo: Path | None = None
+    object: Path | None = None
+    lenses: tuple[Path, ...] = ()
+    project: Path | None = None
+    pictures: Path = Path()
+    listening: ListeningOptions = field(default_factory=ListeningOptions)
+
+
+def project_of(options: StudioOptions) -> Project:
+    """Return the project that options name: the one that was kept, or a new one. Raises InputError for files that are not there."""
+    photo, path = options.photo, options.project
+    if photo is not None and photo.suffix.lower() == ".json":
+        if path is not None:
+            raise InputError(f"{photo} and --project {path} are both projects: give one of them")
+        photo, path = None, _there(photo, "a project file of `mrbokeh studio`")
+    if photo is not None:
+        _there(photo, "a photograph")
+    path = path or options.pictures / f"{photo.stem if photo else 'untitled'}{_SUFFIX}"
+    project = read_project(path) if path.exists() else Project(path)
+    if photo is not None and project.state.photo != photo:
+        project.add(StudioState(photo=photo, object=project.state.object, lens=project.state.lens))
+    _offer(project, options)
+    return project
+
+
+def _offer(project: Project, options: StudioOptions) -> None:
+    """Offer the objects and lenses of the options, and the shipped objects."""
+    given = [] if options.object is None else [_there(options.object, "a GLB file")]
+    if given and given[0].suffix.lower() not in (".glb", ".gltf"):
+        raise InputError(f"expected --object to be a .glb file, got {given[0]}: export the object as glTF binary")
+    for path in (*given, *sorted(SHIPPED.glob("*.glb"))):
+        project.offer(path)
+    for path in options.lenses:
+        if path.suffix.lower() != ".onnx":
+            read_lens(path)
+        project.offer(_there(path, "a lens file"))
+    if given and project.state.object != given[0]:
+        project.add(_with(project.state, given[0]))
+
+
+def _there(path: Path, expected: str) -> Path:
+    require_file(path, expected)
+    return path
+
+
+def _with(state: StudioState, glb: Path) -> StudioState:
+    return StudioState(**{**vars(state), "object": glb, "height": None})
+
+
+async def run(project: Project, options: StudioOptions, ready: Callable[[str], object] = lambda _url: None) -> None:
+    """Serve a project until Ctrl-C. ready: told the address once it answers."""
+    endpoint = open_endpoint(options.listening)
+    site = StudioSite(Desk(project, options.pictures), endpoint.access)
+    stopped = asyncio.Event()
+    on_stop(stopped.set)
+    async with serving_site(site, endpoint.host, options.listening.port, endpoint.tls) as url:
+        endpoint.announce("studio", url, (Role.CONTROL,))
+        say(f"everything is kept in {project.path}; saved pictures go to {options.pictures.absolute()}")
+        ready(url)
+        await stopped.wait()
+
+
+def serve(options: StudioOptions) -> None:
+    """Serve the studio of the options until Ctrl-C."""
+    options.listening.refuse_contradictions()
+    if options.pictures.exists() and not options.pictures.is_dir():
+        raise InputError(f"--pictures {options.pictures} is a file: expected a folder for what is saved")
+    asyncio.run(run(project_of(options), options))
