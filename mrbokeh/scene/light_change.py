@@ -10,6 +10,7 @@ caster needs anyway.
 """
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -28,6 +29,7 @@ from mrbokeh.scene.material import Material, matte
 from mrbokeh.scene.mesh import Mesh, unit
 from mrbokeh.scene.mitsuba.mitsuba_tracer import MitsubaTracer
 from mrbokeh.scene.virtual_scene import Scene, SceneRenderer
+from mrbokeh.system.resources import cores
 
 _RAYS_AT_ONCE = 1 << 18
 _WIDEST_CONE_COSINE = 0.5
@@ -125,9 +127,9 @@ def _hidden_sky(
     rng, at_once = np.random.default_rng(0), max(1, _RAYS_AT_ONCE // samples)
     # The golden lattice is as even as Sobol points, which SciPy takes a second to load.
     grid = np.stack([(np.arange(samples) + 0.5) / samples, np.arange(samples) * (5**0.5 - 1) / 2 % 1.0], axis=-1)
-    for start in range(0, len(near), at_once):
-        some = near[start : start + at_once]
-        uv = (grid + rng.random((len(some), 1, 2))) % 1.0
+
+    def lose(some: np.ndarray, shift: np.ndarray) -> None:
+        uv = (grid + shift) % 1.0
         normals = surfaces.normal[some].astype(np.float64)
         towards, weight = _drawn(objects, points_m[some], normals, sine2[some], uv)
         weight *= np.maximum(np.einsum("psk,pk->ps", towards, normals), 0.0) / np.pi
@@ -136,6 +138,11 @@ def _hidden_sky(
         light = weight[useful][:, None] * _radiance(environment, towards[useful]) * objects.hidden(origins_m, towards[useful])[:, None]
         for channel in range(3):
             lost[some, channel] = np.bincount(np.nonzero(useful)[0], light[:, channel], len(some)) / uv.shape[1]
+
+    parts = [near[start : start + at_once] for start in range(0, len(near), at_once)]
+    shifts = [rng.random((len(some), 1, 2)) for some in parts]
+    with ThreadPoolExecutor(cores()) as pool:
+        list(pool.map(lose, parts, shifts))
     return lost
 
 

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: b8a85062879c2cbce67bfc01e518f30ca88dd1571d76e8c670766e39ad26af79
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 7ca782432985bab6d263fc0b50b76c4c107886415d8efd90516291fc9b0a8b40
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: b8a85062879c2cbce67bfc01e518f30ca88dd1571d76e8c670766e39ad26af79
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 7ca782432985bab6d263fc0b50b76c4c107886415d8efd90516291fc9b0a8b40
 "use strict";
 (() => {
   // src/model.ts
@@ -523,7 +523,9 @@
   }
 
   // src/studio_ground.ts
-  var CELLS = 16;
+  var ACROSS = 5;
+  var WIDE = 40;
+  var DEEP = 50;
   var EYES_M = 1.5;
   var Ground = class {
     constructor(photo, focal_px, state) {
@@ -553,23 +555,29 @@
       const top = Math.max(0, this.horizon_px + 4e-3 * height_px);
       return [Math.min(width_px - 1, Math.max(0, x)), Math.min(height_px - 1, Math.max(Math.min(top, height_px - 1), y))];
     }
-    /** Side of a cell of the grid, metres: 1, 2 or 5 of a power of ten, near a third of the camera's height. */
+    /** Distance ahead on the ground, level, of what the lowest row shows; null where it shows no ground. */
+    get nearest_m() {
+      const y = this.photo.height_px / 2 / this.focal_px;
+      const z_m = this.distance_m(this.photo.height_px);
+      return z_m === null ? null : z_m * (this.cos - this.sin * y);
+    }
+    /** Side of a cell of the grid, metres: 1, 2 or 5 of a power of ten, about five of which fit into the lowest row. */
     get cell_m() {
-      const wanted = this.high_m / 3;
+      const z_m = this.distance_m(this.photo.height_px) ?? this.high_m;
+      const wanted = z_m * this.photo.width_px / this.focal_px / ACROSS;
       const power = 10 ** Math.floor(Math.log10(wanted));
-      return power * (wanted / power >= 5 ? 5 : wanted / power >= 2 ? 2 : 1);
+      return Number((power * (wanted / power >= 5 ? 5 : wanted / power >= 2 ? 2 : 1)).toPrecision(1));
     }
     /** The grid as the path of an SVG in pixels of the photograph. */
     grid() {
-      const cell = this.cell_m;
+      const [cell, nearest_m] = [this.cell_m, this.nearest_m];
+      if (nearest_m === null) return "";
       const lines = [];
-      const nearest = 0.15 * this.high_m;
-      for (let i = -CELLS; i <= CELLS; i++) {
-        this.line(lines, [i * cell, -CELLS * cell], [i * cell, 3 * CELLS * cell], nearest);
-      }
-      for (let j = -CELLS; j <= 3 * CELLS; j++) {
-        this.line(lines, [-CELLS * cell, j * cell], [CELLS * cell, j * cell], nearest);
-      }
+      const first = Math.floor(nearest_m / cell) - 1;
+      const cut_m = 0.02 * this.high_m;
+      const [near, far] = [first * cell, (first + DEEP) * cell];
+      for (let i = -WIDE; i <= WIDE; i++) this.line(lines, [i * cell, near], [i * cell, far], cut_m);
+      for (let j = first; j <= first + DEEP; j++) this.line(lines, [-WIDE * cell, j * cell], [WIDE * cell, j * cell], cut_m);
       return lines.join("");
     }
     /** A circle on the ground about a pixel, as the path of an SVG. */

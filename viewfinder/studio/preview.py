@@ -153,7 +153,7 @@ class Previewer:
         if self._kept is None or self._kept[0] is not wish.photograph:
             self._kept = wish.photograph, KeptParts()
         kept, began_s = self._kept[1], time.perf_counter()
-        kept.draft = wish.draft
+        kept.draft, kept.small = wish.draft, wish.photograph.scale(wish.most_px) < 1.0
         most_px = min(wish.most_px, self._draft_px) if wish.draft else wish.most_px
         preview = preview_of(wish.photograph, wish.options, kept, most_px)
         jpeg = jpeg_of(preview.rgb, _DRAFT_QUALITY if wish.draft else _QUALITY)

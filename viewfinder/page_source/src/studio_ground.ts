@@ -1,7 +1,9 @@
 // The ground that the object stands on: where a pixel meets it, and its grid drawn over the photograph.
 import type { Photo, State } from "./studio_model";
 
-const CELLS = 16;
+const ACROSS = 5;
+const WIDE = 40;
+const DEEP = 50;
 const EYES_M = 1.5;
 
 type Point = [number, number];
@@ -36,24 +38,31 @@ export class Ground {
     return [Math.min(width_px - 1, Math.max(0, x)), Math.min(height_px - 1, Math.max(Math.min(top, height_px - 1), y))];
   }
 
-  /** Side of a cell of the grid, metres: 1, 2 or 5 of a power of ten, near a third of the camera's height. */
+  /** Distance ahead on the ground, level, of what the lowest row shows; null where it shows no ground. */
+  private get nearest_m(): number | null {
+    const y = this.photo.height_px / 2 / this.focal_px;
+    const z_m = this.distance_m(this.photo.height_px);
+    return z_m === null ? null : z_m * (this.cos - this.sin * y);
+  }
+
+  /** Side of a cell of the grid, metres: 1, 2 or 5 of a power of ten, about five of which fit into the lowest row. */
   get cell_m(): number {
-    const wanted = this.high_m / 3;
+    const z_m = this.distance_m(this.photo.height_px) ?? this.high_m;
+    const wanted = (z_m * this.photo.width_px) / this.focal_px / ACROSS;
     const power = 10 ** Math.floor(Math.log10(wanted));
-    return power * (wanted / power >= 5 ? 5 : wanted / power >= 2 ? 2 : 1);
+    return Number((power * (wanted / power >= 5 ? 5 : wanted / power >= 2 ? 2 : 1)).toPrecision(1));
   }
 
   /** The grid as the path of an SVG in pixels of the photograph. */
   grid(): string {
-    const cell = this.cell_m;
+    const [cell, nearest_m] = [this.cell_m, this.nearest_m];
+    if (nearest_m === null) return "";
     const lines: string[] = [];
-    const nearest = 0.15 * this.high_m;
-    for (let i = -CELLS; i <= CELLS; i++) {
-      this.line(lines, [i * cell, -CELLS * cell], [i * cell, 3 * CELLS * cell], nearest);
-    }
-    for (let j = -CELLS; j <= 3 * CELLS; j++) {
-      this.line(lines, [-CELLS * cell, j * cell], [CELLS * cell, j * cell], nearest);
-    }
+    const first = Math.floor(nearest_m / cell) - 1;
+    const cut_m = 0.02 * this.high_m;
+    const [near, far] = [first * cell, (first + DEEP) * cell];
+    for (let i = -WIDE; i <= WIDE; i++) this.line(lines, [i * cell, near], [i * cell, far], cut_m);
+    for (let j = first; j <= first + DEEP; j++) this.line(lines, [-WIDE * cell, j * cell], [WIDE * cell, j * cell], cut_m);
     return lines.join("");
   }
 
