@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 7ca782432985bab6d263fc0b50b76c4c107886415d8efd90516291fc9b0a8b40
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 1c260cc4f79295ee3462f45a1d222894869ed501948c201565c1a6bbc136d4f8
 "use strict";
 (() => {
   // src/model.ts
@@ -355,6 +355,7 @@
       byId("redo").disabled = !told.can_redo;
       byId("camera_told").textContent = told.photo?.has_depth ? "The photograph has depth: the ground slopes as that says." : told.camera?.told ?? (told.photo ? "The camera is looked for in the picture's lines." : "");
       byId("camera_found").disabled = told.camera?.pitch_deg === void 0;
+      byId("plain").disabled = Boolean(told.photo && !told.photo.has_depth && !told.state.plain);
       byId("kept").textContent = `Everything is kept in ${told.project}`;
       this.choices();
       this.saves(told.saves);
@@ -526,6 +527,7 @@
   var ACROSS = 5;
   var WIDE = 40;
   var DEEP = 50;
+  var LEAST_APART = 8e-3;
   var EYES_M = 1.5;
   var Ground = class {
     constructor(photo, focal_px, state) {
@@ -575,9 +577,14 @@
       const lines = [];
       const first = Math.floor(nearest_m / cell) - 1;
       const cut_m = 0.02 * this.high_m;
-      const [near, far] = [first * cell, (first + DEEP) * cell];
-      for (let i = -WIDE; i <= WIDE; i++) this.line(lines, [i * cell, near], [i * cell, far], cut_m);
-      for (let j = first; j <= first + DEEP; j++) this.line(lines, [-WIDE * cell, j * cell], [WIDE * cell, j * cell], cut_m);
+      let last = first;
+      for (let row_px = Infinity; last <= first + DEEP; last++) {
+        const [, y, z] = this.seen(0, last * cell);
+        if (z > cut_m && row_px - y < LEAST_APART * this.photo.height_px) break;
+        row_px = z > cut_m ? y : row_px;
+        this.line(lines, [-WIDE * cell, last * cell], [WIDE * cell, last * cell], cut_m);
+      }
+      for (let i = -WIDE; i <= WIDE; i++) this.line(lines, [i * cell, first * cell], [i * cell, last * cell], cut_m);
       return lines.join("");
     }
     /** A circle on the ground about a pixel, as the path of an SVG. */
@@ -652,9 +659,6 @@
       const photo = studio.told?.photo ?? null;
       this.stage.hidden = !photo;
       byId2("welcome").hidden = Boolean(photo);
-      const badge = byId2("badge");
-      badge.hidden = !studio.told?.busy;
-      badge.textContent = studio.told?.busy ? `${studio.told.busy} ...` : "";
       if (!photo) return;
       const room = byId2("room").getBoundingClientRect();
       const scale = Math.min(room.width / photo.width_px, room.height / photo.height_px);
@@ -668,6 +672,13 @@
         this.before.decode().then(() => studio.isComplete || this.showPhotograph()).catch(() => void 0);
       }
       this.mark();
+    }
+    /** What is to be done next, or what the studio does. */
+    next() {
+      const [told, state] = [studio.told, studio.state];
+      if (told?.busy) return `${told.busy} ...`;
+      if (!told?.photo || !state) return "";
+      return state.object ? state.at_px ? "" : "Click where the object is to stand" : "Choose an object, or drop a GLB file";
     }
     showPhotograph() {
       this.picture.width = this.before.naturalWidth;
@@ -687,6 +698,9 @@
       const ground = groundOf(photo, state);
       const wanted = byId2("grid").getAttribute("aria-pressed") === "true";
       this.stage.classList.toggle("placed", Boolean(state?.at_px));
+      const badge = byId2("badge");
+      badge.textContent = this.next();
+      badge.hidden = !badge.textContent;
       this.ground.replaceChildren();
       if (photo) this.ground.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
       if (photo && ground && state && wanted) {

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 7ca782432985bab6d263fc0b50b76c4c107886415d8efd90516291fc9b0a8b40
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 1c260cc4f79295ee3462f45a1d222894869ed501948c201565c1a6bbc136d4f8
 "use strict";
 (() => {
   // src/model.ts

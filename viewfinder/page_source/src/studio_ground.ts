@@ -4,6 +4,8 @@ import type { Photo, State } from "./studio_model";
 const ACROSS = 5;
 const WIDE = 40;
 const DEEP = 50;
+/** Least distance of two rows of the grid, in heights of the picture. */
+const LEAST_APART = 0.008;
 const EYES_M = 1.5;
 
 type Point = [number, number];
@@ -60,9 +62,15 @@ export class Ground {
     const lines: string[] = [];
     const first = Math.floor(nearest_m / cell) - 1;
     const cut_m = 0.02 * this.high_m;
-    const [near, far] = [first * cell, (first + DEEP) * cell];
-    for (let i = -WIDE; i <= WIDE; i++) this.line(lines, [i * cell, near], [i * cell, far], cut_m);
-    for (let j = first; j <= first + DEEP; j++) this.line(lines, [-WIDE * cell, j * cell], [WIDE * cell, j * cell], cut_m);
+    let last = first;
+    // Rows that would run together are left out, and the lines along the view end with them.
+    for (let row_px = Infinity; last <= first + DEEP; last++) {
+      const [, y, z] = this.seen(0, last * cell);
+      if (z > cut_m && row_px - y < LEAST_APART * this.photo.height_px) break;
+      row_px = z > cut_m ? y : row_px;
+      this.line(lines, [-WIDE * cell, last * cell], [WIDE * cell, last * cell], cut_m);
+    }
+    for (let i = -WIDE; i <= WIDE; i++) this.line(lines, [i * cell, first * cell], [i * cell, last * cell], cut_m);
     return lines.join("");
   }
 

@@ -158,6 +158,7 @@ export class Panel {
       ? "The photograph has depth: the ground slopes as that says."
       : told.camera?.told ?? (told.photo ? "The camera is looked for in the picture's lines." : "");
     byId<HTMLButtonElement>("camera_found").disabled = told.camera?.pitch_deg === undefined;
+    byId<HTMLInputElement>("plain").disabled = Boolean(told.photo && !told.photo.has_depth && !told.state.plain);
     byId("kept").textContent = `Everything is kept in ${told.project}`;
     this.choices();
     this.saves(told.saves);

@@ -46,9 +46,6 @@ export class PictureStage {
     const photo = studio.told?.photo ?? null;
     this.stage.hidden = !photo;
     byId<HTMLElement>("welcome").hidden = Boolean(photo);
-    const badge = byId<HTMLElement>("badge");
-    badge.hidden = !studio.told?.busy;
-    badge.textContent = studio.told?.busy ? `${studio.told.busy} ...` : "";
     if (!photo) return;
     const room = byId<HTMLElement>("room").getBoundingClientRect();
     const scale = Math.min(room.width / photo.width_px, room.height / photo.height_px);
@@ -62,6 +59,14 @@ export class PictureStage {
       this.before.decode().then(() => studio.isComplete || this.showPhotograph()).catch(() => undefined);
     }
     this.mark();
+  }
+
+  /** What is to be done next, or what the studio does. */
+  private next(): string {
+    const [told, state] = [studio.told, studio.state];
+    if (told?.busy) return `${told.busy} ...`;
+    if (!told?.photo || !state) return "";
+    return state.object ? (state.at_px ? "" : "Click where the object is to stand") : "Choose an object, or drop a GLB file";
   }
 
   private showPhotograph(): void {
@@ -84,6 +89,9 @@ export class PictureStage {
     const ground = groundOf(photo, state);
     const wanted = byId<HTMLElement>("grid").getAttribute("aria-pressed") === "true";
     this.stage.classList.toggle("placed", Boolean(state?.at_px));
+    const badge = byId<HTMLElement>("badge");
+    badge.textContent = this.next();
+    badge.hidden = !badge.textContent;
     this.ground.replaceChildren();
     if (photo) this.ground.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
     if (photo && ground && state && wanted) {
