@@ -37,7 +37,12 @@ class KeptParts:
     _light: "tuple[object, tuple[Environment, tuple[Light, ...]]] | None" = None
 
     def renderer(self, filming: "Filming") -> "SceneRenderer":
-        """Return the renderer of these settings, with what it prepared for earlier pictures."""
+        """Return the renderer of these settings, with what it prepared for earlier drafts and small pictures.
+
+        A whole picture has a new one: an object that was prepared elsewhere and moved differs by the rounding of its corners.
+        """
+        if not (self.draft or self.small):
+            return filming.renderer()
         key = (filming.backend, filming.samples if filming.backend == "mitsuba" else 0, filming.denoise)
         if key not in self._renderers:
             self._renderers[key] = filming.renderer()

@@ -97,7 +97,9 @@ def _said(group: Any) -> Iterator[str]:
 
 def _option(name: str, hint: Any) -> str:
     """Return the option of a field: its first declared name, or its own."""
-    declared = [word for each in get_args(hint) for word in getattr(each, "param_decls", None) or () if word.startswith("--")]
+    # The first positional argument of `typer.Option` is a name too, where the type is annotated.
+    named = [word for each in get_args(hint) for word in (getattr(each, "default", ""), *(getattr(each, "param_decls", None) or ()))]
+    declared = [word for word in named if isinstance(word, str) and word.startswith("--")]
     return declared[0] if declared else f"--{name.rstrip('_').replace('_', '-')}"
 
 
@@ -106,7 +108,7 @@ def _word(value: Any) -> str:
 
 
 def _file(path: Path) -> str:
-    """Return a path from the working folder if it lies in it, so that a command line stays short; one that looks like an option is whole."""
+    """Return a path in the working folder by its short name; one that looks like an option is whole."""
     shown = os.path.relpath(path) if path.is_absolute() and path.is_relative_to(Path.cwd()) else str(path)
     return str(path.absolute()) if shown.startswith("-") else shown
 

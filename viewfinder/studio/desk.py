@@ -141,7 +141,8 @@ class Desk:
             self.project.write()
             self.problem = ""
         except OSError as error:
-            self.problem = f"the project could not be kept in {self.project.path} ({error.strerror}): make room, or the last changes are lost"
+            why = f"the project could not be kept in {self.project.path} ({error.strerror})"
+            self.problem = f"{why}: make room, or the last changes are lost"
         self.tell_all()
 
     def _begin(self, work: Any) -> None:
@@ -230,7 +231,8 @@ def _placed(state: StudioState, opened: "OpenedPhotograph") -> StudioState:
 def _camera_told(camera: "SolvedCamera") -> dict[str, Any]:
     sd = f" ± {camera.pitch_sd_deg:.1f}" if camera.pitch_sd_deg > 0.05 else ""
     way = "down" if camera.pitch_deg >= 0 else "up"
-    told = f"by the picture's lines the camera looks {way} by {abs(camera.pitch_deg):.1f}{sd}°, {camera.focal_length_35mm:.0f} mm on full frame"
+    told = f"by the picture's lines the camera looks {way} by {abs(camera.pitch_deg):.1f}{sd}°"
+    told += f", {camera.focal_length_35mm:.0f} mm on full frame"
     rolled = f"; it was rolled by {camera.roll_deg:+.1f}°" if abs(camera.roll_deg) > 0.5 else ""
     return {
         "told": f"{told}{rolled} ({camera.confidence} confidence)",

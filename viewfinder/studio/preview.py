@@ -2,7 +2,6 @@
 
 import logging
 import time
-from collections.abc import Callable
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from threading import Condition, Thread
@@ -121,7 +120,7 @@ class Previewer:
             dropped = self._waiting.pop(page, None)
             self._waiting[page] = wish
             self._changed.notify()
-        if dropped is not None:
+        if dropped is not None and dropped.answer.set_running_or_notify_cancel():
             dropped.answer.set_result(None)
         return wish.answer
 
@@ -133,15 +132,18 @@ class Previewer:
 
     def _work(self) -> None:
         while (wish := self._next()) is not None:
-            try:
-                made: Callable[[], None] = lambda done=self._made(wish), asked=wish: asked.answer.set_result(done)  # type: ignore[misc]
-            except InputError as error:
-                made = lambda refused=error, asked=wish: asked.answer.set_exception(refused)  # type: ignore[misc]
-            except Exception as error:
-                _log.exception("a preview failed")
-                fault = InputError(f"this is a fault of mrbokeh ({type(error).__name__}); the terminal says more")
-                made = lambda refused=fault, asked=wish: asked.answer.set_exception(refused)  # type: ignore[misc]
-            made()
+            # A page that went away has given its wish up.
+            if wish.answer.set_running_or_notify_cancel():
+                self._answer(wish)
+
+    def _answer(self, wish: Wish) -> None:
+        try:
+            wish.answer.set_result(self._made(wish))
+        except InputError as error:
+            wish.answer.set_exception(error)
+        except Exception as error:
+            _log.exception("a preview failed")
+            wish.answer.set_exception(InputError(f"this is a fault of mrbokeh ({type(error).__name__}); the terminal says more"))
 
     def _next(self) -> Wish | None:
         with self._changed:

@@ -106,7 +106,7 @@ class StudioSite:
         assert state.photo is not None
         return command_line(options_of(state), self.desk.saves.free_name(state.photo, ".png"))
 
-    async def _photo(self, request: web.Request) -> web.Response:
+    async def _photo(self, _request: web.Request) -> web.Response:
         """Handle GET /photo: the photograph as it is, as large as the largest preview."""
         from viewfinder.studio.preview import jpeg_of
 

@@ -1,0 +1,48 @@
+"""A small photograph of a floor with a wall behind it, and a studio that serves it on loopback."""
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mrbokeh.images.image_io import write_image
+from viewfinder.server.access import Access
+from viewfinder.server.endpoint import serving_site
+from viewfinder.studio.desk import Desk
+from viewfinder.studio.project import Project
+from viewfinder.studio.running import SHIPPED
+from viewfinder.studio.site import StudioSite
+from viewfinder.studio.state import StudioState
+
+WIDTH, HEIGHT = 240, 180
+CAKE, ALIEN = SHIPPED / "cakeBirthday.glb", SHIPPED / "alien.glb"
+
+
+def write_floor(path: Path, width: int = WIDTH, height: int = HEIGHT) -> Path:
+    """Write a chequered floor below a level horizon, and an even wall above it."""
+    rows, columns = np.mgrid[:height, :width] + 0.5
+    down = np.maximum(rows - height / 2, 0.5) / width
+    across, ahead = (columns - width / 2) / width / down, 1.0 / down
+    tiles = (np.floor(across) + np.floor(ahead / 2)) % 2
+    light = np.where(rows > height / 2, 0.25 + 0.35 * tiles, 0.5)
+    rgb = (light[..., None] * [1.0, 0.95, 0.85]).astype(np.float32)
+    write_image(path, rgb)
+    return path
+
+
+@dataclass
+class MadeStudio:
+    url: str
+    desk: Desk
+    folder: Path
+
+
+@asynccontextmanager
+async def made_studio(folder: Path, state: StudioState | None = None, access: Access | None = None) -> AsyncIterator[MadeStudio]:
+    """Serve a studio whose page offers the two shipped objects. state: the first one; None begins without a photograph."""
+    project = Project(folder / "kept.studio.json", [state or StudioState()], objects=[CAKE, ALIEN])
+    desk = Desk(project, folder)
+    async with serving_site(StudioSite(desk, access or Access()), "127.0.0.1", 0) as url:
+        yield MadeStudio(url, desk, folder)
