@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 1c260cc4f79295ee3462f45a1d222894869ed501948c201565c1a6bbc136d4f8
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 9fc72e163f600d617375edf3c8e9210c417514e0240f9451943a8b1302fd3d26
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 1c260cc4f79295ee3462f45a1d222894869ed501948c201565c1a6bbc136d4f8
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 9fc72e163f600d617375edf3c8e9210c417514e0240f9451943a8b1302fd3d26
 "use strict";
 (() => {
   // src/model.ts
@@ -509,7 +509,7 @@
       if (!fingers.delete(event.pointerId)) return;
       if (kind === "drag") gestures.dragEnd();
       if (kind === "tap" && event.type === "pointerup") {
-        if (event.timeStamp - lastTap_ms < TWICE_MS) gestures.twice();
+        if (event.timeStamp - lastTap_ms < TWICE_MS) gestures.twice(event.clientX, event.clientY);
         else gestures.tap(event.clientX, event.clientY);
         lastTap_ms = event.timeStamp;
       }
@@ -751,7 +751,7 @@
     gestures() {
       listen(this.stage, {
         tap: (x, y) => this.tapped(x, y),
-        twice: () => void 0,
+        twice: (x, y) => this.tapped(x, y),
         dragStart: (x, y) => {
           this.from = studio.state?.at_px ?? this.inside(this.pixel(x, y));
           this.moved = [0, 0];

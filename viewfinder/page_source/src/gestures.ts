@@ -10,7 +10,7 @@ export interface Gestures {
   dragEnd(): void;
   /** factor: of the distance of the fingers since the last call, about the point between them, which moved by (dx, dy). turn_deg: clockwise. */
   pinch(factor: number, x_px: number, y_px: number, dx_px: number, dy_px: number, turn_deg: number): void;
-  twice(): void;
+  twice(x_px: number, y_px: number): void;
 }
 
 const TAP_PX = 10;
@@ -61,7 +61,7 @@ export function listen(element: HTMLElement, gestures: Gestures): void {
     if (!fingers.delete(event.pointerId)) return;
     if (kind === "drag") gestures.dragEnd();
     if (kind === "tap" && event.type === "pointerup") {
-      if (event.timeStamp - lastTap_ms < TWICE_MS) gestures.twice();
+      if (event.timeStamp - lastTap_ms < TWICE_MS) gestures.twice(event.clientX, event.clientY);
       else gestures.tap(event.clientX, event.clientY);
       lastTap_ms = event.timeStamp;
     }

@@ -147,7 +147,7 @@ export class PictureStage {
   private gestures(): void {
     listen(this.stage, {
       tap: (x, y) => this.tapped(x, y),
-      twice: () => undefined,
+      twice: (x, y) => this.tapped(x, y),
       dragStart: (x, y) => {
         this.from = studio.state?.at_px ?? this.inside(this.pixel(x, y));
         this.moved = [0, 0];

@@ -1,0 +1,246 @@
+"""The studio's page in a real headless Chromium: hands, keys, undo, focus, light, saving, on a desk and on a phone held both ways."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from datasets_scripts.gallery.pictures import CHROMIUM, Page, chromium_page
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
+from tests.support.made_studio import ALIEN, CAKE, HEIGHT, WIDTH, MadeStudio, made_studio, write_floor
+from viewfinder.studio.state import StudioState
+
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed; the studio is tested by clients in Python only"),
+]
+DESK, UPRIGHT, LEVEL = (1280, 800), (390, 844), (844, 390)
+AXE = Path(__file__).resolve().parents[2] / "viewfinder" / "page_source" / "node_modules" / "axe-core" / "axe.min.js"
+MESSAGE = "document.getElementById('message').textContent"
+RESTS = "studio.shown && !studio.shown.draft && !studio.isChanging"
+
+
+@asynccontextmanager
+async def opened(folder: Path, size_px: tuple[int, int], state: StudioState | None = None) -> AsyncIterator[tuple[Page, MadeStudio]]:
+    """The page of a studio with a photograph, once that is opened and its camera looked for."""
+    first = state or StudioState(photo=write_floor(folder / "floor.png"), pitch_deg=0.0)
+    async with made_studio(folder, first) as made, chromium_page(made.url, folder / "profile", size_px=size_px) as page:
+        await page.comes_true("window.studio?.told?.photo && studio.told.busy === ''", 40.0)
+        yield page, made
+
+
+async def placed(page: Page, made: MadeStudio, x: float = 0.5, y: float = 0.8) -> None:
+    """Choose the cake and tap it into the picture."""
+    await page.choose("#object", str(CAKE))
+    await page.comes_true(f"studio.state.object === '{CAKE}' && !studio.isChanging")
+    await page.tap("#stage", x, y)
+    await page.comes_true("studio.state.at_px !== null && !studio.isChanging")
+    await page.comes_true(RESTS, 60.0)
+    assert made.desk.state.at_px == pytest.approx((x * WIDTH, y * HEIGHT), abs=WIDTH / 100)
+
+
+async def pressed(page: Page, key: str, times: int = 1, shift: bool = False, ctrl: bool = False) -> None:
+    """Press a key as a keyboard does."""
+    modifiers = (8 if shift else 0) | (2 if ctrl else 0)
+    for _ in range(times):
+        for kind in ("keyDown", "keyUp"):
+            await page.send(
+                "Input.dispatchKeyEvent", type=kind, key=key, modifiers=modifiers, text=key if len(key) == 1 and not ctrl else ""
+            )
+
+
+async def dragged(page: Page, start: tuple[float, float], way: tuple[float, float], mouse: bool) -> None:
+    """Drag from a point of the window along a way, with the mouse or a finger."""
+    points = [(start[0] + share * way[0], start[1] + share * way[1]) for share in np.linspace(0.0, 1.0, 9)]
+    if not mouse:
+        # As slow as a hand: Chromium takes a quick one for a fling, and the next tap for what stops it.
+        for i, (x, y) in enumerate([*points, *points[-1:] * 3]):
+            await page.send("Input.dispatchTouchEvent", type="touchMove" if i else "touchStart", touchPoints=[{"x": x, "y": y, "id": 0}])
+            await asyncio.sleep(0.03)
+        await page.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+        return
+    for kind, (x, y) in zip(("mousePressed", *["mouseMoved"] * 8), points, strict=True):
+        await page.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
+    await page.send("Input.dispatchMouseEvent", type="mouseReleased", x=points[-1][0], y=points[-1][1], button="left", clickCount=1)
+
+
+@pytest.mark.parametrize("size_px", [DESK, UPRIGHT, LEVEL], ids=["desk", "upright", "level"])
+async def test_an_object_is_placed_dragged_turned_focused_on_undone_and_saved(tmp_path: Path, size_px: tuple[int, int]) -> None:
+    async with opened(tmp_path, size_px) as (page, made):
+        assert "Choose an object" in await page.value("document.getElementById('badge').textContent")
+        left, top, width, height = await page.box("#stage")
+        assert left >= 0 and top >= 0 and left + width <= size_px[0] and top + height <= size_px[1], "without scrolling"
+        assert width / height == pytest.approx(WIDTH / HEIGHT, rel=0.01) and width > 0.4 * min(size_px)
+        assert await page.value("document.documentElement.scrollWidth") <= size_px[0]
+        await placed(page, made)
+        first = made.desk.state
+        await drag_and_undo(page, made, first, mouse=size_px == DESK)
+        await keys(page, made)
+        await focus(page, made)
+        await save(page, made)
+        assert page.errors == []
+
+
+async def drag_and_undo(page: Page, made: MadeStudio, first: StudioState, mouse: bool) -> None:
+    left, top, width, height = await page.box("#stage")
+    drafts = await page.value("studio.counts.drafts")
+    await dragged(page, (left + width / 2, top + 0.78 * height), (-0.2 * width, 0.06 * height), mouse)
+    await page.comes_true("!studio.isChanging && studio.told.can_undo")
+    assert made.desk.state.at_px == pytest.approx((0.3 * WIDTH, 0.86 * HEIGHT), abs=0.02 * WIDTH)
+    assert (made.desk.state.height, made.desk.state.camera_height_m) == (first.height, first.camera_height_m)
+    await page.comes_true(f"studio.counts.drafts > {drafts}")
+    await page.tap("#undo")
+    await page.comes_true(f"studio.state.at_px[0] === {first.at_px[0]}")  # type: ignore[index]
+    await page.tap("#redo")
+    await page.comes_true("studio.told.can_redo === false")
+    await pressed(page, "z", ctrl=True)
+    await page.comes_true("studio.told.can_redo")
+    assert made.desk.state == first
+
+
+async def keys(page: Page, made: MadeStudio) -> None:
+    before = made.desk.state
+    assert before.at_px is not None and before.height is not None
+    await page.value("document.getElementById('stage').focus()")
+    await pressed(page, "ArrowRight", 3)
+    await pressed(page, "ArrowDown", shift=True)
+    await pressed(page, "]", 2)
+    await pressed(page, "+")
+    await page.comes_true("!studio.isChanging && studio.told.state.turn_deg === 2")
+    after = made.desk.state
+    assert after.at_px == (before.at_px[0] + 3, before.at_px[1] + 10)
+    assert float(after.height or 0) == pytest.approx(1.05 * float(before.height), rel=1e-4)
+    assert made.desk.project.place == len(made.desk.project.history) - 1 and len(made.desk.project.history) == 4, "one step for all of it"
+    assert "--turn 2 " in await page.value("document.getElementById('command').textContent")
+
+
+async def focus(page: Page, made: MadeStudio) -> None:
+    """The floor at 0.7 of the height, 36 of 180 px below the level horizon, is H f / 36 px away."""
+    await page.tap("#focus_here")
+    assert "in focus" in await page.value(MESSAGE)
+    await page.tap("#stage", 0.9, 0.7)
+    await page.comes_true("studio.state.focus_m !== null && !studio.isChanging")
+    focal_px = await page.value("studio.told.photo.focal_px")
+    wanted_m = float(made.desk.state.camera_height_m or 0) * focal_px / (0.2 * HEIGHT)
+    assert made.desk.state.focus_m == pytest.approx(wanted_m, rel=0.05)
+    assert await page.value("document.getElementById('focus_here').getAttribute('aria-pressed')") == "false"
+    await page.comes_true(f"studio.shown && Math.abs(studio.shown.focus_m - {made.desk.state.focus_m}) < 0.01", 30.0)
+    await page.comes_true("document.getElementById('focus_told').textContent.includes('as chosen')")
+    await page.value("document.getElementById('focus_auto').click()")
+    await page.comes_true("studio.told.state.focus_m === null")
+
+
+async def save(page: Page, made: MadeStudio) -> None:
+    await page.tap("#to_save")
+    await page.tap("[data-format=jpeg]")
+    await page.comes_true("studio.told.saves[0]?.state === 'done'", 60.0)
+    link = "document.querySelector('#saves a')"
+    assert await page.value(f"{link}.textContent") == "Download floor_mrbokeh.jpg"
+    assert await page.value(f"fetch({link}.href).then((answer) => answer.blob()).then((blob) => blob.size)") > 2000
+    assert (made.folder / "floor_mrbokeh.jpg").is_file()
+
+
+async def test_two_fingers_scale_and_turn_and_the_wheel_too(tmp_path: Path) -> None:
+    async with opened(tmp_path, UPRIGHT) as (page, made):
+        await placed(page, made)
+        high = float(made.desk.state.height or 0)
+        left, top, width, height = await page.box("#stage")
+        x, y = left + width / 2, top + height / 2
+        # Two fingers 60 px apart come to 90 px, turned by 30 degrees.
+        steps = [(30 + 5 * i, np.radians(10 * i)) for i in range(4)]
+        await page.touch(*([(x - r * np.cos(t), y - r * np.sin(t)), (x + r * np.cos(t), y + r * np.sin(t))] for r, t in steps))
+        await page.comes_true("!studio.isChanging && Math.abs(studio.told.state.turn_deg - 30) < 3")
+        assert float(made.desk.state.height or 0) == pytest.approx(1.5 * high, rel=0.05)
+        await page.send("Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=0, deltaY=400)
+        await page.comes_true("!studio.isChanging && studio.told.state.height !== null")
+        await asyncio.sleep(0.7)
+        assert float(made.desk.state.height or 0) == pytest.approx(1.5 * high / np.e, rel=0.06)
+
+
+async def test_light_lens_and_before_are_shown(tmp_path: Path) -> None:
+    photo = write_floor(tmp_path / "floor.png")
+    async with opened(tmp_path, DESK, StudioState(photo=photo, pitch_deg=0.0)) as (page, made):
+        write_lens(tmp_path / "ring.json", Lens(35.0, 1.4, 2.0, 36.0, aperture=Aperture.ring(0.5)))
+        made.desk.project.offer(tmp_path / "ring.json")
+        made.desk.tell_all()
+        await placed(page, made)
+        await page.value("document.getElementById('dome').scrollIntoView()")
+        left, top, width, _height = await page.box("#dome")
+        # From the right, half way down to the rim of radius 100 of 110: 45 degrees above the horizon.
+        await dragged(page, (left + width / 2, top + width / 2), (0.25 * width * 100 / 110 * 0.999, 0.0), mouse=True)
+        await page.comes_true("!studio.isChanging && studio.told.state.sun_deg !== null")
+        assert made.desk.state.sun_deg == pytest.approx((90, 45), abs=2)
+        assert not await page.value("document.getElementById('sun_auto').checked")
+        await page.value("document.querySelector('#lenses img').parentElement.click()")
+        await page.comes_true(f"studio.told.state.lens === '{tmp_path / 'ring.json'}'")
+        await page.comes_true("document.querySelector('#lenses img').naturalWidth > 0")
+        await page.comes_true(RESTS, 60.0)
+        left, top, _width, _height = await page.box("#hold_before")
+        shown = "!document.getElementById('before').hidden"
+        await page.send("Input.dispatchMouseEvent", type="mousePressed", x=left + 5, y=top + 5, button="left", buttons=1, clickCount=1)
+        assert await page.value(shown)
+        await page.send("Input.dispatchMouseEvent", type="mouseReleased", x=left + 5, y=top + 5, button="left", clickCount=1)
+        assert not await page.value(shown)
+        assert page.errors == []
+
+
+async def test_refusals_are_sentences_and_another_page_is_followed(tmp_path: Path) -> None:
+    async with opened(tmp_path, DESK) as (page, made):
+        await page.tap("#stage", 0.5, 0.8)
+        assert "choose an object first" in await page.value(MESSAGE)
+        await page.value("studio.upload(new File(['v 0 0 0'], 'cake.glb')), 0")
+        await page.comes_true(f"{MESSAGE}.includes('no GLB file')")
+        await placed(page, made)
+        await page.value(
+            "document.getElementById('height').value = 'tall', document.getElementById('height').dispatchEvent(new Event('change'))"
+        )
+        await page.comes_true(f"{MESSAGE}.includes('120px')")
+        await made.desk.change({"turn_deg": 77})
+        await page.comes_true("studio.state.turn_deg === 77 && document.getElementById('turn').valueAsNumber === 77")
+        assert all("400" in each for each in page.errors), page.errors
+
+
+@pytest.mark.skipif(not AXE.is_file(), reason="axe-core is not installed: `npm ci` in viewfinder/page_source")
+@pytest.mark.parametrize("size_px", [DESK, UPRIGHT], ids=["desk", "upright"])
+async def test_the_page_is_accessible(tmp_path: Path, size_px: tuple[int, int]) -> None:
+    """WCAG 2.1 A and AA by axe-core; everything is reached by the keyboard."""
+    async with opened(tmp_path, size_px) as (page, made):
+        await placed(page, made)
+        await page.value("document.querySelectorAll('details').forEach((each) => (each.open = true))")
+        await page.value(AXE.read_text() + "; 0")
+        found = await page.value(
+            "axe.run(document, {runOnly: ['wcag2a', 'wcag2aa', 'wcag21a', 'wcag21aa']})"
+            ".then((all) => all.violations.map((each) => each.id + ': ' + each.nodes.map((node) => node.target).join(' ')))"
+        )
+        assert found == []
+        reached = set()
+        await page.value("document.activeElement.blur()")
+        for _ in range(60):
+            await page.send("Input.dispatchKeyEvent", type="keyDown", key="Tab", code="Tab", windowsVirtualKeyCode=9)
+            reached.add(
+                await page.value("document.activeElement.id || document.activeElement.dataset.format || document.activeElement.tagName")
+            )
+        wanted = {"stage", "undo", "focus_here", "grid", "hold_before", "magnify", "object", "height", "turn", "focus", "f_number"}
+        wanted |= {"sun_right", "sun_above", "exposure", "shadow", "grain", "pitch", "camera_height", "png", "copy", "open_photo"}
+        assert wanted <= reached, wanted - reached
+
+
+async def test_without_a_photograph_the_page_asks_for_one_and_takes_it(tmp_path: Path) -> None:
+    floor = write_floor(tmp_path / "floor.png")
+    async with made_studio(tmp_path) as made, chromium_page(made.url, tmp_path / "profile", size_px=UPRIGHT) as page:
+        await page.comes_true("window.studio?.told && document.getElementById('welcome').innerText.includes('Drop a photograph')")
+        document = await page.send("DOM.getDocument")
+        for selector, file in (("#open_photo", floor), ("#open_object", ALIEN)):
+            node = await page.send("DOM.querySelector", nodeId=document["root"]["nodeId"], selector=selector)
+            await page.send("DOM.setFileInputFiles", nodeId=node["nodeId"], files=[str(file)])
+            await page.comes_true(f"studio.told.state.{'object' if file is ALIEN else 'photo'}", 30.0)
+        assert made.desk.state.photo == tmp_path / "studio_files" / "floor.png"
+        await page.comes_true("studio.told.photo && studio.told.busy === ''", 40.0)
+        await page.tap("#stage", 0.5, 0.8)
+        await page.comes_true(RESTS, 60.0)
+        assert page.errors == []
