@@ -32,6 +32,7 @@ EVERYDAY = {
     "track convert": "size format overwrite",
     "viewfinder": "source demo scene board lens lan",
     "viewfinder calibrate-phone": "source phone phone-camera board out",
+    "studio": "object lens project pictures lan",
 }
 """Options of a command that most people need, which come first."""
 
@@ -53,7 +54,7 @@ PANELS = {
     "reverse-focus settle spot sweep-step timeout white-balance",
     "Tracking": "camera-model cameras delay focus-from freed lens-table longest-gap map mapper max-image-size metres-per-unit opentrackio "
     "phone phone-camera pose rig smooth steadier",
-    "The page": "captures interface lan max-rate port qr tls tls-key webcam",
+    "The page": "captures interface lan max-rate pictures port project qr tls tls-key webcam",
     "The result": "constant-rate encoding format leaks no-distortion ocio output-space overwrite save-deep save-depth "
     "save-layer sheet virtual-only allow-absent strict",
     "The work": "cluster device epochs max-width segment threads work workers",

@@ -58,6 +58,7 @@ BASES = {
     "train export": "kept_run --out lens.onnx",
     "train ablate": "stack --out table",
     "viewfinder board": "--out board.pdf",
+    "studio": "missing.jpg",
     "blender-addon": "--out addons",
 }
 """Arguments with which each command would work, or is refused late; commands that are not here get none."""

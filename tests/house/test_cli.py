@@ -28,7 +28,7 @@ COMMANDS = [
     ["lens", "fit"], ["lens", "match"], ["render"], ["composite"], ["video"], ["refocus"], ["transfer"],
     ["check"], ["blender-addon"], ["track"], ["track", "clip"], ["track", "convert"],
     ["capture", "matchmove"],
-    ["viewfinder"], ["viewfinder", "board"], ["viewfinder", "calibrate-phone"], ["demo"], ["doctor"],
+    ["viewfinder"], ["viewfinder", "board"], ["viewfinder", "calibrate-phone"], ["studio"], ["demo"], ["doctor"],
 ]  # fmt: skip
 
 

@@ -58,11 +58,11 @@ def test_tutorials_begin_with_what_comes_out() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
 def test_tutorials_run(page: Path, tmp_path: Path) -> None:
-    """All but the viewfinder, which runs until it is stopped, and what needs Mitsuba where there is none."""
+    """All but the viewfinder and the studio, which run until they are stopped, and what needs Mitsuba where there is none."""
     script = SHELL
     for language, block in re.findall(r"```(sh|python)\n(.*?)```", page.read_text(encoding="utf-8").replace("\\\n", ""), re.DOTALL):
         script += f"python <<'END'\n{block}END\n" if language == "python" else block
-    left_out = r"mrbokeh viewfinder (?!board)" + ("" if find_spec("mitsuba") else r"|python -m datasets_scripts.bokeh_stacks")
+    left_out = r"mrbokeh studio|mrbokeh viewfinder (?!board)" + ("" if find_spec("mitsuba") else r"|python -m datasets_scripts.bokeh_stacks")
     script = re.sub(rf"^(?:{left_out}).*\n", "", script, flags=re.MULTILINE)
     environment = os.environ | {"PYTHON": sys.executable, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(["bash", "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True)
