@@ -1,4 +1,4 @@
-"""What several pictures of one photograph have in common, so that the second is made sooner: opened files, prepared scenes, light."""
+"""Parts that several pictures of one photograph share, so that the second is made sooner: opened files, prepared scenes, light."""
 
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING

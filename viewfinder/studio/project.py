@@ -83,7 +83,8 @@ def read_project(path: Path) -> Project:
         objects, lenses = ([_found(Path(each), folder) for each in document.get(name) or ()] for name in ("objects", "lenses"))
     except (InputError, TypeError) as error:
         raise InputError(f"expected {_EXPECTED} at {path}, but: {error}") from None
-    project = Project(path, history, place, [each for each in objects if each.is_file()], [each for each in lenses if each.is_file()])
+    there = {name: [each for each in files if each.is_file()] for name, files in (("objects", objects), ("lenses", lenses))}
+    project = Project(path, history, place, **there)
     for name in _PATHS:
         if (file := getattr(project.state, name)) is not None and not file.is_file():
             raise InputError(f"{path} has the {name} {file}, which is not there any more: put it back, or begin anew without the project")

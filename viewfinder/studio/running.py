@@ -39,8 +39,8 @@ def project_of(options: StudioOptions) -> Project:
     if photo is not None and photo.suffix.lower() == ".json":
         if path is not None:
             raise InputError(f"{photo} and --project {path} are both projects: give one of them")
-        photo, path = None, _there(photo, "a project file of `mrbokeh studio`")
-    if photo is not None:
+        path, photo = _there(photo, "a project file of `mrbokeh studio`"), None
+    elif photo is not None:
         _there(photo, "a photograph")
     path = path or options.pictures / f"{photo.stem if photo else 'untitled'}{_SUFFIX}"
     project = read_project(path) if path.exists() else Project(path)
