@@ -167,9 +167,10 @@ def blur_told(plate: Plate, sharp: Sequence[Layer]) -> tuple[str, dict[str, Any]
     unit = GUESSED if plate.metres_guessed else "m"
     told = f"{plate.blur_from}," if plate.blur_from else f"{lens.focal_length_mm:.4g} mm f/{lens.f_number:.3g}"
     told += f" focused at {f'{lens.focus_distance_m:.3g} {GUESSED}' if plate.metres_guessed else lens.focus_described}"
-    seen_m = np.concatenate(
-        [np.empty(0, np.float32), *(layer.depth_m[(layer.alpha > 0.5) & np.isfinite(layer.depth_m)] for layer in sharp)]
-    )
+    seen_m = np.full(plate.rgb.shape[:2], np.inf, np.float32)
+    for layer in reversed(sharp):
+        seen_m[layer.alpha > 0.5] = layer.depth_m[layer.alpha > 0.5]
+    seen_m = seen_m[np.isfinite(seen_m)]
     known = {} if plate.blur_from or plate.metres_guessed else lens.facts
     if not len(seen_m):
         return told, known, {}
