@@ -51,13 +51,12 @@ def composite(
         check_outputs,
         layers_by,
         nothing_seen,
-        on_level_ground,
-        pair_of,
         placing_warning,
         plate_by,
         require_options_of_stacks,
         write_results,
     )
+    from mrbokeh.commands._level_ground import on_level_ground, pair_of, with_camera_of_file
     from mrbokeh.compositing.choose import best_mode, insertion_of
     from mrbokeh.compositing.ground import with_ground_behind
     from mrbokeh.compositing.plate_look.finishing import finished, finishing_of
@@ -91,8 +90,11 @@ def composite(
         plate = open_focused(focus_m=focused_at_pixel(plate.lens, plate.depth_m, optics.focus_at).focus_distance_m)
     _tell_metres(photo, virtual, standing, lens)
     guess(plate.depth_note)
+    known_height_m = None
+    if virtual.camera is not None and standing.object_ is not None and virtual.scene is None:
+        plate, known_height_m = with_camera_of_file(plate, virtual.camera)
     if on_ground and plate.depth_m is None:
-        plate, standing = on_level_ground(plate, standing)
+        plate, standing = on_level_ground(plate, standing, known_height_m)
     layers_for = layers_by(virtual, standing, rendering, plate, bundle)
     mode = virtual.mode or best_mode(plate)
     insertion = insertion_of(mode, taken.near_distance, exact_depth=taken.exact_depth)

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 from mrbokeh.depth.depth_map import DepthSettings
 from mrbokeh.depth.open_depth import open_depth
@@ -47,7 +47,8 @@ class Plate:
     alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
     depth_note: what is known and what is guessed of a phone's own depth and focus, in words.
     metres_guessed: of a stack that knows no focus distance; blur is right in pixels all the same. blur_from: where the lens has its blur
-        from, in words, if its focal length and f-number are made up. focus_known: False where nothing tells it.
+        from, in words, if its focal length and f-number are made up. focus_known: False where nothing tells it. view_known: False where the
+        field of view is guessed. world_from_camera: (3, 3) turns camera axes into upright ones, where that is known.
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -60,6 +61,8 @@ class Plate:
     metres_guessed: bool = False
     blur_from: str = ""
     focus_known: bool = True
+    view_known: bool = True
+    world_from_camera: Float[np.ndarray, "3 3"] | None = None
     depth_note: str = ""
 
     def __post_init__(self) -> None:
@@ -125,9 +128,10 @@ def open_plate(
     if slice_index is not None:
         raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}: leave it out")
     photograph, phone = read_photograph(photo).stating(facts or {}), _phone(photo)
-    blur_from, focus_known = "", True
+    blur_from, focus_known, view_known = "", True, True
     is_focus_guessed = phone is not None and phone.focus is not None and bool(phone.focus.note) and lens is None and focus_m is None
     if guessing and lens is None and phone is None:
+        view_known = photograph.focal_length_mm is not None and photograph.sensor_width_mm is not None
         photograph, guesses = photograph.guessing()
         guess(f"{photo} does not tell its lens, which is guessed: {guesses}" if guesses else "")
         focus_known = focus_m is not None or photograph.focus_distance_m is not None
@@ -140,7 +144,7 @@ def open_plate(
     focused = lens if focus_m is None else lens.focused_at(focus_m)
     plate = with_own_alpha(plate_of(photograph.rgb, focused), photo, read_alpha(photo, photograph.orientation))
     if phone is None:
-        return replace(plate, focus_known=focus_known)
+        return replace(plate, focus_known=focus_known, view_known=view_known)
     original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
     note = f"{photo}: {phone.depth.note}" + (f"; {phone.focus.note}" if phone.focus is not None and is_focus_guessed else "")
     return replace(with_depth(plate, photo, DepthSettings()), sharp_rgb=original, blur_from=blur_from, depth_note=note)
