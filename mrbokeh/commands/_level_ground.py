@@ -19,6 +19,7 @@ HIGH_SHARE = 0.25
 """Share of the picture's height that an object takes whose size is neither told nor known."""
 _EYES_M, _LOWEST_M, _HIGHEST_M, _FARTHEST_M = 1.5, 0.15, 5.0, 100.0
 """Height of a camera in the hand; heights that are believed where the focus distance is taken for that of the ground; and its farthest."""
+_BELOW_DEG, _BELOW_SHARE, _BELOW_M = 10.0, 0.5, 1.2
 _SAME_SHAPE = 0.01
 
 
@@ -57,10 +58,13 @@ def on_level_ground(plate: Plate, standing: ObjectOptions, known_height_m: float
         plate = replace(plate, world_from_camera=looking_down(math.radians(standing.pitch)))
     elif plate.world_from_camera is None:
         plate = _by_lines(plate)
-    if plate.world_from_camera is None:
-        plate = replace(plate, world_from_camera=np.eye(3))
-        taken.append("the camera to be level (--pitch DEGREES says how far it looks down)")
     ray = plate.camera.unproject(np.array([x_px, y_px]), np.array(1.0))
+    if plate.world_from_camera is None:
+        down_rad = 0.0 if standing.plain else _usual_tilt_rad(plate, ray)
+        down_rad = down_rad if math.degrees(down_rad) >= 1.0 else 0.0
+        plate = replace(plate, world_from_camera=looking_down(down_rad))
+        held = f"to look down by {math.degrees(down_rad):.0f} degrees" if down_rad else "to be level"
+        taken.append(f"the camera {held} (--pitch DEGREES)")
     nearest_m = _ground_m(plate, ray, standing)
     height_m, told = _camera_height_m(plate, standing.camera_height or known_height_m, nearest_m)
     distance_m = height_m * nearest_m
@@ -75,6 +79,17 @@ def on_level_ground(plate: Plate, standing: ObjectOptions, known_height_m: float
         guess(f"the object is made {height} high, a quarter of the picture (--height METRES or such as 300px)")
     place = ",".join(f"{each:.9g}" for each in distance_m * ray)
     return plate, replace(standing, at=place, at_pixel=None, height=height)
+
+
+def _usual_tilt_rad(plate: Plate, ray: Float[np.ndarray, "3"]) -> float:
+    """Return how far a camera usually looks down where nothing tells: 0 if the ground at a ray then lies deep enough below the horizon.
+
+    That is 10 degrees, or for ground at the focus so many that it is 1.2 m, or half its distance, below the camera.
+    """
+    below_rad = math.radians(_BELOW_DEG)
+    if plate.focus_known and plate.lens.focus_distance_m < _FARTHEST_M:
+        below_rad = math.asin(min(_BELOW_SHARE, _BELOW_M / plate.lens.focus_distance_m))
+    return max(0.0, below_rad - math.atan(float(ray[1])))
 
 
 def _ground_m(plate: Plate, ray: Float[np.ndarray, "3"], standing: ObjectOptions) -> float:

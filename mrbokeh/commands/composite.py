@@ -13,7 +13,8 @@ from mrbokeh.system.channel import guess, say, tell, warn
 
 if TYPE_CHECKING:
     from mrbokeh.commands._composite_parts import LayersFor
-    from mrbokeh.compositing.plate import Insertion
+    from mrbokeh.compositing.plate import Insertion, Plate
+    from mrbokeh.compositing.plate_look.finishing import Finishing
     from mrbokeh.optics.lens import Lens
     from mrbokeh.renderers.base import Renderer
 
@@ -59,7 +60,7 @@ def composite(
     from mrbokeh.commands._level_ground import on_level_ground, pair_of, with_camera_of_file
     from mrbokeh.compositing.choose import best_mode, insertion_of
     from mrbokeh.compositing.ground import with_ground_behind
-    from mrbokeh.compositing.plate_look.finishing import finished, finishing_of
+    from mrbokeh.compositing.plate_look.finishing import finished
     from mrbokeh.renderers.choose import lens_and_renderer
     from mrbokeh.stacks.capture_bundle import is_bundle, read_bundle
     from mrbokeh.system.console import working
@@ -101,7 +102,7 @@ def composite(
     if taken.all_slices:
         _into_all_slices(photo, out, layers_for, insertion, renderer, lens)
         return
-    finishing = finishing_of(look.wanted, plate.rgb, None if photo.is_dir() else photo)
+    finishing = _finishing(photo, plate, look, matching=standing.object_ is not None and not standing.plain)
     sharp = layers_for(plate)
     if not any((layer.alpha > 0).any() for layer in sharp):
         nothing_seen(standing, virtual)
@@ -116,6 +117,17 @@ def composite(
         warn(lost)
     told, known, figures = blur_told(plate, sharp)
     tell(f"wrote {out} ({mode}; {told})", known, mode=mode, **figures)
+
+
+def _finishing(photo: Path, plate: "Plate", look: LookGroup, *, matching: bool) -> "Finishing":
+    """Return what makes virtual light look photographed: as told, and of a photograph in a file also as it is."""
+    from mrbokeh.compositing.plate_look.finishing import finishing_of, matched_finishing
+
+    if photo.is_dir() or not matching:
+        return finishing_of(look.wanted, plate.rgb, None if photo.is_dir() else photo)
+    finishing, matched = matched_finishing(look.wanted, plate.rgb, photo)
+    guess(f"black and grain are matched to the photograph ({' off, '.join(matched)} off)" if matched else "")
+    return finishing
 
 
 def _tell_metres(photo: Path, virtual: VirtualOptions, standing: options.ObjectOptions, lens: "Lens | None") -> None:

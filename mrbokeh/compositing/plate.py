@@ -131,8 +131,9 @@ def open_plate(
     blur_from, focus_known, view_known = "", True, True
     is_focus_guessed = phone is not None and phone.focus is not None and bool(phone.focus.note) and lens is None and focus_m is None
     if guessing and lens is None and phone is None:
-        view_known = photograph.focal_length_mm is not None and photograph.sensor_width_mm is not None
+        stated = (photograph.focal_length_mm, photograph.sensor_width_mm)
         photograph, guesses = photograph.guessing()
+        view_known = stated == (photograph.focal_length_mm, photograph.sensor_width_mm)
         guess(f"{photo} does not tell its lens, which is guessed: {guesses}" if guesses else "")
         focus_known = focus_m is not None or photograph.focus_distance_m is not None
         photograph = photograph if focus_known else replace(photograph, focus_distance_m=float("inf"))
