@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 SunDegrees = tuple[float, float]
 
-_DRAFT_EDGES, _DRAFT_SAMPLES, _DRAFT_PX, _SMALL_PX = 4, 16, 4_000, 20_000
+_DRAFT_EDGES, _DRAFT_SAMPLES, _DRAFT_PX = 4, 32, 4_000
 
 
 @dataclass
@@ -25,8 +25,8 @@ class KeptParts:
     """Parts that are kept from picture to picture; for one thread and one photograph.
 
     draft: while True, pictures are made in a hurry, as while an object is dragged: the last place's light serves every place, edges have
-    fewer steps, and light on the ground is computed in few pixels. small: while True, that light is computed in fewer pixels only, as is
-    enough for a picture made smaller.
+    fewer steps, and light on the ground is computed in few pixels. small: while True, objects that were prepared are only moved, which
+    differs by rounding, as nobody sees in a picture made smaller.
     """
 
     assets: Assets = field(default_factory=Assets)
@@ -50,10 +50,10 @@ class KeptParts:
         return whole.with_quality(_DRAFT_EDGES) if self.draft and isinstance(whole, EmbreeRaycaster) else whole
 
     def filming(self, filming: "Filming") -> "Filming":
-        """Return the settings of a draft, or of a small picture, while one is made."""
-        if filming.backend == "mitsuba" or not (self.draft or self.small):
+        """Return the settings of a draft while one is made."""
+        if filming.backend == "mitsuba" or not self.draft:
             return filming
-        return replace(filming, samples=_DRAFT_SAMPLES, change_px=_DRAFT_PX) if self.draft else replace(filming, change_px=_SMALL_PX)
+        return replace(filming, samples=_DRAFT_SAMPLES, change_px=_DRAFT_PX, finer_change=False)
 
     def light(
         self, plate: Plate, foot_px: tuple[float, float], world_from_camera: np.ndarray, sun_degrees: SunDegrees | None

@@ -102,7 +102,7 @@ class ObjectOptions:
     shadow: Annotated[
         float | None, typer.Option(min=0.0, max=1.0, help="Darkness of the object's shadow; 1, the default, is what its light gives.")
     ] = None
-    plain: Annotated[bool, typer.Option("--plain", help="Guess neither light nor ground: even light, no shadow, a level camera.")] = False
+    plain: Annotated[bool, typer.Option("--plain", help="Guess nothing: even light, no shadow, a level camera, no grain.")] = False
 
 
 @dataclass(frozen=True)

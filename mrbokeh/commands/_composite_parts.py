@@ -12,6 +12,7 @@ import numpy as np
 
 from mrbokeh.commands._composite_options import LensOptions, ObjectOptions, PlateOptions, RenderingOptions, ResultOptions
 from mrbokeh.commands._insertion_options import ColourOptions, LookGroup, VirtualOptions, near_far_of
+from mrbokeh.commands._level_ground import HIGH_SHARE, pair_of
 from mrbokeh.compositing.ground import ended_shadow, ground_under
 from mrbokeh.compositing.near_and_far import nearer_than
 from mrbokeh.compositing.plate import (
@@ -32,7 +33,7 @@ from mrbokeh.images.image_io import INTEGER_SUFFIXES, require_suffix
 from mrbokeh.images.layer import Layer, flatten
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
-from mrbokeh.scene.staging.scene_description import SceneDescription
+from mrbokeh.scene.staging.scene_description import SceneDescription, looking_down
 from mrbokeh.stacks.capture_bundle import CaptureBundle
 from mrbokeh.stacks.guessed_metres import GUESSED
 from mrbokeh.stacks.photograph import read_photograph
@@ -80,43 +81,6 @@ def plate_by(
         if own is not None and plate.blur_from and before_m is not None:
             plate = with_blur_in_metres(plate, before_m, focus_m)
     return plate if options.matte is None else with_matte(plate, options.matte)
-
-
-def on_level_ground(plate: Plate, standing: ObjectOptions) -> tuple[Plate, ObjectOptions]:
-    """Return the plate, focused on the foot where nothing tells its focus, and the options with the foot's place on level ground."""
-    from mrbokeh.scene.staging.scene_description import looking_down
-
-    x_px, y_px = pair_of(standing.at_pixel)
-    if not (0 <= x_px < plate.camera.width_px and 0 <= y_px < plate.camera.height_px):
-        size = f"{plate.camera.width_px}x{plate.camera.height_px} px"
-        raise InputError(f"pixel {x_px:g},{y_px:g} lies outside the photograph of {size}: choose one within")
-    pitch_deg = standing.pitch or 0.0
-    ray = plate.camera.unproject(np.array([x_px, y_px]), np.array(1.0))
-    falls = float(looking_down(math.radians(pitch_deg))[1] @ ray)
-    if falls <= 0.0:
-        raise InputError(
-            f"--at-pixel {standing.at_pixel} lies above the horizon of a camera that looks down by {pitch_deg:g} degrees: choose a lower "
-            f"pixel, say how far the camera looks down with --pitch DEGREES, or give --depth"
-        )
-    distance_m = 1.0 / falls
-    at_focus = standing.camera_height is None and plate.focus_known and plate.lens.focus_distance_m < _FARTHEST_M
-    height_m = plate.lens.focus_distance_m / distance_m if at_focus else standing.camera_height or _EYES_M
-    distance_m *= height_m
-    taken = ["the camera to be level (--pitch DEGREES says how far it looks down)"] * (standing.pitch is None)
-    if at_focus:
-        taken.append(f"the object to stand where the lens is focused, {distance_m:.3g} m away (--camera-height METRES)")
-    elif standing.camera_height is None:
-        taken.append(f"the camera to be {_EYES_M:g} m above the ground (--camera-height METRES)")
-    if not plate.focus_known:
-        taken.append(f"the focus to be on the object, {distance_m:.3g} m away (--focus METRES)")
-        plate = replace(plate, lens=plate.lens.focused_at(distance_m))
-    guess(f"there is no depth: mrbokeh takes {', '.join(taken)}" if taken else "")
-    height = standing.height
-    if height is None:
-        height = f"{_HIGH_SHARE * plate.rgb.shape[0]:.0f}px"
-        guess(f"the object is made {height} high, a quarter of the picture (--height METRES or such as 300px)")
-    place = ",".join(f"{each:.9g}" for each in distance_m * ray)
-    return plate, replace(standing, at=place, at_pixel=None, pitch=pitch_deg, height=height)
 
 
 def _from_space(plate: Plate, photo: Path, space: NamedSpace) -> Plate:
@@ -167,9 +131,10 @@ def blur_told(plate: Plate, sharp: Sequence[Layer]) -> tuple[str, dict[str, Any]
     unit = GUESSED if plate.metres_guessed else "m"
     told = f"{plate.blur_from}," if plate.blur_from else f"{lens.focal_length_mm:.4g} mm f/{lens.f_number:.3g}"
     told += f" focused at {f'{lens.focus_distance_m:.3g} {GUESSED}' if plate.metres_guessed else lens.focus_described}"
-    seen_m = np.concatenate(
-        [np.empty(0, np.float32), *(layer.depth_m[(layer.alpha > 0.5) & np.isfinite(layer.depth_m)] for layer in sharp)]
-    )
+    seen_m = np.full(plate.rgb.shape[:2], np.inf, np.float32)
+    for layer in reversed(sharp):
+        seen_m[layer.alpha > 0.5] = layer.depth_m[layer.alpha > 0.5]
+    seen_m = seen_m[np.isfinite(seen_m)]
     known = {} if plate.blur_from or plate.metres_guessed else lens.facts
     if not len(seen_m):
         return told, known, {}
@@ -283,12 +248,8 @@ if TYPE_CHECKING:
 
 _COVERED = 0.5
 _HIGHEST, _NEARER, _MUCH_HIDDEN = 20.0, 0.03, 0.4
-_EYES_M, _FARTHEST_M = 1.5, 100.0
-"""Height of a camera in the hand, where nothing tells it, and the farthest focus that tells where an object stands."""
 _DARK = 0.6
 """How dark the shadow of a light is, where nothing tells."""
-_HIGH_SHARE = 0.25
-"""Share of the picture's height that an object takes whose size is neither told nor known."""
 
 LayersFor = Callable[[Plate], list[Layer]]
 """The same scene for every plate of one view: sharp layers, front first."""
@@ -410,15 +371,17 @@ def _pixel_of(camera: Camera, place_m: tuple[float, float, float]) -> tuple[floa
 
 
 def _upright(options: ObjectOptions, plate: Plate, foot_px: tuple[float, float]) -> np.ndarray:
-    """Return the rotation from camera axes to upright ones: as told, by the ground at the foot, or none."""
-    from mrbokeh.scene.staging.scene_description import looking_down
-
-    if options.pitch is not None or options.plain or not options.at_pixel:
-        return looking_down(math.radians(options.pitch or 0.0))
+    """Return the rotation from camera axes to upright ones: as told, as known of the plate, by the ground at the foot, or none."""
+    if options.pitch is not None:
+        return looking_down(math.radians(options.pitch))
+    if plate.world_from_camera is not None:
+        return plate.world_from_camera
+    if options.plain or not options.at_pixel:
+        return np.eye(3)
     found = ground_under(plate, foot_px)
     if found is None:
         guess("the depth around the foot is no ground with a slope: a level camera is taken (--pitch DEGREES says how far it looks down)")
-        return looking_down(0.0)
+        return np.eye(3)
     down_deg = math.degrees(math.asin(float(np.clip(found[1, 2], -1.0, 1.0))))
     guess(f"by the depth around the foot the camera looks down by {down_deg:.0f} degrees (else --pitch DEGREES)")
     return found
@@ -456,7 +419,7 @@ def _sun_degrees(text: str) -> tuple[float, float]:
 def _height_m(text: str | None, plate: Plate, depth_m: float) -> float | None:
     """Return metres as told, or of so many pixels at that depth; None keeps the size of the file, unless metres are guessed."""
     if text is None:
-        return plate.length_m(_HIGH_SHARE * plate.rgb.shape[0], depth_m) if plate.metres_guessed else None
+        return plate.length_m(HIGH_SHARE * plate.rgb.shape[0], depth_m) if plate.metres_guessed else None
     try:
         number = float(text.removesuffix("px"))
     except ValueError:
@@ -512,10 +475,3 @@ def _triple(text: str) -> tuple[float, float, float]:
     if not z_m > 0.0:
         raise InputError(f"--at: expected a place in front of the lens, with Z above 0 m, got {text!r}")
     return x_m, y_m, z_m
-
-
-def pair_of(at_pixel: str | None) -> tuple[float, float]:
-    if at_pixel is None:
-        raise InputError("where does the object stand? Give --at X,Y,Z in metres, or --at-pixel X,Y")
-    x_px, y_px = numbers_in(at_pixel, "--at-pixel expects 2 numbers with commas between", (2,))
-    return x_px, y_px

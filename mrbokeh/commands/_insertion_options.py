@@ -59,7 +59,7 @@ class VirtualOptions:
         typer.Option(
             metavar="CAMERA",
             help="For --scene: a fixed camera (JSON) or a track (JSON, .chan, nerfstudio, COLMAP, OpenTrackIO); in a photograph by "
-            "default one that looks along z from the origin.",
+            "default one that looks along z from the origin. For an --object in a photograph: the camera of `mrbokeh capture solve`.",
         ),
     ] = None
     mode: Annotated[

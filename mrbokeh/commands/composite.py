@@ -13,7 +13,8 @@ from mrbokeh.system.channel import guess, say, tell, warn
 
 if TYPE_CHECKING:
     from mrbokeh.commands._composite_parts import LayersFor
-    from mrbokeh.compositing.plate import Insertion
+    from mrbokeh.compositing.plate import Insertion, Plate
+    from mrbokeh.compositing.plate_look.finishing import Finishing
     from mrbokeh.optics.lens import Lens
     from mrbokeh.renderers.base import Renderer
 
@@ -51,16 +52,15 @@ def composite(
         check_outputs,
         layers_by,
         nothing_seen,
-        on_level_ground,
-        pair_of,
         placing_warning,
         plate_by,
         require_options_of_stacks,
         write_results,
     )
+    from mrbokeh.commands._level_ground import on_level_ground, pair_of, with_camera_of_file
     from mrbokeh.compositing.choose import best_mode, insertion_of
     from mrbokeh.compositing.ground import with_ground_behind
-    from mrbokeh.compositing.plate_look.finishing import finished, finishing_of
+    from mrbokeh.compositing.plate_look.finishing import finished
     from mrbokeh.renderers.choose import lens_and_renderer
     from mrbokeh.stacks.capture_bundle import is_bundle, read_bundle
     from mrbokeh.system.console import working
@@ -91,15 +91,18 @@ def composite(
         plate = open_focused(focus_m=focused_at_pixel(plate.lens, plate.depth_m, optics.focus_at).focus_distance_m)
     _tell_metres(photo, virtual, standing, lens)
     guess(plate.depth_note)
+    known_height_m = None
+    if virtual.camera is not None and standing.object_ is not None and virtual.scene is None:
+        plate, known_height_m = with_camera_of_file(plate, virtual.camera)
     if on_ground and plate.depth_m is None:
-        plate, standing = on_level_ground(plate, standing)
+        plate, standing = on_level_ground(plate, standing, known_height_m)
     layers_for = layers_by(virtual, standing, rendering, plate, bundle)
     mode = virtual.mode or best_mode(plate)
     insertion = insertion_of(mode, taken.near_distance, exact_depth=taken.exact_depth)
     if taken.all_slices:
         _into_all_slices(photo, out, layers_for, insertion, renderer, lens)
         return
-    finishing = finishing_of(look.wanted, plate.rgb, None if photo.is_dir() else photo)
+    finishing = _finishing(photo, plate, look, matching=standing.object_ is not None and not standing.plain)
     sharp = layers_for(plate)
     if not any((layer.alpha > 0).any() for layer in sharp):
         nothing_seen(standing, virtual)
@@ -114,6 +117,17 @@ def composite(
         warn(lost)
     told, known, figures = blur_told(plate, sharp)
     tell(f"wrote {out} ({mode}; {told})", known, mode=mode, **figures)
+
+
+def _finishing(photo: Path, plate: "Plate", look: LookGroup, *, matching: bool) -> "Finishing":
+    """Return what makes virtual light look photographed: as told, and of a photograph in a file also as it is."""
+    from mrbokeh.compositing.plate_look.finishing import finishing_of, matched_finishing
+
+    if photo.is_dir() or not matching:
+        return finishing_of(look.wanted, plate.rgb, None if photo.is_dir() else photo)
+    finishing, matched = matched_finishing(look.wanted, plate.rgb, photo)
+    guess(f"black and grain are matched to the photograph ({' off, '.join(matched)} off)" if matched else "")
+    return finishing
 
 
 def _tell_metres(photo: Path, virtual: VirtualOptions, standing: options.ObjectOptions, lens: "Lens | None") -> None:

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Float32
 
 from mrbokeh.compositing.plate import Plate
 from mrbokeh.images.layer import Layer
+from mrbokeh.scene.staging.scene_description import looking_down
 
 _SAME_SURFACE, _SURELY_SAME = 0.02, 0.01
 """Largest shares by which depth changes from pixel to pixel of one surface: along a table, and where no edge may be missed."""
@@ -41,8 +42,7 @@ def ground_under(plate: Plate, foot_px: tuple[float, float]) -> Float[np.ndarray
     normal = _plane_of(rays, near)
     if normal is None or normal[1] >= -np.cos(np.radians(_STEEPEST_DEG)) or abs(normal[0]) > -normal[1] * np.tan(np.radians(_ROLL_DEG)):
         return None
-    _, y, z = -normal / np.hypot(normal[1], normal[2])
-    return np.array([[1.0, 0.0, 0.0], [0.0, y, z], [0.0, -z, y]])
+    return looking_down(float(np.arctan2(-normal[2], -normal[1])))
 
 
 def _plane_of(rays: Float[np.ndarray, "points 3"], near: Float[np.ndarray, " points"]) -> Float[np.ndarray, "3"] | None:

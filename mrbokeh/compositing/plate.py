@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 from mrbokeh.depth.depth_map import DepthSettings
 from mrbokeh.depth.open_depth import open_depth
@@ -47,7 +47,8 @@ class Plate:
     alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
     depth_note: what is known and what is guessed of a phone's own depth and focus, in words.
     metres_guessed: of a stack that knows no focus distance; blur is right in pixels all the same. blur_from: where the lens has its blur
-        from, in words, if its focal length and f-number are made up. focus_known: False where nothing tells it.
+        from, in words, if its focal length and f-number are made up. focus_known: False where nothing tells it. view_known: False where the
+        field of view is guessed. world_from_camera: (3, 3) turns camera axes into upright ones, where that is known.
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -60,6 +61,8 @@ class Plate:
     metres_guessed: bool = False
     blur_from: str = ""
     focus_known: bool = True
+    view_known: bool = True
+    world_from_camera: Float[np.ndarray, "3 3"] | None = None
     depth_note: str = ""
 
     def __post_init__(self) -> None:
@@ -132,7 +135,7 @@ def photograph_plate(photo: Path, photograph: Photograph, phone: PhonePhoto | No
     held = held_lens(photo, photograph, phone, wishes)
     plate = with_own_alpha(plate_of(photograph.rgb, held.lens), photo, read_alpha(photo, photograph.orientation))
     if phone is None:
-        return replace(plate, focus_known=held.focus_known)
+        return replace(plate, focus_known=held.focus_known, view_known=held.view_known)
     original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
     is_focus_guessed = phone.focus is not None and bool(phone.focus.note) and wishes.lens is None and wishes.focus_m is None
     note = f"{photo}: {phone.depth.note}" + (f"; {phone.focus.note}" if phone.focus is not None and is_focus_guessed else "")
@@ -151,20 +154,23 @@ class LensWishes:
 
 @dataclass(frozen=True)
 class HeldLens:
-    """Lens of a photograph. blur_from, focus_known: as in `Plate`."""
+    """Lens of a photograph. blur_from, focus_known, view_known: as in `Plate`."""
 
     lens: Lens
     blur_from: str = ""
     focus_known: bool = True
+    view_known: bool = True
 
 
 def held_lens(photo: Path, photograph: Photograph, phone: PhonePhoto | None, wishes: LensWishes) -> HeldLens:
     """Return the lens of a photograph in a file, by what the file states and what is wished; only the size of its rgb counts."""
     lens, focus_m = wishes.lens, wishes.focus_m
     photograph = photograph.stating(wishes.facts)
-    blur_from, focus_known = "", True
+    blur_from, focus_known, view_known = "", True, True
     if wishes.guessing and lens is None and phone is None:
+        stated = (photograph.focal_length_mm, photograph.sensor_width_mm)
         photograph, guesses = photograph.guessing()
+        view_known = stated == (photograph.focal_length_mm, photograph.sensor_width_mm)
         guess(f"{photo} does not tell its lens, which is guessed: {guesses}" if guesses else "")
         focus_known = focus_m is not None or photograph.focus_distance_m is not None
         photograph = photograph if focus_known else replace(photograph, focus_distance_m=float("inf"))
@@ -173,7 +179,7 @@ def held_lens(photo: Path, photograph: Photograph, phone: PhonePhoto | None, wis
     elif phone is not None and phone.focus is not None and photograph.focus_distance_m is None:
         photograph = replace(photograph, focus_distance_m=phone.focus.focus_distance_m)
     lens = photograph.lens(photo, focus_m) if lens is None else lens_for_photograph(lens, photograph, photo)
-    return HeldLens(lens if focus_m is None else lens.focused_at(focus_m), blur_from, focus_known)
+    return HeldLens(lens if focus_m is None else lens.focused_at(focus_m), blur_from, focus_known, view_known)
 
 
 def phone_photo(photo: Path) -> PhonePhoto | None:

@@ -61,12 +61,13 @@ def srgb_codes(rgb: Float32[np.ndarray, "height width channels"], dtype: type) -
     first, thresholds, most = _table(np.dtype(dtype))
 
     def work(top: int, end: int) -> None:
-        light = np.minimum(rgb[top:end], np.float32(1.0), dtype=np.float32)
-        np.fmax(light, np.float32(0.0), out=light)
-        code = first.take(light.view(np.int32) >> _SHIFT[np.dtype(dtype)])
-        for _ in range(most):
-            code += light >= thresholds.take(code)
-        codes[top:end] = code
+        for row in range(top, end):
+            light = np.minimum(rgb[row], np.float32(1.0), dtype=np.float32)
+            np.fmax(light, np.float32(0.0), out=light)
+            code = first.take(light.view(np.int32) >> _SHIFT[np.dtype(dtype)])
+            for _ in range(most):
+                code += light >= thresholds.take(code)
+            codes[row] = code
 
     with workers(rgb.shape[0] * rgb.shape[1]) as pool:
         in_bands(pool, rgb.shape[0], _BAND_ROWS, work)

@@ -65,12 +65,14 @@ class LightChange:
                 f"expected a plate of the shape {self.ratio.shape} of the light change, got {sharp_rgb.shape}: render both alike"
             )
         # Light without any coverage would be lost on renderers that look at covered pixels only.
-        takes = np.maximum(1.0 - self.ratio.min(-1), LEAST_CHANGE * (self.added.max(-1) > 0))
-        gives_back = np.maximum(self.ratio - (1.0 - takes)[..., None], 0.0)
-        rgb = self.added + gives_back * np.maximum(sharp_rgb, 0.0)
-        alpha = (self.alpha * takes).astype(np.float32)
-        depth_m = np.where(alpha > 0, self.depth_m, np.inf).astype(np.float32)
-        return Layer(np.where(alpha[..., None] > 0, self.alpha[..., None] * rgb, 0.0).astype(np.float32), alpha, depth_m)
+        takes = 1.0 - np.minimum(np.minimum(self.ratio[..., 0], self.ratio[..., 1]), self.ratio[..., 2])
+        takes = np.maximum(takes, np.float32(LEAST_CHANGE) * self.added.any(axis=-1))
+        alpha, depth_m = self.alpha * takes, np.full(takes.shape, np.inf, np.float32)
+        rgb, some = np.zeros_like(self.ratio), alpha > 0.0
+        depth_m[some] = self.depth_m[some]
+        gives_back = np.maximum(self.ratio[some] - (1.0 - takes[some])[:, None], 0.0)
+        rgb[some] = self.alpha[some][:, None] * (self.added[some] + gives_back * np.maximum(sharp_rgb[some], 0.0))
+        return Layer(rgb, alpha, depth_m)
 
 
 def seen_surface(caster: EmbreeRaycaster, camera: Camera, catcher: Mesh) -> Layer:

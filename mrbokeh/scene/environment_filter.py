@@ -20,6 +20,7 @@ _PEAKS = 16
 _SAME = 1e-5
 _FINER = 2
 """Reflections have at most so many times the pixels of a small panorama in width."""
+_SMALL_WIDTH_PX = 64
 _ROUGH_LEVELS = ((512, 16), (256, 32), (128, 64), (128, 64), (64, 128), (64, 128), (64, 256), (64, 256))
 """(width in pixels, samples) of the reflections at roughness (k / 8)**1.5, k = 1 to 8: as fine as each lobe is wide."""
 
@@ -95,6 +96,8 @@ def filtered(radiance: Float32[np.ndarray, "height width 3"]) -> LightingMaps:
         # Even light is the same for every surface, and filtering takes a fifth of a small composite's time.
         even = [radiance[:8, :16]] * (1 + len(_ROUGH_LEVELS))
         return LightingMaps(np.zeros((0, 3, 3)), _joined(even[:1]), _joined(even), np.eye(3))
+    if radiance.shape[1] <= _SMALL_WIDTH_PX:
+        return _filtered_small(radiance)
     smooth = np.zeros((_MATTE_SIZE_PX[0] * _MATTE_SIZE_PX[1], 3), np.float32)
     moments = _moments(radiance)
     brightest = np.argsort(-np.abs(moments).sum((1, 2)))[:_PEAKS]
@@ -120,6 +123,29 @@ def filtered(radiance: Float32[np.ndarray, "height width 3"]) -> LightingMaps:
         reflections=_joined(reflections),
         environment_from_world=np.eye(3),
     )
+
+
+def _filtered_small(radiance: Float32[np.ndarray, "height width 3"]) -> LightingMaps:
+    """Return the maps of a panorama of few pixels, each the sum over all pixels: a convolution around the vertical, by FFT.
+
+    It needs no compiled code, whose loading would take longer. Lobes narrower than a pixel show that pixel.
+    """
+    height, width = radiance.shape[:2]
+    towards, sr = directions(height, width), solid_angles_sr(height, width)
+    cosines = np.einsum("ik,jlk->ijl", towards[:, 0], towards)  # between the first pixel of each row and all pixels
+    facing, spectrum = np.maximum(cosines, 0.0), np.fft.rfft(radiance * sr[..., None], axis=1)
+
+    def seen(kernel: Float[np.ndarray, "height height width"]) -> Float32[np.ndarray, "height width 3"]:
+        products = np.einsum("ijf,jfc->ifc", np.fft.rfft(kernel, axis=2).conj(), spectrum)
+        return np.fft.irfft(products, width, axis=1).astype(np.float32)
+
+    def mirrored(number: int) -> Float32[np.ndarray, "height width 3"]:
+        alpha2 = (number / len(_ROUGH_LEVELS)) ** 6.0
+        lobe = facing / (1.0 - (1.0 - alpha2) * (1.0 + cosines) / 2.0) ** 2
+        return seen(lobe / np.einsum("ijl,jl->i", lobe, sr)[:, None, None])
+
+    reflections = [radiance, *(mirrored(number) for number in range(1, len(_ROUGH_LEVELS) + 1))]
+    return LightingMaps(np.zeros((0, 3, 3)), _joined([seen(facing) / np.float32(np.pi)]), _joined(reflections), np.eye(3))
 
 
 @cache

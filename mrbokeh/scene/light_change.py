@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64
+from jaxtyping import Float, Float32, Float64, Int64
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene._lighting_numba import add_environment
@@ -24,7 +24,7 @@ from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.embree.prepared_scenes import prepared
 from mrbokeh.scene.embree.shading import visible
 from mrbokeh.scene.environment_filter import lighting_maps, reflected_share_table
-from mrbokeh.scene.light import Environment, Light
+from mrbokeh.scene.light import Environment
 from mrbokeh.scene.material import Material, matte
 from mrbokeh.scene.mesh import Mesh, unit
 from mrbokeh.scene.mitsuba.mitsuba_tracer import MitsubaTracer
@@ -36,7 +36,7 @@ _WIDEST_CONE_COSINE = 0.5
 """Wider cones around the objects are given up for the whole sky above the surface."""
 _NO_EFFECT = LEAST_CHANGE / 8
 
-__all__ = ["GREY", "LEAST_CHANGE", "LightChange", "light_change"]
+__all__ = ["GREY", "LEAST_CHANGE", "LightChange", "light_change", "light_left"]
 GREY = matte(0.5, 0.5, 0.5)
 
 
@@ -56,48 +56,73 @@ def light_change(
 
         return traced_light_change(renderer, scene, camera, catcher, surface)
     seen = seen_surface(EmbreeRaycaster(), camera, catcher)
-    surfaces, centre_m, pixels = _met_surfaces(camera, catcher)
-    nothing = np.zeros((len(pixels), 3), np.float32)
-    drawn = scene.drawn_meshes
-    if not drawn or not len(pixels):
+    surfaces, centre_m, pixels = _met_surfaces(camera, catcher, np.arange(seen.alpha.size))
+    if not scene.drawn_meshes or not len(pixels):
+        nothing = np.zeros((len(pixels), 3), np.float32)
         return changed(seen, pixels, (nothing, nothing, nothing))
+    mask = renderer.render_shadow_mask(scene, camera, catcher).reshape(-1)[pixels] if scene.lighting[0] else None
+    total, taken = _lost(scene, surfaces, centre_m, samples, mask)
+    return changed(seen, pixels, (total, taken, np.zeros_like(taken)))
+
+
+def light_left(
+    scene: Scene, camera: Camera, catcher: Mesh, pixels: Int64[np.ndarray, " pixels"], samples: int = 64
+) -> Float32[np.ndarray, "pixels 3"]:
+    """Return the share of light that remains on a matte surface in the middle of some pixels (row after row), 1 beside the surface.
+
+    It is what `light_change` computes without Mitsuba, by one shadow ray towards each light.
+    """
+    ratio = np.ones((len(pixels), 3), np.float32)
+    surfaces, centre_m, met = _met_surfaces(camera, catcher, pixels)
+    if scene.drawn_meshes and len(met):
+        total, taken = _lost(scene, surfaces, centre_m, samples)
+        ratio[met] -= np.clip(taken / np.maximum(total, 1e-12), 0.0, 1.0)
+    return ratio
+
+
+def _lost(
+    scene: Scene,
+    surfaces: Surfaces,
+    centre_m: Float64[np.ndarray, "3"],
+    samples: int,
+    mask: Float32[np.ndarray, " points"] | None = None,
+) -> tuple[Float32[np.ndarray, "points 3"], Float32[np.ndarray, "points 3"]]:
+    """Return the radiance of white surfaces before objects came, and what these take of it. mask: share of all lights that arrives."""
     lights, environment = scene.lighting
-    total, taken = nothing.copy(), nothing.copy()
-    if lights:
-        shadow = 1.0 - renderer.render_shadow_mask(scene, camera, catcher).reshape(-1)[pixels]
-        total += _direct_light(lights, surfaces, centre_m)
-        taken += total * shadow[:, None]
+    objects = _Objects(scene.drawn_meshes)
+    total, taken = (np.zeros((len(surfaces.alpha), 3), np.float32) for _ in range(2))
+    for light in lights:
+        towards, distance_m, irradiance = light.arriving_at(surfaces.shadow_origin + centre_m)
+        arriving = np.maximum((surfaces.normal * towards).sum(-1, keepdims=True), 0.0) * irradiance / np.pi
+        total += arriving
+        if mask is not None:
+            taken += arriving * (1.0 - mask[:, None])
+        elif light.casts_shadow:
+            taken += arriving * objects.hidden(surfaces.shadow_origin + centre_m, towards, distance_m)[:, None]
     if environment is not None:
         maps = lighting_maps(environment)
         table = reflected_share_table()
         add_environment(surfaces, maps.peaks, maps.irradiance, maps.reflections, table, maps.environment_from_world, total)
-        taken += _hidden_sky(_Objects(drawn), environment, surfaces, centre_m, samples)
-    return changed(seen, pixels, (total, taken, nothing))
+        taken += _hidden_sky(objects, environment, surfaces, centre_m, samples)
+    return total, taken
 
 
-def _met_surfaces(camera: Camera, catcher: Mesh) -> tuple[Surfaces, Float64[np.ndarray, "3"], np.ndarray]:
-    """Return (white surfaces at the pixel centres that see the catcher, the point that they are relative to, those pixels)."""
+def _met_surfaces(
+    camera: Camera, catcher: Mesh, pixels: Int64[np.ndarray, " pixels"]
+) -> tuple[Surfaces, Float64[np.ndarray, "3"], Int64[np.ndarray, " met"]]:
+    """Return (white surfaces at the centres of pixels that see the catcher, the point that they are relative to, which of the pixels)."""
     white = replace(catcher, material=replace(matte(1.0, 1.0, 1.0), double_sided=True))
     ground = prepared([white])
     eye_m = camera.world_from_camera[:3, 3]
-    ones = np.ones((camera.height_px, camera.width_px))
-    directions = (camera.unproject(camera.pixel_centres_px(), ones) - eye_m).reshape(-1, 3)
+    centres_px = np.stack([pixels % camera.width_px, pixels // camera.width_px], axis=-1) + 0.5
+    directions = camera.unproject(centres_px, np.ones(len(pixels))) - eye_m
     eye = eye_m - ground.centre_m
     origins = np.broadcast_to(eye.astype(np.float32), directions.shape)
     hits = ground.all_rays.run(np.ascontiguousarray(origins), directions.astype(np.float32), query="INTERSECT")
-    pixels = np.flatnonzero(hits >= 0)
-    surfaces = empty_surfaces(len(pixels))
-    fill_surfaces(ground.triangles, ground.materials, ground.textures, eye[None], directions[pixels], hits[pixels], 0.0, False, surfaces)
-    return surfaces, ground.centre_m, pixels
-
-
-def _direct_light(lights: Sequence[Light], surfaces: Surfaces, centre_m: Float64[np.ndarray, "3"]) -> Float32[np.ndarray, "points 3"]:
-    """Return the radiance of a white surface under the lights alone."""
-    rgb = np.zeros((len(surfaces.alpha), 3))
-    for light in lights:
-        towards, _distance_m, irradiance = light.arriving_at(surfaces.shadow_origin + centre_m)
-        rgb += np.maximum((surfaces.normal * towards).sum(-1, keepdims=True), 0.0) * irradiance / np.pi
-    return rgb.astype(np.float32)
+    met = np.flatnonzero(hits >= 0)
+    surfaces = empty_surfaces(len(met))
+    fill_surfaces(ground.triangles, ground.materials, ground.textures, eye[None], directions[met], hits[met], 0.0, False, surfaces)
+    return surfaces, ground.centre_m, met
 
 
 class _Objects:
@@ -110,10 +135,14 @@ class _Objects:
         self.radius_m = float(np.linalg.norm(points_m - middle_m, axis=1).max())
         self.middle_m = middle_m + self._rays.centre_m
 
-    def hidden(self, points_m: Float[np.ndarray, "points 3"], towards: Float[np.ndarray, "points 3"]) -> Float32[np.ndarray, " points"]:
-        """Return the share of light from infinitely far that the objects keep from points."""
-        far_m = np.full(len(points_m), np.inf)
-        return 1.0 - visible(self._rays, points_m - self._rays.centre_m, towards, far_m)
+    def hidden(
+        self,
+        points_m: Float[np.ndarray, "points 3"],
+        towards: Float[np.ndarray, "points 3"],
+        distance_m: Float[np.ndarray, " points"],
+    ) -> Float32[np.ndarray, " points"]:
+        """Return the share of light, from so far away, that the objects keep from points."""
+        return 1.0 - visible(self._rays, points_m - self._rays.centre_m, towards, distance_m)
 
 
 def _hidden_sky(
@@ -133,11 +162,13 @@ def _hidden_sky(
         normals = surfaces.normal[some].astype(np.float64)
         towards, weight = _drawn(objects, points_m[some], normals, sine2[some], uv)
         weight *= np.maximum(np.einsum("psk,pk->ps", towards, normals), 0.0) / np.pi
-        useful = weight > 0
-        origins_m = np.broadcast_to(points_m[some][:, None], towards.shape)[useful]
-        light = weight[useful][:, None] * _radiance(environment, towards[useful]) * objects.hidden(origins_m, towards[useful])[:, None]
+        point, sample = np.nonzero(weight > 0)
+        hidden = objects.hidden(points_m[some[point]], towards[point, sample], np.full(len(point), np.inf))
+        met = np.flatnonzero(hidden)
+        point, sample = point[met], sample[met]
+        light = (weight[point, sample] * hidden[met])[:, None] * _radiance(environment, towards[point, sample])
         for channel in range(3):
-            lost[some, channel] = np.bincount(np.nonzero(useful)[0], light[:, channel], len(some)) / uv.shape[1]
+            lost[some, channel] = np.bincount(point, light[:, channel], len(some)) / uv.shape[1]
 
     parts = [near[start : start + at_once] for start in range(0, len(near), at_once)]
     shifts = [rng.random((len(some), 1, 2)) for some in parts]

@@ -26,6 +26,8 @@ from mrbokeh.system.errors import InputError
 _log = logging.getLogger(__name__)
 _USUAL_FOCAL_MM, _LONG_SIDE_MM, _USUAL_F_NUMBER, _SHORTEST_MM = 28.0, 36.0, 8.0, 14.0
 """What most phones have, as of full frame, an f-number at which nearly all is sharp, and what is short on full frame."""
+_SHORTEST, _LONGEST = 0.3, 40.0
+"""Focal lengths in widths of the sensor between which one is believed: fisheyes and spotting scopes lie beyond."""
 _OPTION_OF = {
     "focal length": "--focal-length MM",
     "f-number": "--f-number N",
@@ -70,6 +72,10 @@ class Photograph:
     def guessing(self) -> tuple["Photograph", str]:
         """Return the photograph with a guess for all of its lens but the focus that its file does not tell, and the guesses in words."""
         guessed, words = self, []
+        if self.focal_length_mm and self.sensor_width_mm and not _SHORTEST <= self.focal_length_mm / self.sensor_width_mm <= _LONGEST:
+            told = f"{self.focal_length_mm:.4g} mm on {self.sensor_width_mm:.4g} mm of sensor width, which no photograph has, are left out"
+            rest, guesses = replace(self, focal_length_mm=None, f_number=None, sensor_width_mm=None).guessing()
+            return rest, f"{told}; {guesses}"
         if self.focal_length_mm is None and self.sensor_width_mm is not None:
             width_mm, focal_mm = self.sensor_width_mm, _USUAL_FOCAL_MM / _LONG_SIDE_MM * self.sensor_width_mm
         else:

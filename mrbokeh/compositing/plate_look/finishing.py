@@ -8,6 +8,7 @@
 5. Grain: made by the sensor from all light that arrives, so last.
 """
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -27,6 +28,7 @@ from mrbokeh.compositing.plate_look.colour_match import (
 )
 from mrbokeh.compositing.plate_look.exposure_match import Exposure, matched_exposure, stated_exposure, white_balance_gain
 from mrbokeh.compositing.plate_look.grain import Grain, GrainDraw, add_grain_to, measured_grain, measured_grain_of_pair, read_grain
+from mrbokeh.compositing.plate_look.noise_measurement import NoiseLevel
 from mrbokeh.compositing.plate_look.vignetting import RadialFalloff, Vignetting, darkened, falloff_at, falloff_of_photo, read_flat_field
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.pixel_box import Box, lit_box
@@ -34,6 +36,8 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.system.typed_numbers import numbers_in
 
 _SIGMAS = 3
+_LEAST_PX, _SURELY_BLACK, _MOST_GRAIN = 64, 0.02, 0.015
+"""Sides of a picture that tells its black; the lightest black that is surely one; standard deviation of strong grain on a grey card."""
 
 Picture = Float32[np.ndarray, "height width 3"]
 AUTO, OFF = "auto", "off"
@@ -163,6 +167,34 @@ def finishing_of(options: LookOptions, plate_rgb: Picture, photo: Path | None = 
     colour = _colour(options, plate_rgb, photo, vignetting)
     grain = _grain(options, plate_rgb, next_rgb)
     return Finishing(None if colour.is_nothing else colour, vignetting, grain, _light_wrap(options.light_wrap))
+
+
+def matched_finishing(options: LookOptions, plate_rgb: Picture, photo: Path | None = None) -> tuple[Finishing, list[str]]:
+    """Build a Finishing with black and grain as the photograph has them, where the options say nothing of these; and what was matched.
+
+    What a scene shows can be lighter than black, and textured where it seems to be noise: no black is lifted that is not surely one, and
+    grain is never stronger than that of high ISO. So an object in a picture of sand alone gets neither.
+    """
+    finishing, matched = finishing_of(options, plate_rgb, photo), []
+    if options.match_black is None and options.match_grey is None and min(plate_rgb.shape[:2]) >= _LEAST_PX:
+        black = darkest_black(plate_rgb)
+        if 0.0 < max(black) <= _SURELY_BLACK:
+            finishing = replace(finishing, colour=replace(finishing.colour or ColourMatch(), black=black))
+            matched.append("--match-black")
+    if options.grain is None:
+        with suppress(InputError):
+            finishing = replace(finishing, grain=_at_most(measured_grain(plate_rgb, options.seed)))
+    if finishing.grain is not None and options.grain is None and not finishing.grain.is_nothing:
+        matched.append("--grain")
+    return finishing, matched
+
+
+def _at_most(grain: Grain) -> Grain:
+    """Return the grain, weakened as a whole if it is stronger on a grey card than that of high ISO."""
+    variance = float(grain.level.variance(np.full(3, GREY_CARD)).max())
+    factor = min(1.0, _MOST_GRAIN**2 / max(variance, 1e-12))
+    shot, read = (triple_of(factor * np.array(each)) for each in (grain.level.shot, grain.level.read))
+    return replace(grain, level=NoiseLevel(shot, read))
 
 
 def _colour(options: LookOptions, plate_rgb: Picture, photo: Path | None, vignetting: Vignetting | None) -> ColourMatch:

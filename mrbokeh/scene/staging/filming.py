@@ -3,8 +3,9 @@
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
+import cv2
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32, Int64
 
 from mrbokeh.distortion import LensDistortion, distorted, overscan_camera
 from mrbokeh.images.layer import Layer, clear
@@ -13,7 +14,7 @@ from mrbokeh.layering.pixel_box import Box
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Scene, SceneRenderer
 from mrbokeh.scene.choose import scene_renderer
-from mrbokeh.scene.light_change import GREY, LightChange, light_change
+from mrbokeh.scene.light_change import GREY, LightChange, light_change, light_left
 from mrbokeh.scene.mesh import Mesh
 from mrbokeh.scene.moving_layers import FilmedScene, ShutterTiming, moving_layer, moving_shadow_layer
 from mrbokeh.scene.moving_layers.moving_layer import ShadowCatcher
@@ -26,7 +27,10 @@ from mrbokeh.tracking.world_axes import upright_camera
 
 CATCHES = ("shadow", "light")
 _FEW_PX, _FEW_SAMPLES = 5_000, 16
-_MOST_PX, _SMALL, _FINER = 60_000, 6, 10
+_MOST_PX, _UNEVEN, _WINDOW_PX = 10_000, 0.1, 5
+"""Pixels in which the change of light is looked at as a whole; where it differs by more than this share within a window it is computed
+anew in twice as many rows and columns, until the picture has no more of them."""
+_COVERS = 0.99
 _UNSEEN = 0.004
 """Share of a surface's light whose loss nobody sees: half a code of 8 bits in bright places. So far the shadow fades out."""
 
@@ -39,8 +43,8 @@ class Filming:
 
     backend: a name of `mrbokeh.scene.choose`. samples: paths per pixel of "mitsuba". distortion: of the plate's lens. catches:
     "shadow", as dark as the scene says, or "light": all that the objects change on the ground (`mrbokeh.scene.light_change`), of which
-    caught_share (0 to 1) is shown, computed in at most change_px pixels (more where lights throw shadows). shutter: motion blur; None
-    for none.
+    caught_share (0 to 1) is shown, computed in at most change_px pixels, and with finer_change in more where it is uneven. shutter:
+    motion blur; None for none.
     """
 
     backend: str = "auto"
@@ -51,6 +55,7 @@ class Filming:
     distortion: LensDistortion = field(default_factory=LensDistortion)
     shutter: ShutterTiming | None = None
     change_px: int = _MOST_PX
+    finer_change: bool = True
 
     def __post_init__(self) -> None:
         if self.catches not in CATCHES:
@@ -70,6 +75,39 @@ def _at_most(camera: Camera, pixels: int) -> Camera:
     """Return the same view in at most so many pixels."""
     scale = min(1.0, (pixels / (camera.width_px * camera.height_px)) ** 0.5)
     return camera.resized(max(1, round(scale * camera.width_px)), max(1, round(scale * camera.height_px)))
+
+
+def _finer(
+    change: LightChange,
+    scene: Scene,
+    camera: Camera,
+    catcher: Mesh,
+    covered: Bool[np.ndarray, "height width"],
+    size_px: Int64[np.ndarray, "2"],
+    samples: int,
+) -> LightChange:
+    """Return the change in more pixels, computed anew where it is uneven and seen. size_px: rows and columns."""
+    height_px, width_px = size_px.tolist()
+    change = change.enlarged(height_px, width_px)
+    window = np.ones((_WINDOW_PX, _WINDOW_PX))
+    uneven = (cv2.dilate(change.ratio, window) - cv2.erode(change.ratio, window)).max(axis=2) > _UNEVEN
+    hidden = cv2.resize(covered.astype(np.uint8), (width_px, height_px), interpolation=cv2.INTER_NEAREST) > 0
+    pixels, ratio = np.flatnonzero(uneven & ~hidden), change.ratio.reshape(-1, 3).copy()
+    ratio[pixels] = light_left(scene, camera.resized(width_px, height_px), catcher, pixels, samples)
+    return replace(change, ratio=ratio.reshape(change.ratio.shape))
+
+
+def _beside(
+    covered: Bool[np.ndarray, "height width"], ratio: Float32[np.ndarray, "height width 3"]
+) -> Float32[np.ndarray, "height width 3"]:
+    """Return the picture with what is covered replaced by the nearest that is not."""
+    if covered.all() or not covered.any():
+        return ratio
+    _, nearest = cv2.distanceTransformWithLabels(covered.astype(np.uint8), cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
+    seen = ~covered
+    values = np.zeros((int(nearest.max()) + 1, 3), np.float32)
+    values[nearest[seen]] = ratio[seen]
+    return values[nearest]
 
 
 class FilmedLayers:
@@ -103,8 +141,8 @@ class FilmedLayers:
         wide = wide_at(time_s)
         if self._filming.shutter is None:
             scene = self._staged.scene_at(time_s)
-            caught = self._caught(scene, wide, sharp_rgb if self._filming.distortion.is_none else None)
-            layers = [self._objects(scene, wide), *caught]
+            objects = self._objects(scene, wide)
+            layers = [objects, *self._caught(scene, wide, objects, sharp_rgb if self._filming.distortion.is_none else None)]
         else:
             shutter = self._filming.shutter.within(wide, plate)
             layers = self._moving(FilmedScene(self._staged.scene_at, wide_at, shutter), time_s)
@@ -132,7 +170,7 @@ class FilmedLayers:
             return self._renderer.render_beside(scene, camera, [replace(catcher, material=GREY, catches_shadow=False)])  # type: ignore[attr-defined]
         return self._renderer.render(scene, camera)
 
-    def _caught(self, scene: Scene, camera: Camera, sharp_rgb: Float32[np.ndarray, "height width 3"] | None) -> list[Layer]:
+    def _caught(self, scene: Scene, camera: Camera, objects: Layer, sharp_rgb: Float32[np.ndarray, "height width 3"] | None) -> list[Layer]:
         shadow, catcher = self._staged.description.shadow, self._staged.catcher
         if shadow is None or catcher is None:
             return []
@@ -142,16 +180,15 @@ class FilmedLayers:
         box = frame if self._filming.backend == "mitsuba" else self._changed_box(scene, camera, catcher)
         if box.is_empty:
             return [clear(camera.height_px, camera.width_px)]
-        change = self._change(scene, box.camera_of(camera), catcher).weakened(self._filming.caught_share)
+        alpha = np.ascontiguousarray(box.of(objects.alpha))
+        change = self._change(scene, box.camera_of(camera), catcher, alpha).weakened(self._filming.caught_share)
         part_rgb = None if sharp_rgb is None else np.ascontiguousarray(box.of(sharp_rgb))
         part = change.evenly().as_layer(np.zeros_like(change.ratio)) if part_rgb is None else change.as_layer(part_rgb)
         return [part if box == frame else box.placed(part, frame.size_px)]
 
     def _changed_box(self, scene: Scene, camera: Camera, catcher: Mesh) -> Box:
-        """Return the part of the frame in which one sees the light change, looked at in few pixels; a small frame as a whole."""
+        """Return the part of the frame in which one sees the light change, looked at in few pixels."""
         frame = Box(0, camera.height_px, 0, camera.width_px)
-        if camera.width_px * camera.height_px <= _SMALL * _MOST_PX:
-            return frame
         few = _at_most(camera, _FEW_PX)
         ratio = light_change(self._renderer, scene, few, catcher, samples=_FEW_SAMPLES).ratio
         rows, columns = np.nonzero((ratio.min(axis=2) < 1.0 - _UNSEEN) | (self._objects(scene, few).alpha > 0.0))
@@ -162,15 +199,24 @@ class FilmedLayers:
         (top, left), (bottom, right) = low.astype(int).tolist(), np.ceil(high).astype(int).tolist()
         return Box(top, bottom, left, right).within(frame.size_px)
 
-    def _change(self, scene: Scene, camera: Camera, catcher: Mesh) -> LightChange:
-        """Return the change of light that one sees; it is soft, and computed in few pixels, in more of them where lights throw shadows."""
+    def _change(self, scene: Scene, camera: Camera, catcher: Mesh, alpha: Float32[np.ndarray, "height width"]) -> LightChange:
+        """Return the change of light that one sees beside objects of that alpha, computed in few pixels and in more where it is uneven.
+
+        The ground under an object is dark, but nobody sees it: pixels that the object covers, and those on its rim, have what is seen
+        next to them. Where lights throw sharp shadows, each pixel is looked at in four places.
+        """
+        samples = self._filming.samples // 2 + 1
         if self._filming.backend == "mitsuba":
             return light_change(self._renderer, scene, camera, catcher, samples=self._filming.samples)
-        finer = _FINER if scene.lighting[0] else 1
-        some, samples = _at_most(camera, self._filming.change_px * finer), max(1, self._filming.samples * 2 // (1 + finer))
-        change = light_change(self._renderer, scene, some, catcher, samples=samples)
-        seen = replace(change, ratio=np.minimum(change.ratio + np.float32(_UNSEEN), np.float32(1.0)))
-        return seen.enlarged(camera.height_px, camera.width_px)
+        change = light_change(self._renderer, scene, _at_most(camera, self._filming.change_px), catcher, samples=samples)
+        covered = (cv2.dilate(alpha, np.ones((3, 3))) > _COVERS) & (alpha > 0.0)
+        size_px = np.array([camera.height_px, camera.width_px]) * (2 if scene.lighting[0] else 1)
+        while self._filming.finer_change and change.alpha.shape != tuple(size_px):
+            change = _finer(change, scene, camera, catcher, covered, np.minimum(2 * np.array(change.alpha.shape), size_px), samples)
+        way = cv2.INTER_AREA if self._filming.finer_change else cv2.INTER_LINEAR
+        ratio = cv2.resize(change.ratio, (camera.width_px, camera.height_px), interpolation=way)
+        ratio = np.minimum(_beside(covered, ratio) + np.float32(_UNSEEN), np.float32(1.0))
+        return replace(change.enlarged(camera.height_px, camera.width_px), ratio=ratio)
 
     def _shadow(self, scene: Scene, camera: Camera, catcher: ShadowCatcher) -> Layer:
         """Drawn where hard shadows fall; the path tracer's are soft and may fall anywhere."""

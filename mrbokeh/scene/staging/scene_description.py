@@ -122,7 +122,8 @@ class OneObject:
         return replace(camera, camera_from_world=camera_from_world)
 
 
-def looking_down(tilt_rad: float) -> np.ndarray:
-    """Return the rotation (3, 3) from the axes of a camera that looks down by an angle to upright ones."""
+def looking_down(tilt_rad: float, roll_rad: float = 0.0) -> np.ndarray:
+    """Return the rotation (3, 3) from camera axes to upright ones, by how far the camera looks down and is turned clockwise."""
     cosine, sine = np.cos(tilt_rad), np.sin(tilt_rad)
-    return np.array([[1.0, 0.0, 0.0], [0.0, cosine, sine], [0.0, -sine, cosine]])
+    level = np.array([[np.cos(roll_rad), -np.sin(roll_rad), 0.0], [np.sin(roll_rad), np.cos(roll_rad), 0.0], [0.0, 0.0, 1.0]])
+    return np.array([[1.0, 0.0, 0.0], [0.0, cosine, sine], [0.0, -sine, cosine]]) @ level

@@ -1,0 +1,161 @@
+"""Level ground of `mrbokeh composite`, for a photograph without depth: the camera by its lines, an object's place by a pixel."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from mrbokeh.commands._composite_options import ObjectOptions
+from mrbokeh.compositing.plate import Plate
+from mrbokeh.scene.staging.scene_description import looking_down
+from mrbokeh.solving.solved_camera import GUESSED, KNOWN, LOW, SolvedCamera, read_solved_camera
+from mrbokeh.system.channel import guess, say, warn
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.typed_numbers import numbers_in
+
+HIGH_SHARE = 0.25
+"""Share of the picture's height that an object takes whose size is neither told nor known."""
+_EYES_M, _LOWEST_M, _HIGHEST_M, _FARTHEST_M = 1.5, 0.15, 5.0, 100.0
+"""Height of a camera in the hand; heights that are believed where the focus distance is taken for that of the ground; and its farthest."""
+_BELOW_DEG, _BELOW_SHARE, _BELOW_M = 10.0, 0.5, 1.2
+_SAME_SHAPE = 0.01
+
+
+def pair_of(at_pixel: str | None) -> tuple[float, float]:
+    """Return X and Y of --at-pixel. Raises InputError."""
+    if at_pixel is None:
+        raise InputError("where does the object stand? Give --at X,Y,Z in metres, or --at-pixel X,Y")
+    x_px, y_px = numbers_in(at_pixel, "--at-pixel expects 2 numbers with commas between", (2,))
+    return x_px, y_px
+
+
+def with_camera_of_file(plate: Plate, path: Path) -> tuple[Plate, float | None]:
+    """Return the plate as a camera of `mrbokeh capture solve` saw it, and the height of that camera in metres, if it is known."""
+    solved = read_solved_camera(path)
+    height_px, width_px = plate.rgb.shape[:2]
+    if abs(math.log(solved.width_px * height_px / (solved.height_px * width_px))) > _SAME_SHAPE:
+        raise InputError(
+            f"the camera of {path} is of a picture of {solved.width_px}x{solved.height_px} px, but the photograph has "
+            f"{width_px}x{height_px} px: solve that one"
+        )
+    say(f"the camera of {path} {_told(plate, solved)}")
+    return _seen_by(plate, solved), solved.camera_height_m if solved.camera_height_source == KNOWN else None
+
+
+def on_level_ground(plate: Plate, standing: ObjectOptions, known_height_m: float | None = None) -> tuple[Plate, ObjectOptions]:
+    """Return the plate, upright and focused on the foot where nothing tells its focus, and the options with the foot's place on the ground.
+
+    known_height_m: of a solved camera; --camera-height comes before it. Raises InputError for a pixel that shows no ground.
+    """
+    x_px, y_px = pair_of(standing.at_pixel)
+    if not (0 <= x_px < plate.camera.width_px and 0 <= y_px < plate.camera.height_px):
+        size = f"{plate.camera.width_px}x{plate.camera.height_px} px"
+        raise InputError(f"pixel {x_px:g},{y_px:g} lies outside the photograph of {size}: choose one within")
+    taken = []
+    if standing.pitch is not None:
+        plate = replace(plate, world_from_camera=looking_down(math.radians(standing.pitch)))
+    elif plate.world_from_camera is None:
+        plate = _by_lines(plate)
+    ray = plate.camera.unproject(np.array([x_px, y_px]), np.array(1.0))
+    if plate.world_from_camera is None:
+        down_rad = 0.0 if standing.plain else usual_tilt_rad(plate, ray)
+        down_rad = down_rad if math.degrees(down_rad) >= 1.0 else 0.0
+        plate = replace(plate, world_from_camera=looking_down(down_rad))
+        held = f"to look down by {math.degrees(down_rad):.0f} degrees" if down_rad else "to be level"
+        taken.append(f"the camera {held} (--pitch DEGREES)")
+    nearest_m = _ground_m(plate, ray, standing)
+    height_m, told = _camera_height_m(plate, standing.camera_height or known_height_m, nearest_m)
+    distance_m = height_m * nearest_m
+    taken += [told] if told else []
+    if not plate.focus_known:
+        taken.append(f"the focus to be on the object, {distance_m:.3g} m away (--focus METRES)")
+        plate = replace(plate, lens=plate.lens.focused_at(distance_m))
+    guess(f"there is no depth: mrbokeh takes {', '.join(taken)}" if taken else "")
+    height = standing.height
+    if height is None:
+        height = f"{HIGH_SHARE * plate.rgb.shape[0]:.0f}px"
+        guess(f"the object is made {height} high, a quarter of the picture (--height METRES or such as 300px)")
+    place = ",".join(f"{each:.9g}" for each in distance_m * ray)
+    return plate, replace(standing, at=place, at_pixel=None, height=height)
+
+
+def usual_tilt_rad(plate: Plate, ray: Float[np.ndarray, "3"]) -> float:
+    """Return how far a camera usually looks down where nothing tells: 0 if the ground at a ray then lies deep enough below the horizon.
+
+    That is 10 degrees, or for ground at the focus so many that it is 1.2 m, or half its distance, below the camera.
+    """
+    below_rad = math.radians(_BELOW_DEG)
+    if plate.focus_known and plate.lens.focus_distance_m < _FARTHEST_M:
+        below_rad = math.asin(min(_BELOW_SHARE, _BELOW_M / plate.lens.focus_distance_m))
+    return max(0.0, below_rad - math.atan(float(ray[1])))
+
+
+def _ground_m(plate: Plate, ray: Float[np.ndarray, "3"], standing: ObjectOptions) -> float:
+    """Return how far the ground is along a ray of length 1 along the axis, for a camera 1 m above it."""
+    assert plate.world_from_camera is not None
+    falls = float(plate.world_from_camera[1] @ ray)
+    if falls <= 0.0:
+        raise InputError(
+            f"--at-pixel {standing.at_pixel} lies above the horizon of a camera that looks down by {_down_deg(plate):.0f} degrees: choose "
+            f"a lower pixel, say how far the camera looks down with --pitch DEGREES, or give --depth"
+        )
+    return 1.0 / falls
+
+
+def _camera_height_m(plate: Plate, told_m: float | None, nearest_m: float) -> tuple[float, str]:
+    """Return the camera's height above the ground, and what is taken for granted of it. nearest_m: of `_ground_m`."""
+    if told_m is not None:
+        return told_m, ""
+    focus_m = plate.lens.focus_distance_m
+    if not plate.focus_known or focus_m >= _FARTHEST_M:
+        return _EYES_M, f"the camera to be {_EYES_M:g} m above the ground (--camera-height METRES)"
+    height_m = focus_m / nearest_m
+    if _LOWEST_M <= height_m <= _HIGHEST_M:
+        told = f"the object to stand where the lens is focused, {focus_m:.3g} m away and {height_m:.2g} m below the camera"
+        return height_m, f"{told} (--camera-height METRES)"
+    warn(
+        f"the lens is focused at {focus_m:.3g} m, but ground that far away at this pixel would be {height_m:.2g} m below the camera: "
+        f"another place is in focus, or the file is wrong (--focus METRES)"
+    )
+    return _EYES_M, f"the camera to be {_EYES_M:g} m above the ground (--camera-height METRES)"
+
+
+def _by_lines(plate: Plate) -> Plate:
+    """Return the plate as its straight lines say that the camera stood, or as it is where they do not tell."""
+    from mrbokeh.solving.solve_camera import solve_camera
+
+    try:
+        solved = solve_camera(plate.rgb, plate.camera.focal_px[0] if plate.view_known else None)
+    except InputError:
+        return plate
+    if solved.confidence == LOW:
+        return plate
+    guess(f"by the straight lines of the picture the camera {_told(plate, solved)} (--pitch DEGREES; `mrbokeh capture solve` shows it)")
+    return _seen_by(plate, solved)
+
+
+def _told(plate: Plate, solved: SolvedCamera) -> str:
+    view = (
+        "" if plate.view_known or solved.focal_length_source == GUESSED else f" and sees as {solved.focal_length_35mm:.0f} mm on 35-mm film"
+    )
+    turned = f", turned by {solved.roll_deg:.1f}" if abs(solved.roll_deg) >= 0.5 else ""
+    way = "up" if solved.pitch_deg > 0.0 else "down"
+    return f"looks {way} by {abs(solved.pitch_deg):.0f} degrees{turned}{view}"
+
+
+def _seen_by(plate: Plate, solved: SolvedCamera) -> Plate:
+    """Return the plate held as that camera, and with its field of view where its file tells none."""
+    plate = replace(plate, world_from_camera=looking_down(-math.radians(solved.pitch_deg), math.radians(solved.roll_deg)))
+    if plate.view_known or solved.focal_length_source == GUESSED:
+        return plate
+    factor = solved.focal_length_px / solved.width_px * plate.camera.width_px / plate.camera.focal_px[0]
+    focal_px = (factor * plate.camera.focal_px[0], factor * plate.camera.focal_px[1])
+    lens = plate.lens.stating({"focal_length_mm": factor * plate.lens.focal_length_mm})
+    return replace(plate, lens=lens, camera=replace(plate.camera, focal_px=focal_px), view_known=True)
+
+
+def _down_deg(plate: Plate) -> float:
+    assert plate.world_from_camera is not None
+    return math.degrees(math.asin(float(np.clip(plate.world_from_camera[1, 2], -1.0, 1.0)))) + 0.0

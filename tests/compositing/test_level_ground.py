@@ -1,0 +1,97 @@
+"""Level ground of a photograph without depth: where objects stand, by a known camera, by straight lines, and where nothing tells."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mrbokeh.commands._composite_options import ObjectOptions
+from mrbokeh.commands._level_ground import on_level_ground, with_camera_of_file
+from mrbokeh.compositing.plate import Plate, plate_of
+from mrbokeh.optics.lens import Lens
+from mrbokeh.scene.staging.scene_description import looking_down
+from mrbokeh.solving.solved_camera import SolvedCamera, write_solved_camera
+from mrbokeh.system.errors import InputError
+from tests.support.projected_places import place
+
+LENS = Lens(focal_length_mm=35.0, f_number=4.0, focus_distance_m=float("inf"), sensor_width_mm=36.0)
+FOOT = ObjectOptions(object_=Path("cake.glb"), at_pixel="500,450", height="50px")
+
+
+def photograph(focus_m: float = float("inf"), **known: bool) -> Plate:
+    """Return a picture of nothing, of 800x600 px, whose focal length is 777.8 px."""
+    return replace(plate_of(np.full((600, 800, 3), 0.2, np.float32), LENS.focused_at(focus_m)), **known)
+
+
+def place_m(standing: ObjectOptions) -> np.ndarray:
+    assert standing.at is not None
+    return np.array([float(each) for each in standing.at.split(",")])
+
+
+@pytest.mark.parametrize("pitch_deg", [0.0, 20.0])
+def test_an_object_stands_so_far_below_the_camera_as_that_is_high(pitch_deg: float) -> None:
+    plate, standing = on_level_ground(photograph(), replace(FOOT, pitch=pitch_deg, camera_height=1.6))
+    foot_m = place_m(standing)
+    np.testing.assert_allclose(plate.camera.project(foot_m[None])[0][0], (500.0, 450.0), atol=1e-3)
+    assert (looking_down(np.radians(pitch_deg)) @ foot_m)[1] == pytest.approx(1.6)
+
+
+def test_the_focus_tells_the_distance_unless_the_camera_would_float() -> None:
+    """Ground 12.1 m away at that pixel is 2.2 m below a level camera: 150 px over a focal length of 777.8 px, and so many metres."""
+    _, standing = on_level_ground(photograph(12.1), replace(FOOT, pitch=0.0))
+    assert place_m(standing)[2] == pytest.approx(12.1)
+    _, standing = on_level_ground(photograph(90.0), replace(FOOT, pitch=0.0))  # 17 m
+    assert place_m(standing)[2] == pytest.approx(1.5 * plate_focal_px() / 150.0, rel=1e-3)
+
+
+def plate_focal_px() -> float:
+    return float(photograph().camera.focal_px[1])
+
+
+@pytest.mark.parametrize(("focus_m", "row", "below_deg"), [(float("inf"), 300, 10.0), (4.8, 300, 14.48), (1.0, 300, 30.0)])
+def test_where_nothing_tells_ground_lies_as_deep_as_it_usually_does(focus_m: float, row: int, below_deg: float) -> None:
+    """In the middle of the picture, where no ground is seen by a level camera: 1.2 m at 4.8 m are 14.5 degrees, half of 1 m is 30."""
+    plate, standing = on_level_ground(photograph(focus_m, focus_known=focus_m < float("inf")), replace(FOOT, at_pixel=f"400,{row}"))
+    assert plate.world_from_camera is not None
+    foot_m = plate.world_from_camera @ place_m(standing)
+    assert np.degrees(np.arctan2(foot_m[1], foot_m[2])) == pytest.approx(below_deg, abs=0.01)
+    if not np.isfinite(focus_m):
+        assert plate.lens.focus_distance_m == pytest.approx(place_m(standing)[2])
+
+
+def test_straight_lines_tell_how_the_camera_was_held_and_its_field_of_view() -> None:
+    made = place("room", 101, 24.0)
+    rgb = made.linear()
+    guessed = replace(plate_of(rgb, LENS), view_known=False, focus_known=False)
+    plate, standing = on_level_ground(guessed, replace(FOOT, at_pixel="700,900"))
+    assert plate.camera.focal_px[0] == pytest.approx(made.focal_px, rel=0.03)
+    assert plate.lens.focal_length_mm == pytest.approx(24.0, rel=0.03)
+    assert plate.world_from_camera is not None
+    off_deg = np.degrees(np.arccos(np.clip(plate.world_from_camera[1] @ made.down, -1.0, 1.0)))
+    assert off_deg < 0.5
+    assert abs(float(plate.world_from_camera[0] @ [0.0, 0.0, 1.0])) < 1e-9, "z of the world is where the camera looks"
+    assert float(made.down @ place_m(standing)) == pytest.approx(1.5, rel=0.02)
+
+
+def test_a_solved_camera_of_a_file_comes_first(tmp_path: Path) -> None:
+    solved = SolvedCamera(400, 300, 500.0, "solved", looking_down(0.2, 0.03).T, confidence="high").standing(1.2)
+    write_solved_camera(tmp_path / "camera.json", solved)
+    plate, height_m = with_camera_of_file(photograph(view_known=False), tmp_path / "camera.json")
+    assert height_m == 1.2
+    assert plate.camera.focal_px == pytest.approx((1000.0, 1000.0))
+    np.testing.assert_allclose(plate.world_from_camera, looking_down(0.2, 0.03), atol=1e-12)
+    _, standing = on_level_ground(plate, FOOT, height_m)
+    assert (looking_down(0.2, 0.03) @ place_m(standing))[1] == pytest.approx(1.2)
+    write_solved_camera(tmp_path / "other.json", replace(solved, height_px=400))
+    with pytest.raises(InputError, match="400x400 px, but the photograph has 800x600"):
+        with_camera_of_file(photograph(), tmp_path / "other.json")
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    ({"pitch": 0.0, "at_pixel": "500,250"}, "above the horizon of a camera that looks down by 0 degrees"),
+    ({"at_pixel": "900,250"}, "outside the photograph of 800x600 px"),
+])  # fmt: skip
+def test_a_pixel_without_ground_is_refused(change: dict[str, object], words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        on_level_ground(photograph(), replace(FOOT, **change))
