@@ -62,7 +62,9 @@ def test_tutorials_run(page: Path, tmp_path: Path) -> None:
     script = SHELL
     for language, block in re.findall(r"```(sh|python)\n(.*?)```", page.read_text(encoding="utf-8").replace("\\\n", ""), re.DOTALL):
         script += f"python <<'END'\n{block}END\n" if language == "python" else block
-    left_out = r"mrbokeh studio|mrbokeh viewfinder (?!board)" + ("" if find_spec("mitsuba") else r"|python -m datasets_scripts.bokeh_stacks")
+    left_out = r"mrbokeh studio|mrbokeh viewfinder (?!board)" + (
+        "" if find_spec("mitsuba") else r"|python -m datasets_scripts.bokeh_stacks"
+    )
     script = re.sub(rf"^(?:{left_out}).*\n", "", script, flags=re.MULTILINE)
     environment = os.environ | {"PYTHON": sys.executable, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(["bash", "-c", script], cwd=tmp_path, env=environment, capture_output=True, text=True)

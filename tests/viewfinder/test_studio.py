@@ -4,6 +4,7 @@ import asyncio
 import io
 import json
 import os
+import shlex
 import signal
 import struct
 import subprocess
@@ -35,7 +36,7 @@ from tests.support.refusals import refused
 from tests.support.waiting import comes_true, wait_until
 from viewfinder.studio import desk as desks
 from viewfinder.studio.command_line import command_line, options_of, words_of
-from viewfinder.studio.photograph import MOST_PX, OpenedPhotograph, open_photograph, placed, with_solved_camera
+from viewfinder.studio.photograph import MOST_PX, OpenedPhotograph, open_photograph, placed
 from viewfinder.studio.preview import Previewer, Wish, preview_of
 from viewfinder.studio.project import Project, read_project
 from viewfinder.studio.running import StudioOptions, project_of
@@ -57,7 +58,7 @@ def whole_state(photo: Path, **more: Any) -> StudioState:
 STATES: list[dict[str, Any]] = [
     {},
     {"turn_deg": -33.3, "sun_deg": [-60, 40], "shadow": 0.5, "exposure": 1.3},
-    {"height": "60px", "f_number": 2.8, "focus_m": 6.25, "focal_length_mm": 35, "sensor_width_mm": 23.5, "grain": True},
+    {"height": "60px", "f_number": 2.8, "focus_m": 6.25, "focal_length_mm": 35, "sensor_width_mm": 23.5, "matched": False},
 ]
 
 
@@ -119,18 +120,47 @@ def test_metres_follow_from_the_first_place_and_then_stay(photo: Path) -> None:
     assert 0.8 * HEIGHT / 4 < high[0] < 1.7 * HEIGHT / 4 and high[1] == pytest.approx(high[0] / 2, rel=0.15)
 
 
-def test_a_camera_from_lines_is_taken_where_nobody_chose_one(photo: Path) -> None:
-    from mrbokeh.solving.solved_camera import SOLVED, SolvedCamera
+async def test_a_camera_from_lines_is_taken_where_nobody_chose_one(photo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Turned by 2 degrees and looking down by 10: the command line names its file, and makes the preview's picture."""
+    from mrbokeh.scene.staging.scene_description import looking_down
+    from mrbokeh.solving.solved_camera import HIGH, LOW, SOLVED, SolvedCamera
+    from viewfinder.studio import photograph
 
+    turned = looking_down(np.radians(10.0), np.radians(2.0)).T
+    found = SolvedCamera(WIDTH, HEIGHT, 240.0, SOLVED, camera_from_world=turned, confidence=HIGH)
+    monkeypatch.setattr(photograph, "solved", lambda _: found)
+    async with made_studio(tmp_path, StudioState(photo=photo, object=CAKE)) as made, aiohttp.ClientSession() as one:
+        await comes_true(lambda: made.desk.photograph is not None and made.desk.busy == "")
+        camera = made.desk.state.camera
+        assert camera is not None and camera.is_file()
+        _, told = await asked(one, made.url + "state", {"changes": {"at_px": AT_PX}})
+        assert told["photo"]["pitch_deg"] == pytest.approx(10.0) and told["photo"]["focal_px"] == pytest.approx(240.0)
+        assert str(camera) in shlex.split(told["command"]) and "--pitch" not in told["command"]
+        state, opened = made.desk.state, made.desk.photograph
+        assert opened is not None
+        preview = preview_of(opened, options_of(state), KeptParts())
+        assert mrbokeh(*words_of(options_of(state), tmp_path / "out.png")).returncode == 0
+        np.testing.assert_array_equal(
+            srgb_codes(preview.rgb, np.uint16), cv2.imread(str(tmp_path / "out.png"), cv2.IMREAD_UNCHANGED)[..., ::-1]
+        )
+        _, told = await asked(one, made.url + "state", {"changes": {"pitch_deg": 4.0}})
+        assert told["photo"]["pitch_deg"] == pytest.approx(4.0) and "--pitch 4 " in told["command"]
+    monkeypatch.setattr(photograph, "solved", lambda _: replace(found, confidence=LOW))
+    async with made_studio(tmp_path, StudioState(photo=photo, object=CAKE)) as made:
+        await comes_true(lambda: made.desk.photograph is not None and made.desk.busy == "")
+        assert made.desk.state.camera is None, "a doubtful one is offered only"
+
+
+def test_what_nobody_told_is_in_the_command_line_too(photo: Path, tmp_path: Path) -> None:
+    """So that it makes the preview's picture without looking at lines again."""
     opened, _rgb = open_photograph(photo)
-    down = np.radians(10.0)
-    turned = np.array([[1, 0, 0], [0, np.cos(down), -np.sin(down)], [0, np.sin(down), np.cos(down)]])
-    found = SolvedCamera(WIDTH, HEIGHT, focal_length_px=240.0, focal_length_source=SOLVED, camera_from_world=turned)
-    state = with_solved_camera(StudioState(photo=photo), opened, found)
-    assert (state.pitch_deg, state.focal_length_mm, state.sensor_width_mm) == (pytest.approx(found.pitch_deg, abs=0.01), 36.0, 36.0)
-    assert abs(found.pitch_deg) == pytest.approx(10.0)
-    chosen = StudioState(photo=photo, pitch_deg=2.0, focal_length_mm=50.0)
-    assert with_solved_camera(chosen, opened, found) == chosen
+    state = placed(state_of({"photo": str(photo), "object": str(CAKE), "at_px": [100, 105]}), opened)
+    # 15 px below the middle of 180 the ground is 4.6 degrees below a level camera of 28 mm (187 px): 10 are usual.
+    assert state.pitch_deg is not None and state.pitch_deg == pytest.approx(10.0 - 4.6, abs=0.1) and state.camera_height_m == pytest.approx(1.5, rel=0.01)
+    preview = preview_of(opened, options_of(state), KeptParts())
+    assert mrbokeh(*words_of(options_of(state), tmp_path / "out.png")).returncode == 0
+    stored = cv2.imread(str(tmp_path / "out.png"), cv2.IMREAD_UNCHANGED)[..., ::-1]
+    np.testing.assert_array_equal(srgb_codes(preview.rgb, np.uint16), stored)
 
 
 @pytest.mark.parametrize(
@@ -288,7 +318,7 @@ async def test_what_a_page_may_not_ask_for_is_refused_in_a_sentence(photo: Path,
         assert "photo, object" in await upload("script", "x.sh", b"rm")
         monkeypatch.setitem(desks.LARGEST, "object", 1 << 20)
         assert "larger than the 1 MB" in await upload("object", "cake.glb", b"glTF" + bytes(2 << 20))
-        assert list((tmp_path / "studio_files").iterdir()) == [] and made.desk.state.object is None
+        assert list((tmp_path / "studio_files").glob("*[!n]")) == [] and made.desk.state.object is None
 
 
 async def test_dropped_files_become_the_photograph_and_the_object(tmp_path: Path) -> None:

@@ -226,7 +226,7 @@ async def test_the_page_is_accessible(tmp_path: Path, size_px: tuple[int, int]) 
                 await page.value("document.activeElement.id || document.activeElement.dataset.format || document.activeElement.tagName")
             )
         wanted = {"stage", "undo", "focus_here", "grid", "hold_before", "magnify", "object", "height", "turn", "focus", "f_number"}
-        wanted |= {"sun_right", "sun_above", "exposure", "shadow", "grain", "pitch", "camera_height", "png", "copy", "open_photo"}
+        wanted |= {"sun_right", "sun_above", "exposure", "shadow", "matched", "pitch", "camera_height", "png", "copy", "open_photo"}
         assert wanted <= reached, wanted - reached
 
 

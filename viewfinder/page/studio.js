@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 9fc72e163f600d617375edf3c8e9210c417514e0240f9451943a8b1302fd3d26
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: c12f47f97752effac4e574c5fc73f0f8f2a449778d9bb963bafee397d68e6ddc
 "use strict";
 (() => {
   // src/model.ts
@@ -247,7 +247,7 @@
       shown: (v) => `${v > 0 ? "+" : ""}${v.toFixed(1)} stops`
     },
     { id: "shadow", read: (s) => s.shadow ?? 1, write: (v) => ({ shadow: v === 1 ? null : v }), shown: (v) => `${Math.round(100 * v)} %` },
-    { id: "pitch", read: (s) => s.pitch_deg ?? 0, write: (pitch_deg) => ({ pitch_deg }), shown: (v) => degrees(v) }
+    { id: "pitch", read: (s) => s.pitch_deg ?? studio.told?.photo?.pitch_deg ?? 0, write: (pitch_deg) => ({ pitch_deg }), shown: (v) => degrees(v) }
   ];
   var right = () => studio.state?.sun_deg?.[0] ?? DEFAULT_SUN[0];
   var above = () => studio.state?.sun_deg?.[1] ?? DEFAULT_SUN[1];
@@ -270,7 +270,7 @@
       const react = (id, changes) => byId(id).addEventListener("click", () => void studio.commit(changes()));
       react("focus_auto", () => ({ focus_m: null, focus_at_px: null }));
       react("f_number_auto", () => ({ f_number: null }));
-      react("camera_found", () => ({ pitch_deg: studio.told?.camera?.pitch_deg ?? studio.state.pitch_deg }));
+      react("camera_found", () => ({ camera: studio.told?.camera?.file ?? null, pitch_deg: null }));
       byId("object").addEventListener("change", (event) => void studio.commit({ object: event.target.value || null, height: null }));
       for (const [id, by] of [["undo", -1], ["redo", 1]]) byId(id).addEventListener("click", () => void studio.step(by));
       studio.addEventListener("told", () => this.told());
@@ -299,8 +299,8 @@
     switches() {
       const auto = byId("sun_auto");
       auto.addEventListener("change", () => void studio.commit(auto.checked ? { sun_deg: null } : sun([right(), above()])));
-      const grain = byId("grain");
-      grain.addEventListener("change", () => void studio.commit({ grain: grain.checked }));
+      const matched = byId("matched");
+      matched.addEventListener("change", () => void studio.commit({ matched: matched.checked }));
       const plain = byId("plain");
       plain.addEventListener("change", () => void studio.commit(plain.checked ? { plain: true, sun_deg: null } : { plain: false }));
     }
@@ -354,7 +354,7 @@
       byId("undo").disabled = !told.can_undo;
       byId("redo").disabled = !told.can_redo;
       byId("camera_told").textContent = told.photo?.has_depth ? "The photograph has depth: the ground slopes as that says." : told.camera?.told ?? (told.photo ? "The camera is looked for in the picture's lines." : "");
-      byId("camera_found").disabled = told.camera?.pitch_deg === void 0;
+      byId("camera_found").disabled = told.camera?.file === void 0;
       byId("plain").disabled = Boolean(told.photo && !told.photo.has_depth && !told.state.plain);
       byId("kept").textContent = `Everything is kept in ${told.project}`;
       this.choices();
@@ -408,7 +408,7 @@
       this.fill("height", state.height ?? "");
       byId("object").value = state.object ?? "";
       byId("sun_auto").checked = state.sun_deg === null;
-      byId("grain").checked = state.grain;
+      byId("matched").checked = state.matched;
       byId("plain").checked = state.plain;
       document.querySelectorAll("input[name=lens]").forEach((each) => each.checked = each.value === (state.lens ?? ""));
       const [turn, high] = state.sun_deg ?? DEFAULT_SUN;
@@ -529,43 +529,57 @@
   var DEEP = 50;
   var LEAST_APART = 8e-3;
   var EYES_M = 1.5;
+  function lookingDown(pitch_deg) {
+    const [cos, sin] = [Math.cos(pitch_deg * Math.PI / 180), Math.sin(pitch_deg * Math.PI / 180)];
+    return [[1, 0, 0], [0, cos, sin], [0, -sin, cos]];
+  }
   var Ground = class {
     constructor(photo, focal_px, state) {
       this.photo = photo;
       this.focal_px = focal_px;
-      const pitch = state.plain ? 0 : (state.pitch_deg ?? 0) * Math.PI / 180;
-      [this.cos, this.sin] = [Math.cos(pitch), Math.sin(pitch)];
-      this.high_m = state.camera_height_m ?? EYES_M;
+      this.turn = state.pitch_deg === null ? photo.world_from_camera ?? lookingDown(0) : lookingDown(state.pitch_deg);
+      this.high_m = state.camera_height_m ?? photo.camera_height_m ?? EYES_M;
     }
     photo;
     focal_px;
-    cos;
-    sin;
+    turn;
     high_m;
-    /** Row of the horizon. */
-    get horizon_px() {
-      return this.photo.height_px / 2 - this.focal_px * this.sin / this.cos;
+    /** The ray of a pixel, of length 1 along the view, in upright axes. */
+    ray([x_px, y_px]) {
+      const seen = [(x_px - this.photo.width_px / 2) / this.focal_px, (y_px - this.photo.height_px / 2) / this.focal_px, 1];
+      const along = (row) => row[0] * seen[0] + row[1] * seen[1] + row[2] * seen[2];
+      return [along(this.turn[0]), along(this.turn[1]), along(this.turn[2])];
+    }
+    /** Row of the horizon in a column. */
+    horizon_px(x_px) {
+      const [right2, down, ahead] = this.turn[1];
+      const across = (x_px - this.photo.width_px / 2) / this.focal_px;
+      return this.photo.height_px / 2 - this.focal_px * (ahead + right2 * across) / down;
     }
     /** Distance along the view of the ground under a pixel, null above the horizon. */
-    distance_m(y_px) {
-      const falls = this.cos * (y_px - this.photo.height_px / 2) / this.focal_px + this.sin;
+    distance_m(at_px) {
+      const falls = this.ray(at_px)[1];
       return falls > 1e-6 ? this.high_m / falls : null;
     }
     /** The pixel, or the nearest below the horizon and within the photograph. */
     within([x, y]) {
       const { width_px, height_px } = this.photo;
-      const top = Math.max(0, this.horizon_px + 4e-3 * height_px);
-      return [Math.min(width_px - 1, Math.max(0, x)), Math.min(height_px - 1, Math.max(Math.min(top, height_px - 1), y))];
+      const column = Math.min(width_px - 1, Math.max(0, x));
+      const top = Math.max(0, this.horizon_px(column) + 4e-3 * height_px);
+      return [column, Math.min(height_px - 1, Math.max(Math.min(top, height_px - 1), y))];
+    }
+    /** Middle of the lowest row. */
+    get lowest_px() {
+      return [this.photo.width_px / 2, this.photo.height_px];
     }
     /** Distance ahead on the ground, level, of what the lowest row shows; null where it shows no ground. */
     get nearest_m() {
-      const y = this.photo.height_px / 2 / this.focal_px;
-      const z_m = this.distance_m(this.photo.height_px);
-      return z_m === null ? null : z_m * (this.cos - this.sin * y);
+      const z_m = this.distance_m(this.lowest_px);
+      return z_m === null ? null : z_m * this.ray(this.lowest_px)[2];
     }
     /** Side of a cell of the grid, metres: 1, 2 or 5 of a power of ten, about five of which fit into the lowest row. */
     get cell_m() {
-      const z_m = this.distance_m(this.photo.height_px) ?? this.high_m;
+      const z_m = this.distance_m(this.lowest_px) ?? this.high_m;
       const wanted = z_m * this.photo.width_px / this.focal_px / ACROSS;
       const power = 10 ** Math.floor(Math.log10(wanted));
       return Number((power * (wanted / power >= 5 ? 5 : wanted / power >= 2 ? 2 : 1)).toPrecision(1));
@@ -588,27 +602,28 @@
       return lines.join("");
     }
     /** A circle on the ground about a pixel, as the path of an SVG. */
-    circle([x_px, y_px], radius_m) {
-      const z_m = this.distance_m(y_px);
+    circle(at_px, radius_m) {
+      const z_m = this.distance_m(at_px);
       if (z_m === null) return "";
-      const x_m = (x_px - this.photo.width_px / 2) / this.focal_px * z_m;
-      const ahead_m = -this.sin * ((y_px - this.photo.height_px / 2) / this.focal_px * z_m) + this.cos * z_m;
+      const [x, , ahead] = this.ray(at_px);
       const points = Array.from({ length: 33 }, (_, i) => {
         const turn = i / 32 * 2 * Math.PI;
-        return this.seen(x_m + radius_m * Math.cos(turn), ahead_m + radius_m * Math.sin(turn));
+        return this.seen(x * z_m + radius_m * Math.cos(turn), ahead * z_m + radius_m * Math.sin(turn));
       });
       if (points.some((each) => each[2] <= 0)) return "";
-      return points.map(([x, y], i) => `${i ? "L" : "M"}${x.toFixed(1)} ${y.toFixed(1)}`).join("");
+      return points.map(([across, down], i) => `${i ? "L" : "M"}${across.toFixed(1)} ${down.toFixed(1)}`).join("");
     }
     /** Pixel and depth of a point of the ground. */
     seen(x_m, ahead_m) {
-      const y = this.cos * this.high_m - this.sin * ahead_m;
-      const z = this.sin * this.high_m + this.cos * ahead_m;
-      return [this.photo.width_px / 2 + this.focal_px * x_m / z, this.photo.height_px / 2 + this.focal_px * y / z, z];
+      const z = this.depth(x_m, ahead_m);
+      const column = (i) => this.turn[0][i] * x_m + this.turn[1][i] * this.high_m + this.turn[2][i] * ahead_m;
+      return [this.photo.width_px / 2 + this.focal_px * column(0) / z, this.photo.height_px / 2 + this.focal_px * column(1) / z, z];
+    }
+    depth(x_m, ahead_m) {
+      return this.turn[0][2] * x_m + this.turn[1][2] * this.high_m + this.turn[2][2] * ahead_m;
     }
     line(lines, [x0, a0], [x1, a1], nearest_m) {
-      const z0 = this.sin * this.high_m + this.cos * a0;
-      const z1 = this.sin * this.high_m + this.cos * a1;
+      const [z0, z1] = [this.depth(x0, a0), this.depth(x1, a1)];
       if (z0 < nearest_m && z1 < nearest_m) return;
       const cut = (x, a, z, x2, a2, z2) => {
         if (z >= nearest_m) return [x, a];
@@ -704,9 +719,8 @@
       this.ground.replaceChildren();
       if (photo) this.ground.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
       if (photo && ground && state && wanted) {
-        const y = ground.horizon_px;
         this.path("", ground.grid());
-        this.path("horizon", `M0 ${y}H${photo.width_px}`);
+        this.path("horizon", `M0 ${ground.horizon_px(0)}L${photo.width_px} ${ground.horizon_px(photo.width_px)}`);
         if (state.at_px) this.path("foot", ground.circle(state.at_px, ground.cell_m / 2));
         this.words(`one square: ${ground.cell_m} m`, photo.width_px * 0.015, photo.height_px * 0.985, photo.width_px / this.stage.clientWidth);
       }
@@ -801,7 +815,7 @@
       const box = studio.shown?.box;
       const [u, v] = [at_px[0] / photo.width_px, at_px[1] / photo.height_px];
       const onObject = box && u >= box[0] && u <= box[2] && v >= box[1] && v <= box[3];
-      const metres = ground.distance_m(onObject && studio.state?.at_px ? studio.state.at_px[1] : at_px[1]);
+      const metres = ground.distance_m(onObject && studio.state?.at_px ? studio.state.at_px : at_px);
       if (metres === null) return studio.say("the sky has no distance: click on the ground or the object");
       void studio.commit({ focus_m: Number(metres.toPrecision(4)), focus_at_px: null, camera_height_m: ground.high_m });
     }

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 9fc72e163f600d617375edf3c8e9210c417514e0240f9451943a8b1302fd3d26
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: c12f47f97752effac4e574c5fc73f0f8f2a449778d9bb963bafee397d68e6ddc
 "use strict";
 (() => {
   // src/model.ts

@@ -65,7 +65,8 @@ def options_of(state: StudioState) -> CompositeOptions:
     return CompositeOptions(
         photo=state.photo,
         standing=standing,
-        look=LookGroup(grain="auto" if state.grain else None),
+        virtual=VirtualOptions(camera=state.camera),
+        look=LookGroup() if state.matched else LookGroup(grain="off", match_black="off"),
         optics=LensOptions(lens=state.lens, focus=state.focus_m, focus_at=focus_at),
         facts=LensFacts(focal_length_mm=state.focal_length_mm, f_number=state.f_number, sensor_width_mm=state.sensor_width_mm),
     )

@@ -85,10 +85,20 @@ class Desk:
             raise InputError(f"expected the changes of the state as names and values, got {type(changes).__name__}")
         document = self.state.document() | {str(name): value for name, value in changes.items()}
         state = state_of(document)
-        for name, known in (("object", self.project.objects), ("lens", self.project.lenses), ("photo", [self.state.photo])):
+        for name, known in (
+            ("object", self.project.objects),
+            ("lens", self.project.lenses),
+            ("photo", [self.state.photo]),
+            ("camera", self._known_cameras()),
+        ):
             if (path := getattr(state, name)) is not None and path not in known:
                 raise InputError(f"the page may choose only what it was offered, but {name} is {str(path)[:60]!r}: drop the file on it")
         return state
+
+    def _known_cameras(self) -> list[Path | None]:
+        """Return the files of cameras that the page may choose: the one in use, and the one found."""
+        found = self._cameras.get(self.state.photo, {}).get("file") if self.state.photo is not None else None
+        return [self.state.camera, Path(found) if found else None]
 
     async def change(self, changes: Any) -> None:
         """Take changes of a page over, complete what follows from them, and keep the project."""
@@ -159,14 +169,12 @@ class Desk:
             while len(self._opened) >= _KEPT_PHOTOGRAPHS:
                 del self._opened[next(iter(self._opened))]
             self._opened[path] = opened
-            await self._complete()
             self.busy = "looking for the camera in the picture's lines" if path not in self._cameras else ""
             self.tell_all()
             if path not in self._cameras:
-                found = await asyncio.to_thread(camera)
-                self._cameras[path] = {"told": found} if isinstance(found, str) else _camera_told(found)
-                if not isinstance(found, str):
-                    self._take_camera(path, found)
+                self._cameras[path] = await asyncio.to_thread(_camera_found, camera, self.uploads / f"{path.stem}.camera.json")
+                self._take_camera(path)
+            await self._complete()
         except InputError as error:
             self.problem = str(error)
         except Exception as error:
@@ -175,21 +183,20 @@ class Desk:
         self.busy = ""
         self.tell_all()
 
-    def _take_camera(self, path: Path, camera: "SolvedCamera") -> None:
-        """Give the state the camera, if it is still that of the photograph and nobody chose another."""
-        from viewfinder.studio.photograph import with_solved_camera
-
-        opened = self._opened.get(path)
-        if opened is not None and self.state.photo == path:
-            self.project.amend(lambda state: with_solved_camera(state, opened, camera))
+    def _take_camera(self, path: Path) -> None:
+        """Give the state the camera of the picture's lines, if it is still that photograph's and nobody chose how it was held."""
+        state, found = self.state, self._cameras[path]
+        is_free = state.camera is None and state.pitch_deg is None and not self._opened[path].has_depth
+        if state.photo == path and is_free and found.get("is_sure"):
+            self.project.amend(lambda state: replace(state, camera=Path(found["file"])))
             self._keep()
 
     async def _complete(self) -> None:
-        """Give a complete state the metres that follow from it."""
+        """Give a complete state the metres that follow from it, once its camera was looked for."""
         opened, before = self.photograph, self.state
-        if opened is None or not before.is_complete:
+        if opened is None or not before.is_complete or before.photo not in self._cameras:
             return
-        completed = await asyncio.to_thread(_placed, before, opened)
+        completed = await asyncio.to_thread(placed_state, before, opened)
         if completed != before and self.state == before:
             self.project.amend(lambda _state: completed)
             self._keep()
@@ -217,8 +224,8 @@ def _opened_photograph(path: Path) -> "tuple[OpenedPhotograph, Callable[[], Solv
     return opened, camera
 
 
-def _placed(state: StudioState, opened: "OpenedPhotograph") -> StudioState:
-    """Return the state with its metres; as it is, where they cannot be told, which the preview then says."""
+def placed_state(state: StudioState, opened: "OpenedPhotograph") -> StudioState:
+    """Return the state with its tilt and metres; as it is, where they cannot be told, which the preview then says."""
     from viewfinder.studio.photograph import placed
 
     with apart():
@@ -228,18 +235,25 @@ def _placed(state: StudioState, opened: "OpenedPhotograph") -> StudioState:
             return state
 
 
-def _camera_told(camera: "SolvedCamera") -> dict[str, Any]:
+def _camera_found(look: "Callable[[], SolvedCamera | str]", path: Path) -> dict[str, Any]:
+    """Look for a camera; return what is told of it, and its file. is_sure: whether it is taken without being asked for."""
+    from mrbokeh.solving.solved_camera import LOW, write_solved_camera
+
+    camera = look()
+    if isinstance(camera, str):
+        return {"told": camera}
+    write_solved_camera(path, camera)
     sd = f" ± {camera.pitch_sd_deg:.1f}" if camera.pitch_sd_deg > 0.05 else ""
-    way = "down" if camera.pitch_deg >= 0 else "up"
-    told = f"by the picture's lines the camera looks {way} by {abs(camera.pitch_deg):.1f}{sd}°"
-    told += f", {camera.focal_length_35mm:.0f} mm on full frame"
-    rolled = f"; it was rolled by {camera.roll_deg:+.1f}°" if abs(camera.roll_deg) > 0.5 else ""
-    return {
-        "told": f"{told}{rolled} ({camera.confidence} confidence)",
-        "pitch_deg": round(camera.pitch_deg, 2),
-        "roll_deg": round(camera.roll_deg, 2),
-        "confidence": camera.confidence,
-    }
+    way, rolled = "up" if camera.pitch_deg > 0 else "down", f", turned by {camera.roll_deg:.1f}°" if abs(camera.roll_deg) > 0.5 else ""
+    told = f"By the picture's straight lines the camera looks {way} by {abs(camera.pitch_deg):.1f}{sd}°{rolled}"
+    told += f", {camera.focal_length_35mm:.0f} mm on full frame ({camera.confidence} confidence)."
+    return {"told": told, "file": str(_short(path)), "is_sure": camera.confidence != LOW}
+
+
+def _short(path: Path) -> Path:
+    """Return a path from the working folder where it lies in it."""
+    whole = path.absolute()
+    return whole.relative_to(Path.cwd()) if whole.is_relative_to(Path.cwd()) else whole
 
 
 def _require_glb(path: Path) -> None:

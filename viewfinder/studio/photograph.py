@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.commands._composite_parts import on_level_ground, pair_of
 from mrbokeh.commands._insertion_options import focused_at_pixel, require_one_focus
+from mrbokeh.commands._level_ground import HIGH_SHARE, on_level_ground, pair_of, usual_tilt_rad, with_camera_of_file
 from mrbokeh.compositing.plate import HeldLens, LensWishes, Plate, held_lens, phone_photo, photograph_plate
 from mrbokeh.depth.phone_depth import PhonePhoto
 from mrbokeh.optics.camera import camera_of_lens
@@ -20,7 +20,7 @@ from mrbokeh.renderers.choose import lens_and_renderer
 from mrbokeh.scene.staging.scene_description import looking_down
 from mrbokeh.scene.staging.staged_scene import modified_s
 from mrbokeh.solving.solve_camera import solve_camera
-from mrbokeh.solving.solved_camera import GUESSED, SolvedCamera
+from mrbokeh.solving.solved_camera import SolvedCamera
 from mrbokeh.stacks.photograph import Photograph, read_photograph
 from mrbokeh.system.errors import InputError
 from viewfinder.studio.command_line import CompositeOptions, options_of, preview_scale
@@ -28,7 +28,7 @@ from viewfinder.studio.state import StudioState
 
 MOST_PX = 1e6
 """Pixels of the largest preview."""
-_FULL_FRAME_MM = 36.0
+_LEAST_TILT_DEG = 1.0
 
 
 @dataclass
@@ -68,6 +68,25 @@ class OpenedPhotograph:
             return plate, renderer
         focused = focused_at_pixel(plate.lens, plate.depth_m, options.scaled(self.scale(most_px)).optics.focus_at or "")
         return _with_lens(small, replace(held, lens=focused)), renderer
+
+    def upright(self, options: CompositeOptions, most_px: float) -> tuple[Plate, Renderer, float | None]:
+        """Return `plate_for` with how the camera was held, which is never looked for in lines, and its height where a file tells it.
+
+        Where neither options nor depth tell it, it is as cameras usually are for the object's place.
+        """
+        plate, renderer = self.plate_for(options, most_px)
+        standing, known_height_m = options.standing, None
+        if options.virtual.camera is not None:
+            plate, known_height_m = with_camera_of_file(plate, options.virtual.camera)
+        if plate.depth_m is not None or standing.plain:
+            return plate, renderer, known_height_m
+        if standing.pitch is not None:
+            plate = replace(plate, world_from_camera=looking_down(np.radians(standing.pitch)))
+        elif plate.world_from_camera is None:
+            foot_px = pair_of(options.scaled(self.scale(most_px)).standing.at_pixel)
+            down_rad = usual_tilt_rad(plate, plate.camera.unproject(np.array(foot_px), np.array(1.0)))
+            plate = replace(plate, world_from_camera=looking_down(down_rad if down_rad >= np.radians(_LEAST_TILT_DEG) else 0.0))
+        return plate, renderer, known_height_m
 
     def _at(self, most_px: float) -> Plate:
         """Return the plate with at most so many pixels; of the sizes asked for the last few are kept."""
@@ -117,7 +136,7 @@ def shrunk(plate: Plate, width_px: int, height_px: int) -> Plate:
 
 def _with_lens(plate: Plate, held: HeldLens) -> Plate:
     camera = camera_of_lens(held.lens, plate.rgb.shape[1], plate.rgb.shape[0])
-    return replace(plate, lens=held.lens, camera=camera, blur_from=held.blur_from, focus_known=held.focus_known)
+    return replace(plate, lens=held.lens, camera=camera, blur_from=held.blur_from, focus_known=held.focus_known, view_known=held.view_known)
 
 
 @lru_cache(maxsize=8)
@@ -136,34 +155,34 @@ def solved(photograph: Photograph) -> SolvedCamera:
     return solve_camera(photograph.rgb, focal_px).of_sensor(photograph.sensor_width_mm)
 
 
-def with_solved_camera(state: StudioState, opened: OpenedPhotograph, camera: SolvedCamera) -> StudioState:
-    """Return the state with how the camera was held, and its field of view where the file does not state it, if nobody chose them."""
-    if opened.has_depth:
-        return state
-    if state.pitch_deg is None:
-        state = replace(state, pitch_deg=round(camera.pitch_deg, 2))
-    stated = opened.told.focal_length_mm is not None and opened.told.sensor_width_mm is not None
-    chosen = state.lens is not None or state.focal_length_mm is not None or state.sensor_width_mm is not None
-    if stated or chosen or camera.focal_length_source == GUESSED:
-        return state
-    width_mm = _FULL_FRAME_MM * camera.width_px / max(camera.width_px, camera.height_px)
-    focal_mm = camera.focal_length_px / camera.width_px * width_mm
-    return replace(state, focal_length_mm=float(f"{focal_mm:.4g}"), sensor_width_mm=float(f"{width_mm:.4g}"))
-
-
 def placed(state: StudioState, opened: OpenedPhotograph) -> StudioState:
-    """Return a complete state with the metres that `mrbokeh composite` would guess, so that they stay while the object is moved."""
-    if not state.is_complete or state.plain or (state.height is not None and (state.camera_height_m is not None or opened.has_depth)):
+    """Return a complete state with the tilt and metres that `mrbokeh composite` would guess, so that they stay while the object is moved.
+
+    Raises InputError for a place that is no ground.
+    """
+    is_told = state.camera is not None or state.pitch_deg is not None
+    whole = state.height is not None and (opened.has_depth or (state.camera_height_m is not None and is_told))
+    if not state.is_complete or state.plain or whole:
         return state
     options = options_of(state)
-    plate, _renderer = opened.plate_for(options, MOST_PX)
+    plate, _renderer, known_height_m = opened.upright(options, MOST_PX)
     standing = options.scaled(opened.scale(MOST_PX)).standing
-    quarter_px = 0.25 * plate.rgb.shape[0]
+    high_px = HIGH_SHARE * plate.rgb.shape[0]
     if plate.depth_m is not None:
         depth_m = plate.point_under_pixel_m(*pair_of(standing.at_pixel))[2]
-        return replace(state, height=f"{plate.length_m(quarter_px, depth_m):.3g}")
-    plate, on_ground = on_level_ground(plate, standing)
-    foot_m = np.array([float(each) for each in (on_ground.at or "").split(",")])
-    eyes_m = float((looking_down(np.radians(on_ground.pitch or 0.0)) @ foot_m)[1])
-    height = state.height or f"{plate.length_m(quarter_px, foot_m[2]):.3g}"
+        return replace(state, height=f"{plate.length_m(high_px, depth_m):.3g}")
+    if not is_told:
+        state = replace(state, pitch_deg=round(looks_down_deg(plate), 2))
+        standing = replace(standing, pitch=state.pitch_deg)
+    plate, on_ground = on_level_ground(plate, standing, known_height_m)
+    assert on_ground.at is not None and plate.world_from_camera is not None
+    foot_m = np.array([float(each) for each in on_ground.at.split(",")])
+    eyes_m = float(plate.world_from_camera[1] @ foot_m)
+    height = state.height or f"{plate.length_m(high_px, foot_m[2]):.3g}"
     return replace(state, camera_height_m=state.camera_height_m or float(f"{eyes_m:.4g}"), height=height)
+
+
+def looks_down_deg(plate: Plate) -> float:
+    """Return how far the camera of an upright plate looks down."""
+    assert plate.world_from_camera is not None
+    return float(np.degrees(np.arcsin(np.clip(plate.world_from_camera[1, 2], -1.0, 1.0)))) + 0.0

@@ -12,10 +12,12 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.commands._composite_kept import KeptParts
-from mrbokeh.commands._composite_parts import blur_told, layers_by, nothing_seen, on_level_ground, pair_of, placing_warning
+from mrbokeh.commands._composite_parts import blur_told, layers_by, nothing_seen, placing_warning
+from mrbokeh.commands._level_ground import on_level_ground, pair_of
 from mrbokeh.compositing.choose import best_mode, insertion_of
 from mrbokeh.compositing.ground import with_ground_behind
-from mrbokeh.compositing.plate_look.finishing import finished, finishing_of
+from mrbokeh.compositing.plate import Plate
+from mrbokeh.compositing.plate_look.finishing import Finishing, finished, finishing_of, matched_finishing
 from mrbokeh.images.color import srgb_codes
 from mrbokeh.images.layer import Layer
 from mrbokeh.system.channel import apart, guess, warn
@@ -45,15 +47,15 @@ def preview_of(photograph: OpenedPhotograph, options: CompositeOptions, kept: Ke
     Where the photograph has no more than most_px, and kept makes no draft, it is the very same picture.
     """
     with apart() as words:
-        plate, renderer = photograph.plate_for(options, most_px)
+        plate, renderer, known_height_m = photograph.upright(options, most_px)
         small = options.scaled(photograph.scale(most_px))
         standing = small.standing
         guess(plate.depth_note)
         if plate.depth_m is None and not standing.plain:
-            plate, standing = on_level_ground(plate, standing)
+            plate, standing = on_level_ground(plate, standing, known_height_m)
         layers_for = layers_by(small.virtual, standing, small.rendering, plate, None, kept)
         mode = best_mode(plate)
-        finishing = finishing_of(small.look.wanted, plate.rgb, photograph.path)
+        finishing = Finishing() if kept.draft else _finishing(photograph, plate, small)
         sharp = layers_for(plate)
         if not any((layer.alpha > 0).any() for layer in sharp):
             nothing_seen(options.standing, small.virtual)
@@ -73,6 +75,16 @@ def preview_of(photograph: OpenedPhotograph, options: CompositeOptions, kept: Ke
             "warnings": list(dict.fromkeys(words.warnings)),
         }
     return Preview(inserted.rgb, told)
+
+
+def _finishing(photograph: OpenedPhotograph, plate: Plate, options: CompositeOptions) -> Finishing:
+    """Return what makes the object look photographed; a draft goes without."""
+    wanted = options.look.wanted
+    return (
+        finishing_of(wanted, plate.rgb, photograph.path)
+        if options.standing.plain
+        else matched_finishing(wanted, plate.rgb, photograph.path)[0]
+    )
 
 
 def _box(layer: Layer) -> list[float] | None:

@@ -14,7 +14,7 @@ FORMAT, VERSION = "mrbokeh studio", 1
 _EXPECTED = "a project file of `mrbokeh studio`"
 _MOST_STORED = 500
 """States of the history that a file keeps: half a megabyte; while the studio runs there is no limit."""
-_PATHS = ("photo", "object", "lens")
+_PATHS = ("photo", "object", "lens", "camera")
 
 
 @dataclass
@@ -85,6 +85,8 @@ def read_project(path: Path) -> Project:
         raise InputError(f"expected {_EXPECTED} at {path}, but: {error}") from None
     there = {name: [each for each in files if each.is_file()] for name, files in (("objects", objects), ("lenses", lenses))}
     project = Project(path, history, place, **there)
+    if project.state.camera is not None and not project.state.camera.is_file():
+        project.amend(lambda state: replace(state, camera=None))
     for name in _PATHS:
         if (file := getattr(project.state, name)) is not None and not file.is_file():
             raise InputError(f"{path} has the {name} {file}, which is not there any more: put it back, or begin anew without the project")

@@ -16,7 +16,7 @@ from mrbokeh.system.errors import InputError
 from viewfinder.server.access import Access, error, json_value, message_body
 from viewfinder.server.site import page_routes
 from viewfinder.studio.command_line import command_line, options_of
-from viewfinder.studio.desk import LARGEST, Desk
+from viewfinder.studio.desk import LARGEST, Desk, placed_state
 from viewfinder.studio.saving import FORMATS
 from viewfinder.studio.state import StudioState
 
@@ -32,6 +32,7 @@ PAGE = {
 _LARGEST_MESSAGE = 8192
 _NEWS_WAIT_S = 20.0
 _LARGEST_SCREEN_PX = 1e6
+_FEW_PX = 1e4
 _PAGE_NAME = re.compile(r"\w{1,40}", re.ASCII)
 _TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".tif": "image/tiff", ".exr": "image/x-exr"}
 
@@ -101,10 +102,11 @@ class StudioSite:
 
     def _command(self, state: StudioState) -> str | None:
         """Return the command line of a state, None while something is missing."""
-        if not state.is_complete:
+        opened = self.desk.photograph
+        if not state.is_complete or opened is None:
             return None
         assert state.photo is not None
-        return command_line(options_of(state), self.desk.saves.free_name(state.photo, ".png"))
+        return command_line(options_of(placed_state(state, opened)), self.desk.saves.free_name(state.photo, ".png"))
 
     async def _photo(self, _request: web.Request) -> web.Response:
         """Handle GET /photo: the photograph as it is, as large as the largest preview."""
@@ -147,7 +149,7 @@ class StudioSite:
         if isinstance(pixels, bool) or not isinstance(pixels, int | float) or not 1e3 <= pixels <= 1e9:
             raise InputError(f"expected how many pixels the screen shows, got {str(pixels)[:20]!r}: load the page again")
         state, opened = self.desk.changed_state(message.get("changes") or {}), self._opened()
-        options = options_of(state)
+        options = options_of(placed_state(state, opened))
         if draft not in self._previewers:
             self._previewers[draft] = Previewer("studio drafts" if draft else "studio previews")
         wish = Wish(photograph=opened, options=options, most_px=min(float(pixels), _LARGEST_SCREEN_PX), draft=draft)
@@ -169,7 +171,7 @@ class StudioSite:
     async def _save(self, request: web.Request) -> web.Response:
         """Handle POST /save: {"format": one of FORMATS}."""
         kind = (await _message(request)).get("format")
-        self.desk.saves.start(options_of(self.desk.state), kind)
+        self.desk.saves.start(options_of(placed_state(self.desk.state, self._opened())), kind)
         self.desk.tell_all()
         return web.json_response(self._told())
 
@@ -194,6 +196,8 @@ class StudioSite:
 
 def _photo_told(opened: "OpenedPhotograph", state: StudioState) -> dict[str, Any]:
     """Return what the page needs of the photograph: its size, and the pinhole by which it draws the ground."""
+    from viewfinder.studio.photograph import looks_down_deg
+
     width_px, height_px = opened.size_px
     told = opened.told
     shown: dict[str, Any] = {"name": opened.path.name, "width_px": width_px, "height_px": height_px, "has_depth": opened.has_depth}
@@ -201,16 +205,23 @@ def _photo_told(opened: "OpenedPhotograph", state: StudioState) -> dict[str, Any
     try:
         with apart():
             whole = state if state.is_complete else _anywhere(state, opened)
-            plate, _renderer = opened.plate_for(options_of(whole), 1e4)
+            plate, _renderer, known_height_m = opened.upright(options_of(whole), _FEW_PX)
+            eyes_m = placed_state(whole, opened).camera_height_m or known_height_m
+        held = plate.world_from_camera
         shown |= {"focal_px": plate.camera.focal_px[0] * width_px / plate.camera.width_px, "lens_f_number": plate.lens.f_number}
+        shown |= {"camera_height_m": eyes_m, "world_from_camera": None if held is None else held.tolist()}
+        shown |= {"pitch_deg": None if held is None else round(looks_down_deg(plate), 2)}
     except InputError as problem:
-        shown |= {"focal_px": None, "lens_f_number": None, "problem": str(problem)}
+        shown |= dict.fromkeys(("focal_px", "lens_f_number", "camera_height_m", "world_from_camera", "pitch_deg")) | {
+            "problem": str(problem)
+        }
     return shown
 
 
 def _anywhere(state: StudioState, opened: "OpenedPhotograph") -> StudioState:
     """Return a complete state, where something is missing still, by which the lens is found."""
-    return replace(state, photo=opened.path, object=state.object or Path("object.glb"), at_px=state.at_px or (0.0, 0.0))
+    middle_px = (0.5 * opened.size_px[0], 0.8 * opened.size_px[1])
+    return replace(state, photo=opened.path, object=state.object or Path("object.glb"), at_px=state.at_px or middle_px)
 
 
 async def _message(request: web.Request) -> dict[str, Any]:

@@ -20,13 +20,14 @@ class StudioState:
 
     at_px: where the object stands, in pixels of the whole photograph. height: metres such as "0.3", or pixels such as "120px".
     focus_at_px: the pixel that is in focus, where the photograph has depth; focus_m otherwise. sun_deg: where the main light comes from,
-    degrees to the right of the view and above the horizon. grain: put the photograph's grain on the object. plain: guess neither light
-    nor ground.
+    degrees to the right of the view and above the horizon. camera: file of `mrbokeh capture solve`; pitch_deg comes before it. matched:
+    black and grain of the object are those of the photograph. plain: guess neither light nor ground.
     """
 
     photo: Path | None = None
     object: Path | None = None
     lens: Path | None = None
+    camera: Path | None = None
     at_px: Pair | None = None
     height: str | None = None
     turn_deg: float = 0.0
@@ -40,7 +41,7 @@ class StudioState:
     sun_deg: Pair | None = None
     shadow: float | None = None
     exposure: float = 1.0
-    grain: bool = False
+    matched: bool = True
     plain: bool = False
 
     @property
@@ -133,6 +134,7 @@ _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "photo": _path,
     "object": _path,
     "lens": _path,
+    "camera": _path,
     "at_px": _pair(_PIXELS, _PIXELS),
     "height": _height,
     "turn_deg": _number(-100_000.0, 100_000.0),
@@ -146,7 +148,7 @@ _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "sun_deg": _pair((-360.0, 360.0), (0.1, 90.0)),
     "shadow": _number(0.0, 1.0),
     "exposure": _number(0.0, 1000.0),
-    "grain": _flag,
+    "matched": _flag,
     "plain": _flag,
 }
 """Checks of what comes from a page or a file, by the names of the state's values."""

@@ -1,4 +1,5 @@
 // The ground that the object stands on: where a pixel meets it, and its grid drawn over the photograph.
+import type { Matrix3 } from "./model";
 import type { Photo, State } from "./studio_model";
 
 const ACROSS = 5;
@@ -10,46 +11,64 @@ const EYES_M = 1.5;
 
 type Point = [number, number];
 
+/** The turn from camera axes to upright ones (x right, y down, z ahead) of a camera that looks down. */
+function lookingDown(pitch_deg: number): Matrix3 {
+  const [cos, sin] = [Math.cos((pitch_deg * Math.PI) / 180), Math.sin((pitch_deg * Math.PI) / 180)];
+  return [[1, 0, 0], [0, cos, sin], [0, -sin, cos]];
+}
+
 /** A pinhole above level ground; pixels are those of the whole photograph. */
 export class Ground {
-  private readonly cos: number;
-  private readonly sin: number;
+  private readonly turn: Matrix3;
   readonly high_m: number;
 
   constructor(private readonly photo: Photo, private readonly focal_px: number, state: State) {
-    const pitch = state.plain ? 0 : ((state.pitch_deg ?? 0) * Math.PI) / 180;
-    [this.cos, this.sin] = [Math.cos(pitch), Math.sin(pitch)];
-    this.high_m = state.camera_height_m ?? EYES_M;
+    this.turn = state.pitch_deg === null ? photo.world_from_camera ?? lookingDown(0) : lookingDown(state.pitch_deg);
+    this.high_m = state.camera_height_m ?? photo.camera_height_m ?? EYES_M;
   }
 
-  /** Row of the horizon. */
-  get horizon_px(): number {
-    return this.photo.height_px / 2 - (this.focal_px * this.sin) / this.cos;
+  /** The ray of a pixel, of length 1 along the view, in upright axes. */
+  private ray([x_px, y_px]: Point): [number, number, number] {
+    const seen = [(x_px - this.photo.width_px / 2) / this.focal_px, (y_px - this.photo.height_px / 2) / this.focal_px, 1];
+    const along = (row: readonly number[]): number => row[0]! * seen[0]! + row[1]! * seen[1]! + row[2]! * seen[2]!;
+    return [along(this.turn[0]), along(this.turn[1]), along(this.turn[2])];
+  }
+
+  /** Row of the horizon in a column. */
+  horizon_px(x_px: number): number {
+    const [right, down, ahead] = this.turn[1];
+    const across = (x_px - this.photo.width_px / 2) / this.focal_px;
+    return this.photo.height_px / 2 - (this.focal_px * (ahead + right * across)) / down;
   }
 
   /** Distance along the view of the ground under a pixel, null above the horizon. */
-  distance_m(y_px: number): number | null {
-    const falls = (this.cos * (y_px - this.photo.height_px / 2)) / this.focal_px + this.sin;
+  distance_m(at_px: Point): number | null {
+    const falls = this.ray(at_px)[1];
     return falls > 1e-6 ? this.high_m / falls : null;
   }
 
   /** The pixel, or the nearest below the horizon and within the photograph. */
   within([x, y]: Point): Point {
     const { width_px, height_px } = this.photo;
-    const top = Math.max(0, this.horizon_px + 0.004 * height_px);
-    return [Math.min(width_px - 1, Math.max(0, x)), Math.min(height_px - 1, Math.max(Math.min(top, height_px - 1), y))];
+    const column = Math.min(width_px - 1, Math.max(0, x));
+    const top = Math.max(0, this.horizon_px(column) + 0.004 * height_px);
+    return [column, Math.min(height_px - 1, Math.max(Math.min(top, height_px - 1), y))];
+  }
+
+  /** Middle of the lowest row. */
+  private get lowest_px(): Point {
+    return [this.photo.width_px / 2, this.photo.height_px];
   }
 
   /** Distance ahead on the ground, level, of what the lowest row shows; null where it shows no ground. */
   private get nearest_m(): number | null {
-    const y = this.photo.height_px / 2 / this.focal_px;
-    const z_m = this.distance_m(this.photo.height_px);
-    return z_m === null ? null : z_m * (this.cos - this.sin * y);
+    const z_m = this.distance_m(this.lowest_px);
+    return z_m === null ? null : z_m * this.ray(this.lowest_px)[2];
   }
 
   /** Side of a cell of the grid, metres: 1, 2 or 5 of a power of ten, about five of which fit into the lowest row. */
   get cell_m(): number {
-    const z_m = this.distance_m(this.photo.height_px) ?? this.high_m;
+    const z_m = this.distance_m(this.lowest_px) ?? this.high_m;
     const wanted = (z_m * this.photo.width_px) / this.focal_px / ACROSS;
     const power = 10 ** Math.floor(Math.log10(wanted));
     return Number((power * (wanted / power >= 5 ? 5 : wanted / power >= 2 ? 2 : 1)).toPrecision(1));
@@ -75,30 +94,31 @@ export class Ground {
   }
 
   /** A circle on the ground about a pixel, as the path of an SVG. */
-  circle([x_px, y_px]: Point, radius_m: number): string {
-    const z_m = this.distance_m(y_px);
+  circle(at_px: Point, radius_m: number): string {
+    const z_m = this.distance_m(at_px);
     if (z_m === null) return "";
-    const x_m = ((x_px - this.photo.width_px / 2) / this.focal_px) * z_m;
-    // From camera axes to upright ones.
-    const ahead_m = -this.sin * (((y_px - this.photo.height_px / 2) / this.focal_px) * z_m) + this.cos * z_m;
+    const [x, , ahead] = this.ray(at_px);
     const points = Array.from({ length: 33 }, (_, i) => {
       const turn = (i / 32) * 2 * Math.PI;
-      return this.seen(x_m + radius_m * Math.cos(turn), ahead_m + radius_m * Math.sin(turn));
+      return this.seen(x * z_m + radius_m * Math.cos(turn), ahead * z_m + radius_m * Math.sin(turn));
     });
     if (points.some((each) => each[2] <= 0)) return "";
-    return points.map(([x, y], i) => `${i ? "L" : "M"}${x.toFixed(1)} ${y.toFixed(1)}`).join("");
+    return points.map(([across, down], i) => `${i ? "L" : "M"}${across.toFixed(1)} ${down.toFixed(1)}`).join("");
   }
 
   /** Pixel and depth of a point of the ground. */
   private seen(x_m: number, ahead_m: number): [number, number, number] {
-    const y = this.cos * this.high_m - this.sin * ahead_m;
-    const z = this.sin * this.high_m + this.cos * ahead_m;
-    return [this.photo.width_px / 2 + (this.focal_px * x_m) / z, this.photo.height_px / 2 + (this.focal_px * y) / z, z];
+    const z = this.depth(x_m, ahead_m);
+    const column = (i: 0 | 1): number => this.turn[0][i] * x_m + this.turn[1][i] * this.high_m + this.turn[2][i] * ahead_m;
+    return [this.photo.width_px / 2 + (this.focal_px * column(0)) / z, this.photo.height_px / 2 + (this.focal_px * column(1)) / z, z];
+  }
+
+  private depth(x_m: number, ahead_m: number): number {
+    return this.turn[0][2] * x_m + this.turn[1][2] * this.high_m + this.turn[2][2] * ahead_m;
   }
 
   private line(lines: string[], [x0, a0]: Point, [x1, a1]: Point, nearest_m: number): void {
-    const z0 = this.sin * this.high_m + this.cos * a0;
-    const z1 = this.sin * this.high_m + this.cos * a1;
+    const [z0, z1] = [this.depth(x0, a0), this.depth(x1, a1)];
     if (z0 < nearest_m && z1 < nearest_m) return;
     // Cut off what lies behind the camera.
     const cut = (x: number, a: number, z: number, x2: number, a2: number, z2: number): Point => {

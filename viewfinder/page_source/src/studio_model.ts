@@ -1,4 +1,5 @@
 // What the studio knows: the server's state, what this page changes, and the newest picture of it.
+import type { Matrix3 } from "./model";
 import { sentenceOf } from "./server";
 
 export type Pair = [number, number];
@@ -8,6 +9,7 @@ export interface State {
   photo: string | null;
   object: string | null;
   lens: string | null;
+  camera: string | null;
   at_px: Pair | null;
   height: string | null;
   turn_deg: number;
@@ -21,7 +23,7 @@ export interface State {
   sun_deg: Pair | null;
   shadow: number | null;
   exposure: number;
-  grain: boolean;
+  matched: boolean;
   plain: boolean;
 }
 
@@ -34,6 +36,9 @@ export interface Photo {
   focus_m: number | null;
   focal_length_mm: number | null;
   focal_px: number | null;
+  camera_height_m: number | null;
+  world_from_camera: Matrix3 | null;
+  pitch_deg: number | null;
   lens_f_number: number | null;
   problem?: string;
 }
@@ -60,7 +65,7 @@ export interface Told {
   formats: string[];
   project: string;
   largest: { photo: number; object: number };
-  camera: { told: string; pitch_deg?: number } | null;
+  camera: { told: string; file?: string } | null;
   command: string | null;
   photo: Photo | null;
 }

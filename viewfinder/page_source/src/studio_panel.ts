@@ -36,7 +36,7 @@ const SLIDERS: Slider[] = [
     shown: (v) => `${v > 0 ? "+" : ""}${v.toFixed(1)} stops`,
   },
   { id: "shadow", read: (s) => s.shadow ?? 1, write: (v) => ({ shadow: v === 1 ? null : v }), shown: (v) => `${Math.round(100 * v)} %` },
-  { id: "pitch", read: (s) => s.pitch_deg ?? 0, write: (pitch_deg) => ({ pitch_deg }), shown: (v) => degrees(v) },
+  { id: "pitch", read: (s) => s.pitch_deg ?? studio.told?.photo?.pitch_deg ?? 0, write: (pitch_deg) => ({ pitch_deg }), shown: (v) => degrees(v) },
 ];
 
 const right = (): number => studio.state?.sun_deg?.[0] ?? DEFAULT_SUN[0];
@@ -63,7 +63,7 @@ export class Panel {
     const react = (id: string, changes: () => Partial<State>): void => byId(id).addEventListener("click", () => void studio.commit(changes()));
     react("focus_auto", () => ({ focus_m: null, focus_at_px: null }));
     react("f_number_auto", () => ({ f_number: null }));
-    react("camera_found", () => ({ pitch_deg: studio.told?.camera?.pitch_deg ?? studio.state!.pitch_deg }));
+    react("camera_found", () => ({ camera: studio.told?.camera?.file ?? null, pitch_deg: null }));
     byId("object").addEventListener("change", (event) => void studio.commit({ object: (event.target as HTMLSelectElement).value || null, height: null }));
     for (const [id, by] of [["undo", -1], ["redo", 1]] as const) byId(id).addEventListener("click", () => void studio.step(by));
     studio.addEventListener("told", () => this.told());
@@ -96,8 +96,8 @@ export class Panel {
   private switches(): void {
     const auto = byId<HTMLInputElement>("sun_auto");
     auto.addEventListener("change", () => void studio.commit(auto.checked ? { sun_deg: null } : sun([right(), above()])));
-    const grain = byId<HTMLInputElement>("grain");
-    grain.addEventListener("change", () => void studio.commit({ grain: grain.checked }));
+    const matched = byId<HTMLInputElement>("matched");
+    matched.addEventListener("change", () => void studio.commit({ matched: matched.checked }));
     const plain = byId<HTMLInputElement>("plain");
     plain.addEventListener("change", () => void studio.commit(plain.checked ? { plain: true, sun_deg: null } : { plain: false }));
   }
@@ -157,7 +157,7 @@ export class Panel {
     byId("camera_told").textContent = told.photo?.has_depth
       ? "The photograph has depth: the ground slopes as that says."
       : told.camera?.told ?? (told.photo ? "The camera is looked for in the picture's lines." : "");
-    byId<HTMLButtonElement>("camera_found").disabled = told.camera?.pitch_deg === undefined;
+    byId<HTMLButtonElement>("camera_found").disabled = told.camera?.file === undefined;
     byId<HTMLInputElement>("plain").disabled = Boolean(told.photo && !told.photo.has_depth && !told.state.plain);
     byId("kept").textContent = `Everything is kept in ${told.project}`;
     this.choices();
@@ -214,7 +214,7 @@ export class Panel {
     this.fill("height", state.height ?? "");
     byId<HTMLSelectElement>("object").value = state.object ?? "";
     byId<HTMLInputElement>("sun_auto").checked = state.sun_deg === null;
-    byId<HTMLInputElement>("grain").checked = state.grain;
+    byId<HTMLInputElement>("matched").checked = state.matched;
     byId<HTMLInputElement>("plain").checked = state.plain;
     document.querySelectorAll<HTMLInputElement>("input[name=lens]").forEach((each) => (each.checked = each.value === (state.lens ?? "")));
     const [turn, high] = state.sun_deg ?? DEFAULT_SUN;

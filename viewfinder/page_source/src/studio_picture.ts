@@ -95,9 +95,8 @@ export class PictureStage {
     this.ground.replaceChildren();
     if (photo) this.ground.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
     if (photo && ground && state && wanted) {
-      const y = ground.horizon_px;
       this.path("", ground.grid());
-      this.path("horizon", `M0 ${y}H${photo.width_px}`);
+      this.path("horizon", `M0 ${ground.horizon_px(0)}L${photo.width_px} ${ground.horizon_px(photo.width_px)}`);
       if (state.at_px) this.path("foot", ground.circle(state.at_px, ground.cell_m / 2));
       this.words(`one square: ${ground.cell_m} m`, photo.width_px * 0.015, photo.height_px * 0.985, photo.width_px / this.stage.clientWidth);
     }
@@ -201,7 +200,7 @@ export class PictureStage {
     const box = studio.shown?.box;
     const [u, v] = [at_px[0] / photo.width_px, at_px[1] / photo.height_px];
     const onObject = box && u >= box[0] && u <= box[2] && v >= box[1] && v <= box[3];
-    const metres = ground.distance_m(onObject && studio.state?.at_px ? studio.state.at_px[1] : at_px[1]);
+    const metres = ground.distance_m(onObject && studio.state?.at_px ? studio.state.at_px : at_px);
     if (metres === null) return studio.say("the sky has no distance: click on the ground or the object");
     void studio.commit({ focus_m: Number(metres.toPrecision(4)), focus_at_px: null, camera_height_m: ground.high_m });
   }
