@@ -156,7 +156,11 @@ def test_what_nobody_told_is_in_the_command_line_too(photo: Path, tmp_path: Path
     opened, _rgb = open_photograph(photo)
     state = placed(state_of({"photo": str(photo), "object": str(CAKE), "at_px": [100, 105]}), opened)
     # 15 px below the middle of 180 the ground is 4.6 degrees below a level camera of 28 mm (187 px): 10 are usual.
-    assert state.pitch_deg is not None and state.pitch_deg == pytest.approx(10.0 - 4.6, abs=0.1) and state.camera_height_m == pytest.approx(1.5, rel=0.01)
+    assert (
+        state.pitch_deg is not None
+        and state.pitch_deg == pytest.approx(10.0 - 4.6, abs=0.1)
+        and state.camera_height_m == pytest.approx(1.5, rel=0.01)
+    )
     preview = preview_of(opened, options_of(state), KeptParts())
     assert mrbokeh(*words_of(options_of(state), tmp_path / "out.png")).returncode == 0
     stored = cv2.imread(str(tmp_path / "out.png"), cv2.IMREAD_UNCHANGED)[..., ::-1]

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: c12f47f97752effac4e574c5fc73f0f8f2a449778d9bb963bafee397d68e6ddc
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 9e192babefdb831acdd1953ecc42c09d07304098b631bdadcbed0bf5d875626b
 "use strict";
 (() => {
   // src/model.ts
@@ -529,6 +529,7 @@
   var DEEP = 50;
   var LEAST_APART = 8e-3;
   var EYES_M = 1.5;
+  var BELOW_DEG = 10;
   function lookingDown(pitch_deg) {
     const [cos, sin] = [Math.cos(pitch_deg * Math.PI / 180), Math.sin(pitch_deg * Math.PI / 180)];
     return [[1, 0, 0], [0, cos, sin], [0, -sin, cos]];
@@ -576,6 +577,15 @@
     get nearest_m() {
       const z_m = this.distance_m(this.lowest_px);
       return z_m === null ? null : z_m * this.ray(this.lowest_px)[2];
+    }
+    /** Whether the picture shows ground at all. */
+    get isInSight() {
+      return this.distance_m(this.lowest_px) !== null && this.horizon_px(this.photo.width_px / 2) < 0.97 * this.photo.height_px;
+    }
+    /** How far a camera looks down, in degrees, for which the ground at a pixel lies as deep below the horizon as it usually does. */
+    usualTilt_deg([, y_px]) {
+      const below_deg = Math.atan((y_px - this.photo.height_px / 2) / this.focal_px) * 180 / Math.PI;
+      return Number(Math.max(0, BELOW_DEG - below_deg).toFixed(1));
     }
     /** Side of a cell of the grid, metres: 1, 2 or 5 of a power of ten, about five of which fit into the lowest row. */
     get cell_m() {
@@ -656,6 +666,7 @@
     ground = byId2("ground");
     loupe = byId2("loupe");
     photoName = "";
+    hint = "";
     from = null;
     moved = [0, 0];
     later;
@@ -683,6 +694,7 @@
       const name = `${photo.name} ${studio.told?.state.photo} ${photo.width_px}`;
       if (name !== this.photoName) {
         this.photoName = name;
+        this.hint = "";
         this.before.src = `/photo?of=${encodeURIComponent(name)}`;
         this.before.decode().then(() => studio.isComplete || this.showPhotograph()).catch(() => void 0);
       }
@@ -692,6 +704,7 @@
     next() {
       const [told, state] = [studio.told, studio.state];
       if (told?.busy) return `${told.busy} ...`;
+      if (this.hint) return this.hint;
       if (!told?.photo || !state) return "";
       return state.object ? state.at_px ? "" : "Click where the object is to stand" : "Choose an object, or drop a GLB file";
     }
@@ -790,7 +803,11 @@
       if (!studio.told?.photo) return;
       if (this.stage.classList.contains("focusing")) return this.focusAt(x, y);
       if (!studio.state?.object) return studio.say("choose an object first: in the list at the right, or drop a GLB file");
-      void studio.commit({ at_px: this.inside(this.pixel(x, y)) });
+      const ground = groundOf(studio.told.photo, studio.state);
+      if (!ground || ground.isInSight) return void studio.commit({ at_px: this.inside(this.pixel(x, y)) });
+      const at_px = this.pixel(x, y);
+      void studio.commit({ at_px, camera: null, pitch_deg: ground.usualTilt_deg(at_px) });
+      this.hint = "the camera looks up, so that no ground is in sight: another tilt is taken, see Camera and ground";
     }
     /** Scale and turn the object, and keep that once the hand rests. */
     shape(factor, turn_deg) {

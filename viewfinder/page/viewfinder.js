@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: c12f47f97752effac4e574c5fc73f0f8f2a449778d9bb963bafee397d68e6ddc
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 9e192babefdb831acdd1953ecc42c09d07304098b631bdadcbed0bf5d875626b
 "use strict";
 (() => {
   // src/model.ts

@@ -13,6 +13,10 @@ from mrbokeh.commands._insertion_options import ColourOptions, LensFacts, LookGr
 from mrbokeh.system.errors import InputError
 from viewfinder.studio.state import StudioState
 
+Size = tuple[int, int]
+
+_INSIDE = 1e-3
+
 
 @dataclass(frozen=True)
 class CompositeOptions:
@@ -29,15 +33,16 @@ class CompositeOptions:
     colour: ColourOptions = field(default_factory=ColourOptions)
     result: ResultOptions = field(default_factory=ResultOptions)
 
-    def scaled(self, scale: float) -> "CompositeOptions":
-        """Return the options for the photograph made smaller: all that counts pixels is multiplied by a scale."""
-        if scale == 1.0:
+    def scaled(self, whole_px: Size, small_px: Size) -> "CompositeOptions":
+        """Return the options for the photograph made smaller, by its width and height before and after: all that counts pixels follows."""
+        if whole_px == small_px:
             return self
         height = self.standing.height
         if height is not None and height.endswith("px"):
-            height = f"{scale * float(height.removesuffix('px')):.9g}px"
-        standing = replace(self.standing, at_pixel=_scaled(self.standing.at_pixel, scale), height=height)
-        focus_at = self.optics.focus_at and ",".join(str(int(scale * float(each))) for each in self.optics.focus_at.split(","))
+            height = f"{small_px[1] / whole_px[1] * float(height.removesuffix('px')):.9g}px"
+        standing = replace(self.standing, at_pixel=_scaled(self.standing.at_pixel, whole_px, small_px), height=height)
+        focus_at = _scaled(self.optics.focus_at, whole_px, small_px)
+        focus_at = focus_at and ",".join(str(int(float(each))) for each in focus_at.split(","))
         return replace(self, standing=standing, optics=replace(self.optics, focus_at=focus_at))
 
 
@@ -118,8 +123,12 @@ def _numbers(values: tuple[float, ...]) -> str:
     return ",".join(f"{each:.9g}" for each in values)
 
 
-def _scaled(pair: str | None, scale: float) -> str | None:
-    return pair and _numbers(tuple(scale * float(each) for each in pair.split(",")))
+def _scaled(pair: str | None, whole_px: Size, small_px: Size) -> str | None:
+    """Return a pixel of the whole as that of the small picture, within it."""
+    if pair is None:
+        return None
+    places = zip(pair.split(","), whole_px, small_px, strict=True)
+    return _numbers(tuple(min(float(each) * small / whole, small - _INSIDE) for each, whole, small in places))
 
 
 def preview_scale(width_px: int, height_px: int, most_px: float) -> float:

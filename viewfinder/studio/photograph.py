@@ -54,6 +54,10 @@ class OpenedPhotograph:
         """Return the scale of a preview of at most so many pixels."""
         return preview_scale(*self.size_px, min(most_px, MOST_PX))
 
+    def small(self, options: CompositeOptions, most_px: float) -> CompositeOptions:
+        """Return the options for the photograph with at most so many pixels."""
+        return options.scaled(self.size_px, self._small_px(most_px))
+
     def plate_for(self, options: CompositeOptions, most_px: float) -> tuple[Plate, Renderer]:
         """Return the plate that `mrbokeh composite` opens by these options, made smaller, and the renderer of its blur."""
         require_one_focus(focus=options.optics.focus, focus_at=options.optics.focus_at)
@@ -66,7 +70,7 @@ class OpenedPhotograph:
         plate = _with_lens(small, held)
         if focus_at is None:
             return plate, renderer
-        focused = focused_at_pixel(plate.lens, plate.depth_m, options.scaled(self.scale(most_px)).optics.focus_at or "")
+        focused = focused_at_pixel(plate.lens, plate.depth_m, self.small(options, most_px).optics.focus_at or "")
         return _with_lens(small, replace(held, lens=focused)), renderer
 
     def upright(self, options: CompositeOptions, most_px: float) -> tuple[Plate, Renderer, float | None]:
@@ -83,14 +87,19 @@ class OpenedPhotograph:
         if standing.pitch is not None:
             plate = replace(plate, world_from_camera=looking_down(np.radians(standing.pitch)))
         elif plate.world_from_camera is None:
-            foot_px = pair_of(options.scaled(self.scale(most_px)).standing.at_pixel)
+            foot_px = pair_of(self.small(options, most_px).standing.at_pixel)
             down_rad = usual_tilt_rad(plate, plate.camera.unproject(np.array(foot_px), np.array(1.0)))
             plate = replace(plate, world_from_camera=looking_down(down_rad if down_rad >= np.radians(_LEAST_TILT_DEG) else 0.0))
         return plate, renderer, known_height_m
 
+    def _small_px(self, most_px: float) -> tuple[int, int]:
+        """Return width and height of the photograph with at most so many pixels."""
+        width_px, height_px = (max(1, round(self.scale(most_px) * each)) for each in self.size_px)
+        return width_px, height_px
+
     def _at(self, most_px: float) -> Plate:
         """Return the plate with at most so many pixels; of the sizes asked for the last few are kept."""
-        width_px, height_px = (max(1, round(self.scale(most_px) * each)) for each in self.size_px)
+        width_px, height_px = self._small_px(most_px)
         if (height_px, width_px) == self.plate.rgb.shape[:2]:
             return self.plate
         if (width_px, height_px) not in self._smaller:
@@ -166,7 +175,7 @@ def placed(state: StudioState, opened: OpenedPhotograph) -> StudioState:
         return state
     options = options_of(state)
     plate, _renderer, known_height_m = opened.upright(options, MOST_PX)
-    standing = options.scaled(opened.scale(MOST_PX)).standing
+    standing = opened.small(options, MOST_PX).standing
     high_px = HIGH_SHARE * plate.rgb.shape[0]
     if plate.depth_m is not None:
         depth_m = plate.point_under_pixel_m(*pair_of(standing.at_pixel))[2]

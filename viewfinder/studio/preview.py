@@ -48,7 +48,7 @@ def preview_of(photograph: OpenedPhotograph, options: CompositeOptions, kept: Ke
     """
     with apart() as words:
         plate, renderer, known_height_m = photograph.upright(options, most_px)
-        small = options.scaled(photograph.scale(most_px))
+        small = photograph.small(options, most_px)
         standing = small.standing
         guess(plate.depth_note)
         if plate.depth_m is None and not standing.plain:

@@ -8,6 +8,7 @@ const DEEP = 50;
 /** Least distance of two rows of the grid, in heights of the picture. */
 const LEAST_APART = 0.008;
 const EYES_M = 1.5;
+const BELOW_DEG = 10;
 
 type Point = [number, number];
 
@@ -64,6 +65,17 @@ export class Ground {
   private get nearest_m(): number | null {
     const z_m = this.distance_m(this.lowest_px);
     return z_m === null ? null : z_m * this.ray(this.lowest_px)[2];
+  }
+
+  /** Whether the picture shows ground at all. */
+  get isInSight(): boolean {
+    return this.distance_m(this.lowest_px) !== null && this.horizon_px(this.photo.width_px / 2) < 0.97 * this.photo.height_px;
+  }
+
+  /** How far a camera looks down, in degrees, for which the ground at a pixel lies as deep below the horizon as it usually does. */
+  usualTilt_deg([, y_px]: Point): number {
+    const below_deg = (Math.atan((y_px - this.photo.height_px / 2) / this.focal_px) * 180) / Math.PI;
+    return Number(Math.max(0, BELOW_DEG - below_deg).toFixed(1));
   }
 
   /** Side of a cell of the grid, metres: 1, 2 or 5 of a power of ten, about five of which fit into the lowest row. */

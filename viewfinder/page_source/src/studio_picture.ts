@@ -26,6 +26,7 @@ export class PictureStage {
   private readonly ground = byId<SVGSVGElement>("ground");
   private readonly loupe = byId<HTMLCanvasElement>("loupe");
   private photoName = "";
+  private hint = "";
   private from: Pair | null = null;
   private moved: Pair = [0, 0];
   private later: ReturnType<typeof setTimeout> | undefined;
@@ -55,6 +56,7 @@ export class PictureStage {
     const name = `${photo.name} ${studio.told?.state.photo} ${photo.width_px}`;
     if (name !== this.photoName) {
       this.photoName = name;
+      this.hint = "";
       this.before.src = `/photo?of=${encodeURIComponent(name)}`;
       this.before.decode().then(() => studio.isComplete || this.showPhotograph()).catch(() => undefined);
     }
@@ -65,6 +67,7 @@ export class PictureStage {
   private next(): string {
     const [told, state] = [studio.told, studio.state];
     if (told?.busy) return `${told.busy} ...`;
+    if (this.hint) return this.hint;
     if (!told?.photo || !state) return "";
     return state.object ? (state.at_px ? "" : "Click where the object is to stand") : "Choose an object, or drop a GLB file";
   }
@@ -172,7 +175,11 @@ export class PictureStage {
     if (!studio.told?.photo) return;
     if (this.stage.classList.contains("focusing")) return this.focusAt(x, y);
     if (!studio.state?.object) return studio.say("choose an object first: in the list at the right, or drop a GLB file");
-    void studio.commit({ at_px: this.inside(this.pixel(x, y)) });
+    const ground = groundOf(studio.told.photo, studio.state);
+    if (!ground || ground.isInSight) return void studio.commit({ at_px: this.inside(this.pixel(x, y)) });
+    const at_px = this.pixel(x, y);
+    void studio.commit({ at_px, camera: null, pitch_deg: ground.usualTilt_deg(at_px) });
+    this.hint = "the camera looks up, so that no ground is in sight: another tilt is taken, see Camera and ground";
   }
 
   /** Scale and turn the object, and keep that once the hand rests. */
