@@ -26,12 +26,14 @@ class KeptParts:
 
     draft: while True, pictures are made in a hurry, as while an object is dragged: the last place's light serves every place, edges have
     fewer steps, and light on the ground is computed in few pixels. small: while True, objects that were prepared are only moved, which
-    differs by rounding, as nobody sees in a picture made smaller.
+    differs by rounding, as nobody sees in a picture made smaller. holds_light: while True, the last place's light serves,
+    as for a part of a picture, which does not show its surroundings.
     """
 
     assets: Assets = field(default_factory=Assets)
     draft: bool = False
     small: bool = False
+    holds_light: bool = False
     _renderers: "dict[tuple[str, int, bool], SceneRenderer]" = field(default_factory=dict)
     _around: tuple[object, Surroundings] | None = None
     _light: "tuple[object, tuple[Environment, tuple[Light, ...]]] | None" = None
@@ -60,7 +62,7 @@ class KeptParts:
     ) -> "tuple[Environment, tuple[Light, ...]]":
         """Return `picture_light`, the very same objects for the same place, because renderers keep what they prepared for them."""
         key = (plate.rgb.shape, foot_px, world_from_camera.tobytes())
-        if self._around is None or (self._around[0] != key and not self.draft):
+        if self._around is None or (self._around[0] != key and not (self.draft or self.holds_light)):
             self._around = key, surroundings_of(plate, foot_px, world_from_camera)
         lit_by = (self._around[0], sun_degrees)
         if self._light is None or self._light[0] != lit_by:

@@ -36,6 +36,7 @@ from tests.support.refusals import refused
 from tests.support.waiting import comes_true, wait_until
 from viewfinder.studio import desk as desks
 from viewfinder.studio.command_line import command_line, options_of, words_of
+from viewfinder.studio.loupe import Region, WholePhotograph, region_of
 from viewfinder.studio.photograph import MOST_PX, OpenedPhotograph, open_photograph, placed
 from viewfinder.studio.preview import Previewer, Wish, preview_of
 from viewfinder.studio.project import Project, read_project
@@ -43,6 +44,7 @@ from viewfinder.studio.running import StudioOptions, project_of
 from viewfinder.studio.state import StudioState, state_of
 
 AT_PX = (120.0, 140.0)
+PLACED = {"object": str(CAKE), "at_px": AT_PX}
 
 
 @pytest.fixture
@@ -105,6 +107,27 @@ def test_a_smaller_preview_shows_the_same_place_and_size(photo: Path) -> None:
     options = options_of(whole_state(photo, height="60px"))
     boxes = [preview_of(opened, options, KeptParts(), most_px).told["box"] for most_px in (MOST_PX, WIDTH * HEIGHT / 9)]
     np.testing.assert_allclose(boxes[1], boxes[0], atol=1.5 / (WIDTH / 3))
+
+
+def test_the_loupe_shows_the_finished_picture_pixel_by_pixel(tmp_path: Path) -> None:
+    """Of a photograph larger than its preview, 1200 by 900 px; grain would differ. Beyond the frame it is black."""
+    photo = write_floor(tmp_path / "large.png", 1200, 900)
+    options = options_of(whole_state(photo, at_px=(600, 700), f_number=1.4, focus_m=2.0, matched=False))
+    opened, _rgb = open_photograph(photo)
+    kept = KeptParts()
+    kept.small = True
+    preview = preview_of(opened, options, kept)
+    assert preview.rgb.shape[0] < 900
+    kept.holds_light = True
+    side_px, blur_px = 120, preview.told["coc_px"][1]
+    shown = region_of(WholePhotograph(opened), options, kept, Region(600.0, 700.0, side_px, blur_px))
+    beside = region_of(WholePhotograph(opened), options, kept, Region(0.0, 0.0, side_px, blur_px))
+    assert mrbokeh(*words_of(options, tmp_path / "out.png")).returncode == 0
+    stored = cv2.imread(str(tmp_path / "out.png"), cv2.IMREAD_UNCHANGED)[640:760, 540:660, ::-1]
+    # In codes of 8 bits: the light on the ground is interpolated between other points, and the light is that of the smaller photograph.
+    apart = np.abs(srgb_codes(shown, np.uint16).astype(int) - stored) / 257
+    assert apart.mean() < 0.3 and apart.max() < 25
+    assert (beside[:60] == 0.0).all() and (beside[60:, 60:] > 0.0).all()
 
 
 def test_metres_follow_from_the_first_place_and_then_stay(photo: Path) -> None:
@@ -305,6 +328,7 @@ async def test_what_a_page_may_not_ask_for_is_refused_in_a_sentence(photo: Path,
             ("preview", {"page": "p", "pixels": 1e5}, "no object yet"),
             ("preview", {"page": "../", "pixels": 1e5}, "the page that asks"),
             ("preview", {"page": "p", "pixels": "many"}, "how many pixels"),
+            ("preview", {"page": "p", "pixels": 1e5, "changes": PLACED, "region": [1, 2]}, "region of a loupe"),
         ):
             status, answer = await asked(one, made.url + path, message)
             assert status == 400 and why in answer["error"], (path, answer)

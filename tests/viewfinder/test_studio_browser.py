@@ -186,6 +186,11 @@ async def test_light_lens_and_before_are_shown(tmp_path: Path) -> None:
         assert await page.value(shown)
         await page.send("Input.dispatchMouseEvent", type="mouseReleased", x=left + 5, y=top + 5, button="left", clickCount=1)
         assert not await page.value(shown)
+        await page.tap("#magnify")
+        left, top, width, height = await page.box("#stage")
+        await page.send("Input.dispatchMouseEvent", type="mouseMoved", x=left + width / 2, y=top + 0.7 * height)
+        await page.comes_true("Number(document.getElementById('loupe').dataset.looked) > 0", 30.0)
+        assert (await page.box("#loupe"))[2] == 240
         assert page.errors == []
 
 

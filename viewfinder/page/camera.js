@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 9e192babefdb831acdd1953ecc42c09d07304098b631bdadcbed0bf5d875626b
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 8e9606e5f387591f93a7d24b5b87ffbce01f0b1f9e61d3a6483ef3ea7cf49894
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 9e192babefdb831acdd1953ecc42c09d07304098b631bdadcbed0bf5d875626b
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 8e9606e5f387591f93a7d24b5b87ffbce01f0b1f9e61d3a6483ef3ea7cf49894
 "use strict";
 (() => {
   // src/model.ts
@@ -195,6 +195,16 @@
     }
     async whole(change) {
       if (change === this.changes) await this.ask(false, change);
+    }
+    /** The part of the finished picture around a pixel, as the loupe shows it; null where another one was asked for since. */
+    async region(x_px, y_px, side_px) {
+      const region = [x_px, y_px, side_px, this.shown?.coc_px[1] ?? 0];
+      const message = { changes: { ...this.sending, ...this.local }, pixels: this.pixels, page: pageName, region };
+      const answer = await fetch("/preview", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(message) });
+      if (answer.status !== 200) return null;
+      const body = await answer.arrayBuffer();
+      const length = new DataView(body).getUint32(0);
+      return createImageBitmap(new Blob([new Uint8Array(body, 4 + length)], { type: "image/jpeg" }));
     }
     async ask(draft, change) {
       const began = performance.now();
@@ -652,6 +662,7 @@
   var NUDGES_REST_MS = 500;
   var LOUPE_PX = 240;
   var DRAWN_AGAIN_MS = 900;
+  var LOOKS_MS = 150;
   var byId2 = (id) => document.getElementById(id);
   function scaledHeight(height, factor) {
     if (height === null) return null;
@@ -670,6 +681,7 @@
     from = null;
     moved = [0, 0];
     later;
+    looking;
     quiet;
     constructor() {
       new ResizeObserver(() => this.fit()).observe(byId2("room"));
@@ -785,7 +797,7 @@
           this.stage.classList.add("dragging");
         },
         drag: (_x, _y, dx, dy) => {
-          if (!this.from || !studio.state?.object) return;
+          if (!this.from || !studio.state?.object || !this.loupe.hidden) return;
           const scale = studio.told.photo.width_px / this.stage.clientWidth;
           this.moved = [this.moved[0] + dx * scale, this.moved[1] + dy * scale];
           studio.change({ at_px: this.inside([this.from[0] + this.moved[0], this.from[1] + this.moved[1]]) });
@@ -886,29 +898,26 @@
       hold.addEventListener("keydown", (event) => (event.key === " " || event.key === "Enter") && show(true));
       hold.addEventListener("keyup", () => show(false));
     }
-    /** Show the preview under the pointer with one pixel of the photograph to one of the screen. */
+    /** Show what lies under the pointer with one pixel of the photograph to one of the screen: the preview, then the finished picture. */
     magnify(event) {
       const box = this.stage.getBoundingClientRect();
       const [x, y] = [event.clientX - box.left, event.clientY - box.top];
       const photo = studio.told.photo;
-      const shown = this.picture.width / photo.width_px;
-      const side = LOUPE_PX * shown;
-      const context = this.loupe.getContext("2d");
-      context.fillRect(0, 0, LOUPE_PX, LOUPE_PX);
-      context.drawImage(
-        this.picture,
-        x / box.width * this.picture.width - side / 2,
-        y / box.height * this.picture.height - side / 2,
-        side,
-        side,
-        0,
-        0,
-        LOUPE_PX,
-        LOUPE_PX
-      );
-      const left = Math.min(box.width - LOUPE_PX, Math.max(0, x + 20));
-      const top = Math.min(box.height - LOUPE_PX, Math.max(0, y - LOUPE_PX - 20));
-      Object.assign(this.loupe.style, { left: `${left}px`, top: `${top}px` });
+      const side = LOUPE_PX * devicePixelRatio;
+      this.loupe.width = this.loupe.height = side;
+      const cut = side * this.picture.width / photo.width_px;
+      const [left, top] = [x / box.width * this.picture.width - cut / 2, y / box.height * this.picture.height - cut / 2];
+      this.loupe.getContext("2d").drawImage(this.picture, left, top, cut, cut, 0, 0, side, side);
+      const within = (value, most) => Math.min(Math.max(0, most - LOUPE_PX), Math.max(0, value));
+      Object.assign(this.loupe.style, { left: `${within(x + 20, box.width)}px`, top: `${within(y - LOUPE_PX - 20, box.height)}px` });
+      clearTimeout(this.looking);
+      this.looking = setTimeout(() => void this.look(this.pixel(event.clientX, event.clientY), side), LOOKS_MS);
+    }
+    async look([x_px, y_px], side) {
+      const timer = this.looking;
+      const bitmap = studio.isComplete ? await studio.region(x_px, y_px, side).catch(() => null) : null;
+      if (bitmap && timer === this.looking && !this.loupe.hidden) this.loupe.getContext("2d").drawImage(bitmap, 0, 0, side, side);
+      if (bitmap) this.loupe.dataset.looked = String(Number(this.loupe.dataset.looked ?? 0) + 1);
     }
   };
 

@@ -23,6 +23,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.system.channel import apart, guess, warn
 from mrbokeh.system.errors import InputError
 from viewfinder.studio.command_line import CompositeOptions
+from viewfinder.studio.loupe import Region, WholePhotograph, region_of
 from viewfinder.studio.photograph import MOST_PX, OpenedPhotograph
 
 _log = logging.getLogger(__name__)
@@ -105,12 +106,16 @@ def jpeg_of(rgb: Float32[np.ndarray, "height width 3"], quality: int = _QUALITY)
 
 @dataclass
 class Wish:
-    """Picture that a page waits for; its answer is (what is told, JPEG), or None where a newer wish of the page took its place."""
+    """Picture that a page waits for, or a region of it.
+
+    answer: (what is told, JPEG), or None where a newer wish of the page took its place.
+    """
 
     photograph: OpenedPhotograph
     options: CompositeOptions
     most_px: float
     draft: bool
+    region: Region | None = None
     answer: "Future[tuple[dict[str, Any], bytes] | None]" = field(default_factory=Future)
 
 
@@ -122,6 +127,7 @@ class Previewer:
         self._changed = Condition()
         self._ended = False
         self._kept: tuple[OpenedPhotograph, KeptParts] | None = None
+        self._whole: WholePhotograph | None = None
         self._draft_px, self._slow = _FIRST_PX, 0
         self._thread = Thread(target=self._work, name=name, daemon=True)
         self._thread.start()
@@ -167,6 +173,9 @@ class Previewer:
         if self._kept is None or self._kept[0] is not wish.photograph:
             self._kept = wish.photograph, KeptParts()
         kept, began_s = self._kept[1], time.perf_counter()
+        if wish.region is not None:
+            return self._region(wish, wish.region, kept)
+        kept.holds_light = False
         kept.draft, kept.small = wish.draft, wish.photograph.scale(wish.most_px) < 1.0
         most_px = min(wish.most_px, self._draft_px) if wish.draft else wish.most_px
         preview = preview_of(wish.photograph, wish.options, kept, most_px)
@@ -176,6 +185,12 @@ class Previewer:
             self._adapt(took_s)
         size_px = [preview.rgb.shape[1], preview.rgb.shape[0]]
         return preview.told | {"ms": round(1e3 * took_s), "size_px": size_px, "draft": wish.draft}, jpeg
+
+    def _region(self, wish: Wish, region: Region, kept: KeptParts) -> tuple[dict[str, Any], bytes]:
+        if self._whole is None or self._whole.photograph is not wish.photograph:
+            self._whole = WholePhotograph(wish.photograph)
+        kept.draft, kept.small, kept.holds_light = False, True, True
+        return {"region": True}, jpeg_of(region_of(self._whole, wish.options, kept, region))
 
     def _adapt(self, took_s: float) -> None:
         """Choose the next draft's size by what the last one took, in steps, as a new size has to be prepared."""

@@ -21,6 +21,7 @@ from viewfinder.studio.saving import FORMATS
 from viewfinder.studio.state import StudioState
 
 if TYPE_CHECKING:
+    from viewfinder.studio.loupe import Region
     from viewfinder.studio.photograph import OpenedPhotograph
     from viewfinder.studio.preview import Previewer
 
@@ -33,6 +34,7 @@ _LARGEST_MESSAGE = 8192
 _NEWS_WAIT_S = 20.0
 _LARGEST_SCREEN_PX = 1e6
 _FEW_PX = 1e4
+_LARGEST_LOUPE_PX = 800
 _PAGE_NAME = re.compile(r"\w{1,40}", re.ASCII)
 _TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".tif": "image/tiff", ".exr": "image/x-exr"}
 
@@ -136,7 +138,7 @@ class StudioSite:
         return web.json_response(self._told())
 
     async def _preview(self, request: web.Request) -> web.Response:
-        """Handle POST /preview: {"changes", "draft", "pixels", "page"}; the answer is a length, JSON of that length, and a JPEG.
+        """Handle POST /preview: {"changes", "draft", "pixels", "page", "region"}; the answer is a length, JSON of that length, and a JPEG.
 
         204 says that the page has asked for a newer picture since.
         """
@@ -152,8 +154,9 @@ class StudioSite:
         options = options_of(placed_state(state, opened))
         if draft not in self._previewers:
             self._previewers[draft] = Previewer("studio drafts" if draft else "studio previews")
-        wish = Wish(photograph=opened, options=options, most_px=min(float(pixels), _LARGEST_SCREEN_PX), draft=draft)
-        made = await asyncio.wrap_future(self._previewers[draft].ask(page, wish))
+        region = _region_of(message.get("region"))
+        wish = Wish(photograph=opened, options=options, most_px=min(float(pixels), _LARGEST_SCREEN_PX), draft=draft, region=region)
+        made = await asyncio.wrap_future(self._previewers[draft].ask(f"{page} loupe" if region else page, wish))
         if made is None:
             return web.Response(status=204)
         told, jpeg = made
@@ -208,7 +211,7 @@ def _photo_told(opened: "OpenedPhotograph", state: StudioState) -> dict[str, Any
             plate, _renderer, known_height_m = opened.upright(options_of(whole), _FEW_PX)
             eyes_m = placed_state(whole, opened).camera_height_m or known_height_m
         held = plate.world_from_camera
-        shown |= {"focal_px": plate.camera.focal_px[0] * width_px / plate.camera.width_px, "lens_f_number": plate.lens.f_number}
+        shown |= {"focal_px": plate.lens.focal_px(width_px), "lens_f_number": plate.lens.f_number}
         shown |= {"camera_height_m": eyes_m, "world_from_camera": None if held is None else held.tolist()}
         shown |= {"pitch_deg": None if held is None else round(looks_down_deg(plate), 2)}
     except InputError as problem:
@@ -222,6 +225,19 @@ def _anywhere(state: StudioState, opened: "OpenedPhotograph") -> StudioState:
     """Return a complete state, where something is missing still, by which the lens is found."""
     middle_px = (0.5 * opened.size_px[0], 0.8 * opened.size_px[1])
     return replace(state, photo=opened.path, object=state.object or Path("object.glb"), at_px=state.at_px or middle_px)
+
+
+def _region_of(value: Any) -> "Region | None":
+    """Return the region that a loupe shows: [x, y, side, blur] in pixels of the photograph. Raises InputError."""
+    from viewfinder.studio.loupe import Region
+
+    if value is None:
+        return None
+    sound = isinstance(value, list) and len(value) == 4
+    if not sound or not all(isinstance(each, int | float) and not isinstance(each, bool) and -1e6 < each < 1e6 for each in value):
+        raise InputError(f"expected the region of a loupe as x, y, side and blur in pixels, got {str(value)[:60]!r}")
+    x_px, y_px, side_px, blur_px = value
+    return Region(float(x_px), float(y_px), max(16, min(_LARGEST_LOUPE_PX, int(side_px))), max(0.0, float(blur_px)))
 
 
 async def _message(request: web.Request) -> dict[str, Any]:

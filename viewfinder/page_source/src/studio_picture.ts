@@ -6,6 +6,7 @@ import { type Pair, studio } from "./studio_model";
 const NUDGES_REST_MS = 500;
 const LOUPE_PX = 240;
 const DRAWN_AGAIN_MS = 900;
+const LOOKS_MS = 150;
 
 const byId = <T extends Element>(id: string): T => document.getElementById(id) as unknown as T;
 
@@ -30,6 +31,7 @@ export class PictureStage {
   private from: Pair | null = null;
   private moved: Pair = [0, 0];
   private later: ReturnType<typeof setTimeout> | undefined;
+  private looking: ReturnType<typeof setTimeout> | undefined;
   private quiet: ReturnType<typeof setTimeout> | undefined;
 
   constructor() {
@@ -156,7 +158,8 @@ export class PictureStage {
         this.stage.classList.add("dragging");
       },
       drag: (_x, _y, dx, dy) => {
-        if (!this.from || !studio.state?.object) return;
+        // Under the loupe a finger looks, and moves nothing.
+        if (!this.from || !studio.state?.object || !this.loupe.hidden) return;
         const scale = studio.told!.photo!.width_px / this.stage.clientWidth;
         this.moved = [this.moved[0] + dx * scale, this.moved[1] + dy * scale];
         studio.change({ at_px: this.inside([this.from[0] + this.moved[0], this.from[1] + this.moved[1]]) });
@@ -264,29 +267,26 @@ export class PictureStage {
     hold.addEventListener("keyup", () => show(false));
   }
 
-  /** Show the preview under the pointer with one pixel of the photograph to one of the screen. */
+  /** Show what lies under the pointer with one pixel of the photograph to one of the screen: the preview, then the finished picture. */
   private magnify(event: PointerEvent): void {
     const box = this.stage.getBoundingClientRect();
     const [x, y] = [event.clientX - box.left, event.clientY - box.top];
     const photo = studio.told!.photo!;
-    const shown = this.picture.width / photo.width_px;
-    const side = LOUPE_PX * shown;
-    const context = this.loupe.getContext("2d")!;
-    context.fillRect(0, 0, LOUPE_PX, LOUPE_PX);
-    context.drawImage(
-      this.picture,
-      (x / box.width) * this.picture.width - side / 2,
-      (y / box.height) * this.picture.height - side / 2,
-      side,
-      side,
-      0,
-      0,
-      LOUPE_PX,
-      LOUPE_PX,
-    );
-    const left = Math.min(box.width - LOUPE_PX, Math.max(0, x + 20));
-    const top = Math.min(box.height - LOUPE_PX, Math.max(0, y - LOUPE_PX - 20));
-    Object.assign(this.loupe.style, { left: `${left}px`, top: `${top}px` });
+    const side = LOUPE_PX * devicePixelRatio;
+    this.loupe.width = this.loupe.height = side;
+    const cut = (side * this.picture.width) / photo.width_px;
+    const [left, top] = [(x / box.width) * this.picture.width - cut / 2, (y / box.height) * this.picture.height - cut / 2];
+    this.loupe.getContext("2d")!.drawImage(this.picture, left, top, cut, cut, 0, 0, side, side);
+    const within = (value: number, most: number): number => Math.min(Math.max(0, most - LOUPE_PX), Math.max(0, value));
+    Object.assign(this.loupe.style, { left: `${within(x + 20, box.width)}px`, top: `${within(y - LOUPE_PX - 20, box.height)}px` });
+    clearTimeout(this.looking);
+    this.looking = setTimeout(() => void this.look(this.pixel(event.clientX, event.clientY), side), LOOKS_MS);
+  }
+
+  private async look([x_px, y_px]: Pair, side: number): Promise<void> {
+    const timer = this.looking;
+    const bitmap = studio.isComplete ? await studio.region(x_px, y_px, side).catch(() => null) : null;
+    if (bitmap && timer === this.looking && !this.loupe.hidden) this.loupe.getContext("2d")!.drawImage(bitmap, 0, 0, side, side);
+    if (bitmap) this.loupe.dataset.looked = String(Number(this.loupe.dataset.looked ?? 0) + 1);
   }
 }
-
