@@ -32,7 +32,7 @@ EVERYDAY = {
     "track convert": "size format overwrite",
     "viewfinder": "source demo scene board lens lan",
     "viewfinder calibrate-phone": "source phone phone-camera board out",
-    "studio": "object lens project pictures lan",
+    "studio": "object depth lens project pictures lan",
 }
 """Options of a command that most people need, which come first."""
 

@@ -26,18 +26,22 @@ from typer.main import get_command
 from mrbokeh.commands._composite_kept import KeptParts
 from mrbokeh.commands.composite import app as composite
 from mrbokeh.images.color import srgb_codes
-from mrbokeh.images.image_io import write_image
+from mrbokeh.images.image_io import write_image, write_layer
+from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.scene.staging.scene_description import looking_down
+from mrbokeh.solving.solved_camera import HIGH, LOW, SOLVED, SolvedCamera
 from mrbokeh.system.errors import InputError
 from tests.support.command_line import mrbokeh
 from tests.support.made_studio import ALIEN, CAKE, HEIGHT, WIDTH, made_studio, write_floor
 from tests.support.refusals import refused
 from tests.support.waiting import comes_true, wait_until
 from viewfinder.studio import desk as desks
+from viewfinder.studio import photograph
 from viewfinder.studio.command_line import command_line, options_of, words_of
 from viewfinder.studio.loupe import Region, WholePhotograph, region_of
-from viewfinder.studio.photograph import MOST_PX, OpenedPhotograph, open_photograph, placed
+from viewfinder.studio.photograph import MOST_PX, OpenedPhotograph, open_photograph, placed, shrunk
 from viewfinder.studio.preview import Previewer, Wish, preview_of
 from viewfinder.studio.project import Project, read_project
 from viewfinder.studio.running import StudioOptions, project_of
@@ -145,10 +149,6 @@ def test_metres_follow_from_the_first_place_and_then_stay(photo: Path) -> None:
 
 async def test_a_camera_from_lines_is_taken_where_nobody_chose_one(photo: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Turned by 2 degrees and looking down by 10: the command line names its file, and makes the preview's picture."""
-    from mrbokeh.scene.staging.scene_description import looking_down
-    from mrbokeh.solving.solved_camera import HIGH, LOW, SOLVED, SolvedCamera
-    from viewfinder.studio import photograph
-
     turned = looking_down(np.radians(10.0), np.radians(2.0)).T
     found = SolvedCamera(WIDTH, HEIGHT, 240.0, SOLVED, camera_from_world=turned, confidence=HIGH)
     monkeypatch.setattr(photograph, "solved", lambda _: found)
@@ -273,13 +273,14 @@ def test_options_of_the_command_are_checked_before_anything_listens(photo: Path,
         ([photo, "--object", "gone.glb"], "GLB file"),
         ([photo, "--object", photo], "to be a .glb file"),
         ([photo, "--lens", photo], "lens file"),
+        ([photo, "--depth", "gone.exr"], "depth of the photograph"),
         ([photo, "--interface", "eth0"], "--lan"),
         ([photo, "--pictures", photo], "is a file"),
     ):
         done = mrbokeh("studio", *words)
         assert done.returncode == 2 and why in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
     write_lens(tmp_path / "lens.json", Lens(35.0, 2.8, 1.0, 23.5))
-    project = project_of(StudioOptions(photo, CAKE, (tmp_path / "lens.json",), pictures=tmp_path))
+    project = project_of(StudioOptions(photo, CAKE, lenses=(tmp_path / "lens.json",), pictures=tmp_path))
     assert project.state == StudioState(photo=photo, object=CAKE) and project.lenses == [tmp_path / "lens.json"]
     assert project.path == tmp_path / "a floor.studio.json"
 
@@ -426,13 +427,11 @@ def test_a_studio_that_was_killed_goes_on_where_it_was(photo: Path, tmp_path: Pa
 
 def test_a_photograph_with_depth_keeps_its_depth_when_it_is_made_smaller(photo: Path) -> None:
     """Depth is picked, so that it has no values between those of two surfaces."""
-    from viewfinder.studio.photograph import shrunk
-
     opened, _rgb = open_photograph(photo)
     depth_m = np.where(np.arange(WIDTH) < WIDTH // 2, 1.0, 9.0).astype(np.float32) * np.ones((HEIGHT, 1), np.float32)
     small = shrunk(replace(opened.plate, depth_m=depth_m), 77, 58)
     assert small.depth_m is not None and set(np.unique(small.depth_m)) == {1.0, 9.0} and small.camera.width_px == 77
-    with_depth = OpenedPhotograph(photo, opened.told, None, replace(opened.plate, depth_m=depth_m))
+    with_depth = OpenedPhotograph(photo, None, opened.told, None, plate=replace(opened.plate, depth_m=depth_m))
     state = placed(state_of({"photo": str(photo), "object": str(CAKE), "at_px": [30, 140]}), with_depth)
     assert state.camera_height_m is None and state.height is not None
     far = preview_of(with_depth, options_of(replace(state, focus_at_px=(200.0, 100.0))), KeptParts())
@@ -445,3 +444,26 @@ def test_a_picture_of_one_pixel_is_no_fault(tmp_path: Path) -> None:
     options = options_of(whole_state(tmp_path / "dot.png", at_px=(0.5, 0.5)))
     with pytest.raises(InputError):
         preview_of(opened, options, KeptParts())
+
+
+async def test_depth_of_a_file_hides_what_stands_behind(photo: Path, tmp_path: Path) -> None:
+    """A wall 2 m away in the left half, and the floor farther than it: the cake at 4 m is hidden there; the command line says --depth."""
+    rows = np.mgrid[:HEIGHT, :WIDTH][0]
+    floor_m = 1.2 * 187.0 / np.maximum(rows + 0.5 - HEIGHT / 2, 1.0)
+    depth_m = np.where(np.arange(WIDTH) < WIDTH // 2, np.minimum(floor_m, 2.0), floor_m).astype(np.float32)
+    write_layer(tmp_path / "depth.exr", Layer(np.zeros((HEIGHT, WIDTH, 3), np.float32), np.ones_like(depth_m), depth_m))
+    project = project_of(StudioOptions(photo, CAKE, tmp_path / "depth.exr", pictures=tmp_path))
+    project.add(replace(project.state, at_px=(122.0, 145.0), height="0.8"))
+    project.write()
+    assert read_project(project.path).state.depth == project.state.depth
+    opened, _rgb = open_photograph(photo, project.state.depth)
+    options = options_of(placed(project.state, opened))
+    preview = preview_of(opened, options, KeptParts())
+    assert "--depth" in words_of(options, tmp_path / "out.png") and options.standing.camera_height is None
+    assert mrbokeh(*words_of(options, tmp_path / "out.png")).returncode == 0
+    stored = cv2.imread(str(tmp_path / "out.png"), cv2.IMREAD_UNCHANGED)[..., ::-1]
+    np.testing.assert_array_equal(srgb_codes(preview.rgb, np.uint16), stored)
+    changed = np.abs(preview.rgb - opened.plate.rgb).max(axis=2) > 0.05
+    left, top, right, bottom = preview.told["box"]
+    inside = changed[int(top * HEIGHT) : int(bottom * HEIGHT)]
+    assert left < 0.5 < right and inside[:, WIDTH // 2 + 4 :].any() and not inside[:, : WIDTH // 2 - 4].any()

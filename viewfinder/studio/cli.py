@@ -19,6 +19,12 @@ def studio(
         typer.Argument(metavar="PHOTO", help="A photograph (RAW, JPEG, HEIC, TIFF, PNG), or the .json project of an earlier time."),
     ] = None,
     object_: Annotated[Path | None, typer.Option("--object", help="GLB file to render and put in.")] = None,
+    depth: Annotated[
+        Path | None,
+        typer.Option(
+            help="Depth of the photograph: EXR with Z, PNG or TIFF, a phone's photograph. Default: PHOTO's own, else level ground."
+        ),
+    ] = None,
     lens: Annotated[
         list[Path] | None, typer.Option(help="LENS.json, or NETWORK.onnx (repeat: the page switches between them); else the photograph's.")
     ] = None,
@@ -46,4 +52,4 @@ def studio(
     from viewfinder.studio.running import StudioOptions, serve
 
     listening = ListeningOptions(port=port, lan=lan, interface=interface, tls=tls, tls_key=tls_key, qr=qr)
-    serve(StudioOptions(photo, object_, tuple(lens or ()), project=project, pictures=pictures, listening=listening))
+    serve(StudioOptions(photo, object_, depth, tuple(lens or ()), project=project, pictures=pictures, listening=listening))

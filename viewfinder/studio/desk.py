@@ -36,7 +36,7 @@ class Desk:
         self.busy = ""
         self._number = 0
         self._changed = asyncio.Event()
-        self._opened: dict[Path, OpenedPhotograph] = {}
+        self._opened: dict[tuple[Path | None, Path | None], OpenedPhotograph] = {}
         self._cameras: dict[Path, dict[str, Any]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
 
@@ -47,7 +47,7 @@ class Desk:
     @property
     def photograph(self) -> "OpenedPhotograph | None":
         """The opened photograph of the state, None while there is none."""
-        return None if self.state.photo is None else self._opened.get(self.state.photo)
+        return self._opened.get((self.state.photo, self.state.depth))
 
     @property
     def number(self) -> int:
@@ -72,7 +72,7 @@ class Desk:
     def start(self) -> None:
         """Open the photograph of the state, if there is one."""
         if self.state.photo is not None:
-            self._begin(self._open(self.state.photo))
+            self._begin(self._open(self.state.photo, self.state.depth))
 
     async def close(self) -> None:
         for task in self._tasks:
@@ -85,20 +85,21 @@ class Desk:
             raise InputError(f"expected the changes of the state as names and values, got {type(changes).__name__}")
         document = self.state.document() | {str(name): value for name, value in changes.items()}
         state = state_of(document)
-        for name, known in (
-            ("object", self.project.objects),
-            ("lens", self.project.lenses),
-            ("photo", [self.state.photo]),
-            ("camera", self._known_cameras()),
-        ):
+        for name, known in self._known_files().items():
             if (path := getattr(state, name)) is not None and path not in known:
                 raise InputError(f"the page may choose only what it was offered, but {name} is {str(path)[:60]!r}: drop the file on it")
         return state
 
-    def _known_cameras(self) -> list[Path | None]:
-        """Return the files of cameras that the page may choose: the one in use, and the one found."""
+    def _known_files(self) -> dict[str, list[Path | None]]:
+        """Return the files that the page may choose: what was offered, what is in use, and the camera that was found."""
         found = self._cameras.get(self.state.photo, {}).get("file") if self.state.photo is not None else None
-        return [self.state.camera, Path(found) if found else None]
+        return {
+            "object": [*self.project.objects],
+            "lens": [*self.project.lenses],
+            "photo": [self.state.photo],
+            "depth": [self.state.depth],
+            "camera": [self.state.camera, Path(found) if found else None],
+        }
 
     async def change(self, changes: Any) -> None:
         """Take changes of a page over, complete what follows from them, and keep the project."""
@@ -113,7 +114,7 @@ class Desk:
         self.project.step(int(by))
         self._keep()
         if self.state.photo is not None and self.photograph is None:
-            self._begin(self._open(self.state.photo))
+            self._begin(self._open(self.state.photo, self.state.depth))
 
     async def upload(self, kind: str, name: str, body: AsyncIterator[bytes]) -> None:
         """Keep a file that was dropped on the page, if it is what it should be. Raises InputError."""
@@ -137,7 +138,7 @@ class Desk:
         else:
             self.project.add(StudioState(photo=path, object=self.state.object, lens=self.state.lens))
             self._keep()
-            self._begin(self._open(path))
+            self._begin(self._open(path, None))
 
     def _require_photograph(self, path: Path) -> None:
         from viewfinder.studio.photograph import open_photograph
@@ -160,15 +161,15 @@ class Desk:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _open(self, path: Path) -> None:
+    async def _open(self, path: Path, depth: Path | None) -> None:
         """Open a photograph, then look for its camera."""
         self.busy = "opening the photograph"
         self.tell_all()
         try:
-            opened, camera = await asyncio.to_thread(_opened_photograph, path)
+            opened, camera = await asyncio.to_thread(_opened_photograph, path, depth)
             while len(self._opened) >= _KEPT_PHOTOGRAPHS:
                 del self._opened[next(iter(self._opened))]
-            self._opened[path] = opened
+            self._opened[path, depth] = opened
             self.busy = "looking for the camera in the picture's lines" if path not in self._cameras else ""
             self.tell_all()
             if path not in self._cameras:
@@ -186,7 +187,8 @@ class Desk:
     def _take_camera(self, path: Path) -> None:
         """Give the state the camera of the picture's lines, if it is still that photograph's and nobody chose how it was held."""
         state, found = self.state, self._cameras[path]
-        is_free = state.camera is None and state.pitch_deg is None and not self._opened[path].has_depth
+        opened = self.photograph
+        is_free = state.camera is None and state.pitch_deg is None and opened is not None and not opened.has_depth
         if state.photo == path and is_free and found.get("is_sure"):
             self.project.amend(lambda state: replace(state, camera=Path(found["file"])))
             self._keep()
@@ -206,12 +208,12 @@ class Desk:
         return None if self.state.photo is None else self._cameras.get(self.state.photo)
 
 
-def _opened_photograph(path: Path) -> "tuple[OpenedPhotograph, Callable[[], SolvedCamera | str]]":
+def _opened_photograph(path: Path, depth: Path | None) -> "tuple[OpenedPhotograph, Callable[[], SolvedCamera | str]]":
     """Return the photograph, and what looks for its camera: it returns the camera, or the sentence why there is none."""
     from viewfinder.studio.photograph import open_photograph, solved
 
     with apart() as words:
-        opened, rgb = open_photograph(path)
+        opened, rgb = open_photograph(path, depth)
     for warning in words.warnings:
         say(f"warning: {warning}", err=True)
 
@@ -241,7 +243,7 @@ def _camera_found(look: "Callable[[], SolvedCamera | str]", path: Path) -> dict[
 
     camera = look()
     if isinstance(camera, str):
-        return {"told": camera}
+        return {"told": f"{camera.partition(': give ')[0]}: set below how far the camera looks down."}
     write_solved_camera(path, camera)
     sd = f" ± {camera.pitch_sd_deg:.1f}" if camera.pitch_sd_deg > 0.05 else ""
     way, rolled = "up" if camera.pitch_deg > 0 else "down", f", turned by {camera.roll_deg:.1f}°" if abs(camera.roll_deg) > 0.5 else ""

@@ -10,15 +10,14 @@ from mrbokeh.commands._composite_kept import KeptParts
 from mrbokeh.commands._composite_parts import layers_by
 from mrbokeh.commands._level_ground import on_level_ground, pair_of
 from mrbokeh.compositing.choose import best_mode, insertion_of
-from mrbokeh.compositing.plate import LensWishes, Plate, phone_photo, photograph_plate
+from mrbokeh.compositing.plate import Plate, phone_photo
 from mrbokeh.layering.pixel_box import Box, is_same_everywhere
 from mrbokeh.optics.camera import camera_of_lens
-from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.stacks.photograph import read_photograph
 from mrbokeh.system.channel import apart
 from viewfinder.studio.command_line import CompositeOptions
-from viewfinder.studio.photograph import OpenedPhotograph
+from viewfinder.studio.photograph import OpenedPhotograph, whole_plate
 
 _MOST_MARGIN_PX, _SPARE_PX = 300, 8
 
@@ -45,7 +44,7 @@ class WholePhotograph:
         path, plate = self.photograph.path, self.photograph.plate
         if plate.rgb.shape[1::-1] != self.photograph.size_px:
             with apart():
-                plate = photograph_plate(path, read_photograph(path), phone_photo(path), LensWishes(lens=Lens.default()))
+                plate = whole_plate(path, read_photograph(path), phone_photo(path), self.photograph.depth)
         return replace(plate, rgb=np.broadcast_to(np.float32(0.0), plate.rgb.shape)), plate.rgb.astype(np.float16)
 
     @property

@@ -11,7 +11,8 @@ from jaxtyping import Float32
 
 from mrbokeh.commands._insertion_options import focused_at_pixel, require_one_focus
 from mrbokeh.commands._level_ground import HIGH_SHARE, on_level_ground, pair_of, usual_tilt_rad, with_camera_of_file
-from mrbokeh.compositing.plate import HeldLens, LensWishes, Plate, held_lens, phone_photo, photograph_plate
+from mrbokeh.compositing.plate import HeldLens, LensWishes, Plate, held_lens, phone_photo, photograph_plate, with_depth
+from mrbokeh.depth.depth_map import DepthSettings
 from mrbokeh.depth.phone_depth import PhonePhoto
 from mrbokeh.optics.camera import camera_of_lens
 from mrbokeh.optics.lens import Lens
@@ -33,9 +34,13 @@ _LEAST_TILT_DEG = 1.0
 
 @dataclass
 class OpenedPhotograph:
-    """Photograph in memory, at most MOST_PX of it. told: what its file states, with the size of the whole but none of its light."""
+    """Photograph in memory, at most MOST_PX of it.
+
+    depth: file of its depth, in place of its own. told: what its file states, with the size of the whole but none of its light.
+    """
 
     path: Path
+    depth: Path | None
     told: Photograph
     phone: PhonePhoto | None
     plate: Plate
@@ -109,17 +114,23 @@ class OpenedPhotograph:
         return self._smaller[width_px, height_px]
 
 
-def open_photograph(path: Path) -> tuple[OpenedPhotograph, Float32[np.ndarray, "height width 3"]]:
+def open_photograph(path: Path, depth: Path | None = None) -> tuple[OpenedPhotograph, Float32[np.ndarray, "height width 3"]]:
     """Read a photograph; return it, and the light of the whole. Raises InputError where it is none."""
     if path.is_dir():
         raise InputError(f"{path} is a folder, but the studio takes one photograph: put an object into a stack by `mrbokeh composite`")
     photograph, phone = read_photograph(path), phone_photo(path)
     height_px, width_px = photograph.rgb.shape[:2]
-    whole = photograph_plate(path, photograph, phone, LensWishes(lens=Lens.default()))
+    whole = whole_plate(path, photograph, phone, depth)
     scale = preview_scale(width_px, height_px, MOST_PX)
     small = whole if scale == 1.0 else shrunk(whole, round(scale * width_px), round(scale * height_px))
     dark = np.broadcast_to(np.float32(0.0), photograph.rgb.shape)
-    return OpenedPhotograph(path, replace(photograph, rgb=dark), phone, small), photograph.rgb
+    return OpenedPhotograph(path=path, depth=depth, told=replace(photograph, rgb=dark), phone=phone, plate=small), photograph.rgb
+
+
+def whole_plate(path: Path, photograph: Photograph, phone: PhonePhoto | None, depth: Path | None) -> Plate:
+    """Return the plate of a photograph in all its pixels, with its own depth or that of a file; its lens means nothing yet."""
+    whole = photograph_plate(path, photograph, phone, LensWishes(lens=Lens.default()))
+    return whole if depth is None else replace(with_depth(whole, depth, DepthSettings()), depth_note="")
 
 
 def shrunk(plate: Plate, width_px: int, height_px: int) -> Plate:

@@ -55,7 +55,7 @@ def preview_of(photograph: OpenedPhotograph, options: CompositeOptions, kept: Ke
         if plate.depth_m is None and not standing.plain:
             plate, standing = on_level_ground(plate, standing, known_height_m)
         layers_for = layers_by(small.virtual, standing, small.rendering, plate, None, kept)
-        mode = best_mode(plate)
+        mode = "over" if kept.draft and plate.depth_m is not None else best_mode(plate)
         finishing = Finishing() if kept.draft else _finishing(photograph, plate, small)
         sharp = layers_for(plate)
         if not any((layer.alpha > 0).any() for layer in sharp):

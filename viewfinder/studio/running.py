@@ -2,7 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import mrbokeh
@@ -27,6 +27,7 @@ class StudioOptions:
 
     photo: Path | None = None
     object: Path | None = None
+    depth: Path | None = None
     lenses: tuple[Path, ...] = ()
     project: Path | None = None
     pictures: Path = Path()
@@ -46,6 +47,8 @@ def project_of(options: StudioOptions) -> Project:
     project = read_project(path) if path.exists() else Project(path)
     if photo is not None and project.state.photo != photo:
         project.add(StudioState(photo=photo, object=project.state.object, lens=project.state.lens))
+    if options.depth is not None and project.state.depth != _there(options.depth, "the depth of the photograph"):
+        project.add(replace(project.state, depth=options.depth, camera=None, pitch_deg=None, camera_height_m=None))
     _offer(project, options)
     return project
 
@@ -62,16 +65,12 @@ def _offer(project: Project, options: StudioOptions) -> None:
             read_lens(path)
         project.offer(_there(path, "a lens file"))
     if given and project.state.object != given[0]:
-        project.add(_with(project.state, given[0]))
+        project.add(replace(project.state, object=given[0], height=None))
 
 
 def _there(path: Path, expected: str) -> Path:
     require_file(path, expected)
     return path
-
-
-def _with(state: StudioState, glb: Path) -> StudioState:
-    return StudioState(**{**vars(state), "object": glb, "height": None})
 
 
 async def run(project: Project, options: StudioOptions, ready: Callable[[str], object] = lambda _url: None) -> None:

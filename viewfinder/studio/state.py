@@ -25,6 +25,7 @@ class StudioState:
     """
 
     photo: Path | None = None
+    depth: Path | None = None
     object: Path | None = None
     lens: Path | None = None
     camera: Path | None = None
@@ -132,6 +133,7 @@ def _shown(value: Any) -> str:
 _PIXELS = (0.0, 200_000.0)
 _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "photo": _path,
+    "depth": _path,
     "object": _path,
     "lens": _path,
     "camera": _path,
