@@ -48,6 +48,7 @@ class Plate:
     depth_note: what is known and what is guessed of a phone's own depth and focus, in words.
     metres_guessed: of a stack that knows no focus distance; blur is right in pixels all the same. blur_from: where the lens has its blur
         from, in words, if its focal length and f-number are made up. focus_known: False where nothing tells it.
+    rough_focus_m: nearest and farthest distance that the focus in the photograph's file may mean, where that is a wide range.
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -61,6 +62,7 @@ class Plate:
     blur_from: str = ""
     focus_known: bool = True
     depth_note: str = ""
+    rough_focus_m: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         size = self.rgb.shape[:2]
@@ -140,7 +142,7 @@ def open_plate(
     focused = lens if focus_m is None else lens.focused_at(focus_m)
     plate = with_own_alpha(plate_of(photograph.rgb, focused), photo, read_alpha(photo, photograph.orientation))
     if phone is None:
-        return replace(plate, focus_known=focus_known)
+        return replace(plate, focus_known=focus_known, rough_focus_m=photograph.rough_focus_m if focus_m is None else None)
     original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
     note = f"{photo}: {phone.depth.note}" + (f"; {phone.focus.note}" if phone.focus is not None and is_focus_guessed else "")
     return replace(with_depth(plate, photo, DepthSettings()), sharp_rgb=original, blur_from=blur_from, depth_note=note)
