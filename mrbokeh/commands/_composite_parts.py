@@ -76,7 +76,7 @@ def plate_by(
     source = options.depth or (photo if near_far_m or options.depth_scale else None)
     if source is not None:
         before_m, plate = plate.depth_m, with_depth(plate, source, DepthSettings(near_far_m, options.depth_scale))
-        plate = replace(plate, depth_note="")
+        plate = replace(plate, depth_note="", metres_guessed=plate.metres_guessed and photo.is_dir())
         if own is not None and plate.blur_from and before_m is not None:
             plate = with_blur_in_metres(plate, before_m, focus_m)
     return plate if options.matte is None else with_matte(plate, options.matte)
@@ -212,7 +212,7 @@ def placing_warning(sharp: Sequence[Layer], plate: Plate, mode: str, height: str
     mend = f"--height {height} may be wrong" if height else unit
     if not alpha.any():
         return None
-    if float(alpha[alpha > 0.5].sum()) < 1.0:
+    if max(float(layer.alpha.sum()) for layer in sharp) < 1.0:
         return f"what is put in is smaller than a pixel; {mend}"
     whole = len(rows) and (np.ptp(rows) + 1, np.ptp(columns) + 1) == alpha.shape
     if whole:

@@ -20,7 +20,8 @@ from jaxtyping import Float32
 
 from mrbokeh.depth.depth_map import DepthSettings
 from mrbokeh.depth.open_depth import open_depth
-from mrbokeh.depth.phone_depth import PhoneFocus, PhonePhoto, read_phone_photo
+from mrbokeh.depth.phone_depth import read_phone_photo
+from mrbokeh.depth.phone_photo import PhoneFocus, PhonePhoto
 from mrbokeh.images.alpha_io import is_straight, read_alpha
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
@@ -46,8 +47,9 @@ class Plate:
     near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects, sharp; or None.
     alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
     depth_note: what is known and what is guessed of a phone's own depth and focus, in words.
-    metres_guessed: of a stack that knows no focus distance; blur is right in pixels all the same. blur_from: where the lens has its blur
-        from, in words, if its focal length and f-number are made up. focus_known: False where nothing tells it.
+    metres_guessed: of a stack that knows no focus distance, and of a phone's depth without a unit; blur is right in pixels all the same.
+    blur_from: where the lens has its blur from, in words, if its focal length and f-number are made up. focus_known: False where nothing
+        tells it.
     rough_focus_m: nearest and farthest distance that the focus in the photograph's file may mean, where that is a wide range.
     """
 
@@ -128,7 +130,7 @@ def open_plate(
         raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}: leave it out")
     photograph, phone = read_photograph(photo).stating(facts or {}), _phone(photo)
     blur_from, focus_known = "", True
-    is_focus_guessed = phone is not None and phone.focus is not None and bool(phone.focus.note) and lens is None and focus_m is None
+    is_focus_guessed = lens is None and focus_m is None and photograph.focus_distance_m is None
     if guessing and lens is None and phone is None:
         photograph, guesses = photograph.guessing()
         guess(f"{photo} does not tell its lens, which is guessed: {guesses}" if guesses else "")
@@ -144,8 +146,10 @@ def open_plate(
     if phone is None:
         return replace(plate, focus_known=focus_known, rough_focus_m=photograph.rough_focus_m if focus_m is None else None)
     original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
-    note = f"{photo}: {phone.depth.note}" + (f"; {phone.focus.note}" if phone.focus is not None and is_focus_guessed else "")
-    return replace(with_depth(plate, photo, DepthSettings()), sharp_rgb=original, blur_from=blur_from, depth_note=note)
+    guessed = [] if phone.focus is None else [phone.focus.note * is_focus_guessed, phone.focus.blur_note * bool(blur_from)]
+    note = "; ".join(each for each in (f"{photo}: {phone.depth.note}", *guessed) if each)
+    deep = with_depth(plate, photo, DepthSettings())
+    return replace(deep, sharp_rgb=original, blur_from=blur_from, depth_note=note, metres_guessed=not phone.has_unit)
 
 
 def _phone(photo: Path) -> PhonePhoto | None:
