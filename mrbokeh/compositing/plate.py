@@ -25,6 +25,7 @@ from mrbokeh.depth.phone_photo import PhoneFocus, PhonePhoto
 from mrbokeh.images.alpha_io import is_straight, read_alpha
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
+from mrbokeh.images.xmp import jpeg_xmp
 from mrbokeh.optics.camera import Camera, camera_of_lens
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
@@ -129,6 +130,8 @@ def open_plate(
     if slice_index is not None:
         raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}: leave it out")
     photograph, phone = read_photograph(photo).stating(facts or {}), _phone(photo)
+    if lens is None and not facts:
+        _require_no_panorama(photo, photograph)
     blur_from, focus_known = "", True
     is_focus_guessed = lens is None and focus_m is None and photograph.focus_distance_m is None
     if guessing and lens is None and phone is None:
@@ -150,6 +153,21 @@ def open_plate(
     note = "; ".join(each for each in (f"{photo}: {phone.depth.note}", *guessed) if each)
     deep = with_depth(plate, photo, DepthSettings())
     return replace(deep, sharp_rgb=original, blur_from=blur_from, depth_note=note, metres_guessed=not phone.has_unit)
+
+
+def _require_no_panorama(photo: Path, photograph: Photograph) -> None:
+    """Raise InputError for a panorama that says so (GPano), and warn of a picture that is shaped as one: a lens draws neither."""
+    height_px, width_px = photograph.rgb.shape[:2]
+    advice = "cut out a part, and say --focal-length and --sensor-width of that"
+    told = jpeg_xmp(photo.read_bytes(), photo) if photo.suffix.lower() in (".jpg", ".jpeg") else {}
+    if told.get(_GPANO + "ProjectionType") or told.get(_GPANO + "FullPanoWidthPixels"):
+        raise InputError(f"{photo} is a panorama, as its XMP tells (GPano), in which straight lines are bent: {advice}")
+    if width_px > _PANORAMIC * height_px and photograph.cut_from_px is None:
+        _log.warning(f"{photo} of {width_px}x{height_px} px is shaped as a panorama, for which its lens would be wrong: {advice}")
+
+
+_GPANO = "{http://ns.google.com/photos/1.0/panorama/}"
+_PANORAMIC = 2.2
 
 
 def _phone(photo: Path) -> PhonePhoto | None:
