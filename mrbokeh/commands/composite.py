@@ -78,17 +78,20 @@ def composite(
     )
     if taken.all_slices:
         require_options_of_stacks(taken, optics, look, colour, result)
+    standing.require_meant(photo, taken.depth, rendering.catch)
+    require_one_focus(focus=optics.focus, focus_at=optics.focus_at)
     check_outputs(out, result, read, all_slices=taken.all_slices)
     bundle = read_bundle(photo) if is_bundle(photo) else None
     lens, renderer = lens_and_renderer(optics.lens, optics.renderer or (bundle.renderer if bundle and optics.lens is None else None))
     lens = lens and facts.on(lens, renderer)
-    require_one_focus(focus=optics.focus, focus_at=optics.focus_at)
     on_ground = standing.object_ is not None and bool(standing.at_pixel) and not photo.is_dir() and not standing.plain
     stated = {} if lens else facts.given
     open_focused = partial(plate_by, photo, taken, colour, bundle, lens=lens, facts=stated, guessing=on_ground)
     plate = open_focused(focus_m=optics.focus if optics.focus_at is None else 1.0)  # then only its depth is asked for
     if optics.focus_at is not None:
         plate = open_focused(focus_m=focused_at_pixel(plate.lens, plate.depth_m, optics.focus_at).focus_distance_m)
+    if plate.depth_m is not None:
+        standing.require_no_depth()
     _tell_metres(photo, virtual, standing, lens)
     guess(plate.depth_note)
     known_height_m = None

@@ -20,10 +20,12 @@ from jaxtyping import Float, Float32
 
 from mrbokeh.depth.depth_map import DepthSettings
 from mrbokeh.depth.open_depth import open_depth
-from mrbokeh.depth.phone_depth import PhoneFocus, PhonePhoto, read_phone_photo
+from mrbokeh.depth.phone_depth import read_phone_photo
+from mrbokeh.depth.phone_photo import PhoneFocus, PhonePhoto
 from mrbokeh.images.alpha_io import is_straight, read_alpha
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
+from mrbokeh.images.xmp import jpeg_xmp
 from mrbokeh.optics.camera import Camera, camera_of_lens
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
@@ -46,9 +48,11 @@ class Plate:
     near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects, sharp; or None.
     alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
     depth_note: what is known and what is guessed of a phone's own depth and focus, in words.
-    metres_guessed: of a stack that knows no focus distance; blur is right in pixels all the same. blur_from: where the lens has its blur
-        from, in words, if its focal length and f-number are made up. focus_known: False where nothing tells it. view_known: False where the
-        field of view is guessed. world_from_camera: (3, 3) turns camera axes into upright ones, where that is known.
+    metres_guessed: of a stack that knows no focus distance, and of a phone's depth without a unit; blur is right in pixels all the same.
+    blur_from: where the lens has its blur from, in words, if its focal length and f-number are made up.
+    focus_known, view_known: False where nothing tells the focus, and where the field of view is guessed.
+    rough_focus_m: nearest and farthest distance that the focus in the photograph's file may mean, where that is a wide range.
+    world_from_camera: (3, 3) turns camera axes into upright ones, where that is known.
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -64,6 +68,7 @@ class Plate:
     view_known: bool = True
     world_from_camera: Float[np.ndarray, "3 3"] | None = None
     depth_note: str = ""
+    rough_focus_m: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         size = self.rgb.shape[:2]
@@ -128,8 +133,10 @@ def open_plate(
     if slice_index is not None:
         raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}: leave it out")
     photograph, phone = read_photograph(photo).stating(facts or {}), _phone(photo)
+    if lens is None and not facts:
+        _require_no_panorama(photo, photograph)
     blur_from, focus_known, view_known = "", True, True
-    is_focus_guessed = phone is not None and phone.focus is not None and bool(phone.focus.note) and lens is None and focus_m is None
+    is_focus_guessed = lens is None and focus_m is None and photograph.focus_distance_m is None
     if guessing and lens is None and phone is None:
         stated = (photograph.focal_length_mm, photograph.sensor_width_mm)
         photograph, guesses = photograph.guessing()
@@ -145,10 +152,28 @@ def open_plate(
     focused = lens if focus_m is None else lens.focused_at(focus_m)
     plate = with_own_alpha(plate_of(photograph.rgb, focused), photo, read_alpha(photo, photograph.orientation))
     if phone is None:
-        return replace(plate, focus_known=focus_known, view_known=view_known)
+        rough_m = photograph.rough_focus_m if focus_m is None else None
+        return replace(plate, focus_known=focus_known, view_known=view_known, rough_focus_m=rough_m)
     original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
-    note = f"{photo}: {phone.depth.note}" + (f"; {phone.focus.note}" if phone.focus is not None and is_focus_guessed else "")
-    return replace(with_depth(plate, photo, DepthSettings()), sharp_rgb=original, blur_from=blur_from, depth_note=note)
+    guessed = [] if phone.focus is None else [phone.focus.note * is_focus_guessed, phone.focus.blur_note * bool(blur_from)]
+    note = "; ".join(each for each in (f"{photo}: {phone.depth.note}", *guessed) if each)
+    deep = with_depth(plate, photo, DepthSettings())
+    return replace(deep, sharp_rgb=original, blur_from=blur_from, depth_note=note, metres_guessed=not phone.has_unit)
+
+
+def _require_no_panorama(photo: Path, photograph: Photograph) -> None:
+    """Raise InputError for a panorama that says so (GPano), and warn of a picture that is shaped as one: a lens draws neither."""
+    height_px, width_px = photograph.rgb.shape[:2]
+    advice = "cut out a part, and say --focal-length and --sensor-width of that"
+    told = jpeg_xmp(photo.read_bytes(), photo) if photo.suffix.lower() in (".jpg", ".jpeg") else {}
+    if told.get(_GPANO + "ProjectionType") or told.get(_GPANO + "FullPanoWidthPixels"):
+        raise InputError(f"{photo} is a panorama, as its XMP tells (GPano), in which straight lines are bent: {advice}")
+    if width_px > _PANORAMIC * height_px and photograph.cut_from_px is None:
+        _log.warning(f"{photo} of {width_px}x{height_px} px is shaped as a panorama, for which its lens would be wrong: {advice}")
+
+
+_GPANO = "{http://ns.google.com/photos/1.0/panorama/}"
+_PANORAMIC = 2.2
 
 
 def _phone(photo: Path) -> PhonePhoto | None:

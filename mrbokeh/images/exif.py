@@ -93,6 +93,15 @@ def upright(picture: Picture, orientation: int) -> Picture:
     return np.ascontiguousarray(np.rot90(picture[:, ::-1] if mirrored else picture, turns))  # type: ignore[return-value]
 
 
+def upright_place(x: float, y: float, orientation: int) -> tuple[float, float]:
+    """Return where a place of the stored picture lies in the upright one; both in shares of width and height."""
+    turns, mirrored = _UPRIGHT[orientation]
+    x = 1.0 - x if mirrored else x
+    for _ in range(turns):
+        x, y = y, 1.0 - x
+    return x, y
+
+
 def as_stored(picture: Picture, orientation: int) -> Picture:
     """Turn an upright picture back to how it is stored: the inverse of `upright`."""
     turns, mirrored = _UPRIGHT[orientation]

@@ -5,6 +5,7 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -138,22 +139,33 @@ def test_objects_are_placed_in_camera_axes_wherever_the_camera_stood(tmp_path: P
     ({"--object": "cake", "--at-pixel": "10,10", "--pitch": "0"}, "above the horizon"),
     ({"--object": "cake", "--at-pixel": "10,60", "--camera": "lens.json"}, "expected a camera of `mrbokeh capture solve`"),
     ({"--object": "cake", "--at": "1,2"}, "--at expects 3 numbers"),
+    ({"--object": "cake", "--at": "0,0,1", "--at-pixel": "10,80"}, "--at and --at-pixel both say where the object stands"),
+    ({"--object": "cake", "--at-pixel": "10,80", "--sun": "0,40", "--environment": "sky.hdr"}, "a panorama has its own sun"),
+    ({"--object": "cake", "--at-pixel": "10,80", "--sun": "0,40", "--plain": True}, "needs the light that --plain leaves out"),
+    ({"--object": "cake", "--at-pixel": "10,80", "--sun": "0,95"}, "above 0 and up to 90 degrees over the horizon"),
+    ({"--object": "cake", "--at-pixel": "10,80", "--pitch": "95"}, "--pitch: expected how far the camera looks down, between -90"),
+    ({"--object": "cake", "--at-pixel": "10,80", "--height": "high"}, "--height: expected metres above 0"),
+    ({"--object": "cake", "--at-pixel": "10,80", "--catch": "shadow"}, "the photograph tells of none"),
+    ({"--object": "cake", "--at-pixel": "10,80", "--camera-height": "0"}, "--camera-height: expected metres above 0, got 0"),
+    ({"--object": "cake", "--at": "0,0,1", "--camera-height": "1.2"}, "leave it out with depth, a stack, --plain or --at"),
+    ({"--object": "cake", "--at-pixel": "10,80", "--depth": "depth.exr", "--camera-height": "1.2"}, "leave it out with depth"),
     ({"--layer": "card.exr", "--renderer": "magic"}, "expected a renderer"),
     ({"--layer": "card.exr", "--out": "photo.exr"}, "is read and would be written over"),
     ({"--layer": "card.exr", "--out": "depth.exr"}, "exists already: give another name, or --overwrite"),
     ({"--layer": "card.exr", "--slice": "1"}, "not a folder"),
     ({"--layer": "card.exr", "--out": "out.gif"}, "expected a name that ends in .exr or .png"),
 ])  # fmt: skip
-def test_mistakes_end_in_one_sentence(files: Path, composite: Composite, change: dict[str, str | None], message: str) -> None:
+def test_mistakes_end_in_one_sentence(files: Path, composite: Composite, change: dict[str, Any], message: str) -> None:
+    """And none of them comes after a line that says what was guessed."""
     options = {"--lens": "lens.json", "--out": "out.exr"} | change
     words: list[object] = []
     for option, value in options.items():
         if value is not None:
-            path = CAKE if value == "cake" else files / value if "." in value and "," not in value else value
-            words += [option, path]
+            path = CAKE if value == "cake" else files / value if str(value).endswith((".exr", ".json", ".gif", ".hdr")) else value
+            words += [option] if value is True else [option, path]
     code, told = composite(files / "photo.exr", *words)
     assert code == 2
-    assert message in told and "Traceback" not in told
+    assert message in told and "Traceback" not in told and "guessed" not in told and "there is no depth: mrbokeh" not in told
     assert not (files / "out.exr").exists() and not (files / "out.gif").exists()
 
 
