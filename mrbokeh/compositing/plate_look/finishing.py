@@ -30,14 +30,17 @@ from mrbokeh.compositing.plate_look.exposure_match import Exposure, matched_expo
 from mrbokeh.compositing.plate_look.grain import Grain, GrainDraw, add_grain_to, measured_grain, measured_grain_of_pair, read_grain
 from mrbokeh.compositing.plate_look.noise_measurement import NoiseLevel
 from mrbokeh.compositing.plate_look.vignetting import RadialFalloff, Vignetting, darkened, falloff_at, falloff_of_photo, read_flat_field
+from mrbokeh.images.color import srgb_to_linear
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.pixel_box import Box, lit_box
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.typed_numbers import numbers_in
 
 _SIGMAS = 3
-_LEAST_PX, _SURELY_BLACK, _MOST_GRAIN = 64, 0.02, 0.015
-"""Sides of a picture that tells its black; the lightest black that is surely one; standard deviation of strong grain on a grey card."""
+_LEAST_PX, _SURELY_BLACK, _MOST_GRAIN, _SHOWN = 64, 0.02, 0.015, np.linspace(0.1, 0.8, 8, dtype=np.float32)
+"""Sides of a picture that tells its black; the lightest black that is surely one; standard deviation of strong grain on a screen of 0 to 1,
+and the levels there at which it is looked at.
+"""
 
 Picture = Float32[np.ndarray, "height width 3"]
 AUTO, OFF = "auto", "off"
@@ -190,9 +193,10 @@ def matched_finishing(options: LookOptions, plate_rgb: Picture, photo: Path | No
 
 
 def _at_most(grain: Grain) -> Grain:
-    """Return the grain, weakened as a whole if it is stronger on a grey card than that of high ISO."""
-    variance = float(grain.level.variance(np.full(3, GREY_CARD)).max())
-    factor = min(1.0, _MOST_GRAIN**2 / max(variance, 1e-12))
+    """Return the grain, weakened as a whole where it would be stronger on a screen than that of high ISO, at any level."""
+    shown = np.square(_MOST_GRAIN * np.diff(srgb_to_linear(_SHOWN)) / np.diff(_SHOWN))  # what a step on the screen is in linear light
+    seen = grain.level.variance(np.repeat(srgb_to_linear(_SHOWN[:-1])[:, None], 3, axis=1)).max(axis=1)
+    factor = float(np.minimum(1.0, shown / np.maximum(seen, 1e-12)).min())
     shot, read = (triple_of(factor * np.array(each)) for each in (grain.level.shot, grain.level.read))
     return replace(grain, level=NoiseLevel(shot, read))
 
