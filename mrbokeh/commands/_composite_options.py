@@ -206,10 +206,28 @@ class LensOptions:
 
 @dataclass(frozen=True)
 class ResultOptions:
-    """Files beside OUT."""
+    """What OUT is, and files beside it."""
 
+    preview: Annotated[
+        bool,
+        typer.Option(
+            "--preview", help="OUT is small, with the ground in metres, a box around the --object, its distance, size and blur: to try."
+        ),
+    ] = False
     save_layer: Annotated[Path | None, typer.Option(help="Also write the blurred virtual layer (EXR with alpha).")] = None
     save_deep: Annotated[
         Path | None, typer.Option(metavar="FILE.exr", help="Also write the sharp virtual layers as a deep EXR, one sample per layer.")
     ] = None
     overwrite: shared.OverwriteOption = False
+
+    def require_meant(self, out: Path, *, is_object: bool, all_slices: bool) -> None:
+        """Raise InputError for a preview of something else than one object in one picture for the screen."""
+        from mrbokeh.images.image_io import require_suffix
+
+        if not self.preview:
+            return
+        require_suffix(out, (".png", ".jpg", ".jpeg"), "--out of a --preview")
+        if not is_object or all_slices or self.save_layer is not None or self.save_deep is not None:
+            raise InputError(
+                "--preview shows where an --object stands: give that, and leave --all-slices, --save-layer and --save-deep out"
+            )

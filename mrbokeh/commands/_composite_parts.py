@@ -331,7 +331,7 @@ def _object_layers(glb: Path, options: ObjectOptions, rendering: RenderingOption
 
     stands_at_m = typed_place_m(options.at) if options.at else first.point_under_pixel_m(*pair_of(options.at_pixel))
     foot_px = pair_of(options.at_pixel) if options.at_pixel else _pixel_of(first.camera, stands_at_m)
-    world_from_camera = _upright(options, first, foot_px)
+    world_from_camera = np.eye(3) if first.world_from_camera is None else first.world_from_camera
     catches = rendering.catch or ("shadow" if options.plain else "light")
     usual = 0.0 if options.plain else _DARK if catches == "shadow" else 1.0
     shadow = usual if options.shadow is None else options.shadow
@@ -363,21 +363,21 @@ def _pixel_of(camera: Camera, place_m: tuple[float, float, float]) -> tuple[floa
     return x_px, y_px
 
 
-def _upright(options: ObjectOptions, plate: Plate, foot_px: tuple[float, float]) -> np.ndarray:
-    """Return the rotation from camera axes to upright ones: as told, as known of the plate, by the ground at the foot, or none."""
+def held_upright(plate: Plate, options: ObjectOptions) -> Plate:
+    """Return the plate with the turn of its camera: as told, as known already, by the ground at the foot of an object, or none."""
     if options.pitch is not None:
-        return looking_down(math.radians(options.pitch))
-    if plate.world_from_camera is not None:
-        return plate.world_from_camera
-    if options.plain or not options.at_pixel:
-        return np.eye(3)
+        return replace(plate, world_from_camera=looking_down(math.radians(options.pitch)))
+    if plate.world_from_camera is not None or options.plain or not options.at_pixel:
+        return plate
+    foot_px = pair_of(options.at_pixel)
+    plate.require_pixel(*foot_px)
     found = ground_under(plate, foot_px)
     if found is None:
         guess("the depth around the foot is no ground with a slope: a level camera is taken (--pitch DEGREES says how far it looks down)")
-        return np.eye(3)
+        return plate
     down_deg = math.degrees(math.asin(float(np.clip(found[1, 2], -1.0, 1.0))))
     guess(f"by the depth around the foot the camera looks down by {down_deg:.0f} degrees (else --pitch DEGREES)")
-    return found
+    return replace(plate, world_from_camera=found)
 
 
 def _light(options: ObjectOptions, plate: Plate, foot_px: tuple[float, float], world_from_camera: np.ndarray) -> "Lighting":

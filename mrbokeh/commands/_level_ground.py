@@ -48,9 +48,7 @@ def on_level_ground(plate: Plate, standing: ObjectOptions, known_height_m: float
     known_height_m: of a solved camera; --camera-height comes before it. Raises InputError for a pixel that shows no ground.
     """
     x_px, y_px = pair_of(standing.at_pixel)
-    if not (0 <= x_px < plate.camera.width_px and 0 <= y_px < plate.camera.height_px):
-        size = f"{plate.camera.width_px}x{plate.camera.height_px} px"
-        raise InputError(f"pixel {x_px:g},{y_px:g} lies outside the photograph of {size}: choose one within")
+    plate.require_pixel(x_px, y_px)
     taken = []
     if standing.pitch is not None:
         plate = replace(plate, world_from_camera=looking_down(math.radians(standing.pitch)))

@@ -50,6 +50,7 @@ def composite(
         alpha_lost,
         blur_told,
         check_outputs,
+        held_upright,
         layers_by,
         nothing_seen,
         placing_warning,
@@ -58,6 +59,7 @@ def composite(
         write_results,
     )
     from mrbokeh.commands._level_ground import on_level_ground, pair_of, with_camera_of_file
+    from mrbokeh.commands._preview import smaller, write_preview_of
     from mrbokeh.compositing.choose import best_mode, insertion_of
     from mrbokeh.compositing.ground import with_ground_behind
     from mrbokeh.compositing.plate_look.finishing import finished
@@ -80,6 +82,7 @@ def composite(
         require_options_of_stacks(taken, optics, look, colour, result)
     standing.require_meant(photo, taken.depth, rendering.catch)
     require_one_focus(focus=optics.focus, focus_at=optics.focus_at)
+    result.require_meant(out, is_object=standing.object_ is not None, all_slices=taken.all_slices)
     check_outputs(out, result, read, all_slices=taken.all_slices)
     bundle = read_bundle(photo) if is_bundle(photo) else None
     lens, renderer = lens_and_renderer(optics.lens, optics.renderer or (bundle.renderer if bundle and optics.lens is None else None))
@@ -94,11 +97,15 @@ def composite(
         standing.require_no_depth()
     _tell_metres(photo, virtual, standing, lens)
     guess(plate.depth_note)
-    known_height_m = None
+    known_height_m, scale = None, 1.0
+    if result.preview:
+        plate, standing, scale = smaller(plate, standing)
     if virtual.camera is not None and standing.object_ is not None and virtual.scene is None:
         plate, known_height_m = with_camera_of_file(plate, virtual.camera)
     if on_ground and plate.depth_m is None:
         plate, standing = on_level_ground(plate, standing, known_height_m)
+    if standing.object_ is not None:
+        plate = held_upright(plate, standing)
     layers_for = layers_by(virtual, standing, rendering, plate, bundle)
     mode = virtual.mode or best_mode(plate)
     insertion = insertion_of(mode, taken.near_distance, exact_depth=taken.exact_depth)
@@ -115,6 +122,9 @@ def composite(
         warn(warning)
     with working("blurring"):
         inserted = finished(insertion.insert(plate, sharp, renderer), plate, finishing)
+    if result.preview:
+        tell(f"wrote the preview {out}: {write_preview_of(out, inserted, plate, sharp[0], scale)}")
+        return
     write_results(out, inserted, plate, sharp, colour, result)
     if lost := alpha_lost(out, plate):
         warn(lost)

@@ -10,7 +10,7 @@ Every insertion owes these (tests/compositing/test_compositing.py asks all of th
 """
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -91,12 +91,16 @@ class Plate:
         x_m, y_m, z_m = self.camera.unproject(np.array([x_px, y_px], np.float64), np.array(depth_m))
         return float(x_m), float(y_m), float(z_m)
 
+    def require_pixel(self, x_px: float, y_px: float) -> None:
+        """Raise InputError for a pixel outside the photograph."""
+        height, width = self.rgb.shape[:2]
+        if not (0 <= x_px < width and 0 <= y_px < height):
+            raise InputError(f"pixel {x_px:g},{y_px:g} lies outside the photograph of {width}x{height} px: choose one within")
+
     def depth_at_m(self, x_px: float, y_px: float) -> float:
         """Return the depth at a pixel of a photograph with depth. Raises InputError if it lies outside."""
         assert self.depth_m is not None
-        height, width = self.depth_m.shape
-        if not (0 <= x_px < width and 0 <= y_px < height):
-            raise InputError(f"pixel {x_px:g},{y_px:g} lies outside the photograph of {width}x{height} px: choose one within")
+        self.require_pixel(x_px, y_px)
         return float(self.depth_m[int(y_px), int(x_px)])
 
     def length_m(self, pixels: float, depth_m: float) -> float:
@@ -217,6 +221,29 @@ def with_blur_in_metres(plate: Plate, before_m: Float32[np.ndarray, "height widt
 def plate_of(rgb: Float32[np.ndarray, "height width 3"], lens: Lens, depth_m: Float32[np.ndarray, "height width"] | None = None) -> Plate:
     """A picture through the pinhole of its lens, which looks at its middle."""
     return Plate(rgb, depth_m, lens, camera_of_lens(lens, rgb.shape[1], rgb.shape[0]))
+
+
+def shrunk(plate: Plate, width_px: int, height_px: int) -> Plate:
+    """Return the plate with fewer pixels; depth is picked, as a mean of two surfaces is none."""
+    import cv2
+
+    size_px = (width_px, height_px)
+
+    def by(method: int) -> Callable[[np.ndarray | None], np.ndarray | None]:
+        return lambda plane: None if plane is None else np.ascontiguousarray(cv2.resize(plane, size_px, interpolation=method))
+
+    mean, picked = by(cv2.INTER_AREA), by(cv2.INTER_NEAREST)
+    rgb = mean(plate.rgb)
+    assert rgb is not None
+    return replace(
+        plate,
+        rgb=rgb,
+        depth_m=picked(plate.depth_m),
+        camera=plate.camera.resized(*size_px),
+        sharp_rgb=mean(plate.sharp_rgb),
+        near_alpha=mean(plate.near_alpha),
+        alpha=mean(plate.alpha),
+    )
 
 
 def with_own_alpha(plate: Plate, path: Path, alpha: Float32[np.ndarray, "height width"] | None) -> Plate:

@@ -1,5 +1,6 @@
 """`mrbokeh composite` as a user meets it: a layer or an object into a photograph or a slice, and what it refuses."""
 
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -7,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -96,6 +98,25 @@ def test_without_depth_an_object_stands_on_level_ground(files: Path, composite: 
     assert read_layer(layer).depth_m[68, 100] == pytest.approx(3.0, abs=0.5)
     code, told = composite(*words, "--at-pixel", "100,40")
     assert code == 0 and "28 mm on 36 mm of sensor" in told and "f/8" in told and "to look down by" in told
+
+
+def test_a_preview_is_small_and_tells_the_size_in_pixels_of_the_photograph(tmp_path: Path, composite: Composite) -> None:
+    """24 px of 144 are 240 of 1440; the picture is 1000 px wide and has the grid's colour beside the object, not on it."""
+    photo, out = tmp_path / "large.exr", tmp_path / "preview.png"
+    write_image(photo, np.repeat(np.repeat(plate_rgb(), 10, axis=0), 10, axis=1))
+    words = (photo, "--object", CAKE, "--at-pixel", "1000,700", "--height", "240px", "--preview", "--out", out)
+    code, told = composite(*words, "--focal-length", 35, "--sensor-width", 23.5, "--f-number", 4, "--focus", 3)
+    assert code == 0, told
+    height_px = int(re.search(r"x(\d+) px, ", told).group(1))  # type: ignore[union-attr]
+    assert 220 < height_px < 290 and "cells of 0.2 m" in told, told
+    shown = cv2.imread(str(out))[..., ::-1].astype(int)
+    assert shown.shape == (667, 1000, 3)
+    yellow = np.abs(shown - (255, 225, 40)).max(axis=2) < 60
+    assert yellow[500:640].sum() > 500 and not yellow[430:480, 660:730].any()
+    code, told = composite(*words[:-1], tmp_path / "preview.exr")
+    assert code == 2 and "expected a name that ends in .png" in told
+    code, told = composite(*words, "--save-layer", tmp_path / "layer.exr", "--overwrite")
+    assert code == 2 and "--preview shows where an --object stands" in told
 
 
 def test_a_slice_of_a_stack_brings_lens_focus_and_depth(files: Path, composite: Composite) -> None:
