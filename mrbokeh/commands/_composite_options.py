@@ -206,7 +206,7 @@ class LensOptions:
 
 @dataclass(frozen=True)
 class ResultOptions:
-    """What OUT is, and files beside it."""
+    """Options of OUT and of files beside it."""
 
     preview: Annotated[
         bool,

@@ -112,7 +112,8 @@ def composite(
     if taken.all_slices:
         _into_all_slices(photo, out, layers_for, insertion, renderer, lens)
         return
-    finishing = _finishing(photo, plate, look, matching=standing.object_ is not None and not standing.plain)
+    matching = standing.object_ is not None and not standing.plain
+    finishing = _finishing(photo, plate, look, matching=matching, is_linear=out.suffix.lower() == ".exr" or result.preview)
     sharp = layers_for(plate)
     if not any((layer.alpha > 0).any() for layer in sharp):
         nothing_seen(standing, virtual)
@@ -132,14 +133,16 @@ def composite(
     tell(f"wrote {out} ({mode}; {told})", known, mode=mode, **figures)
 
 
-def _finishing(photo: Path, plate: "Plate", look: LookGroup, *, matching: bool) -> "Finishing":
+def _finishing(photo: Path, plate: "Plate", look: LookGroup, *, matching: bool, is_linear: bool) -> "Finishing":
     """Return what makes virtual light look photographed: as told, and of a photograph in a file also as it is."""
     from mrbokeh.compositing.plate_look.finishing import finishing_of, matched_finishing
 
     if photo.is_dir() or not matching:
         return finishing_of(look.wanted, plate.rgb, None if photo.is_dir() else photo)
-    finishing, matched = matched_finishing(look.wanted, plate.rgb, photo)
-    guess(f"black and grain are matched to the photograph ({' off, '.join(matched)} off)" if matched else "")
+    finishing, matched = matched_finishing(look.wanted, plate.rgb, photo, is_linear=is_linear)
+    guess(
+        f"black, grain and compression are the photograph's, as far as they can be told ({' off, '.join(matched)} off)" if matched else ""
+    )
     return finishing
 
 

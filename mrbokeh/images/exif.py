@@ -104,9 +104,14 @@ def upright_place(x: float, y: float, orientation: int) -> tuple[float, float]:
 
 def as_stored(picture: Picture, orientation: int) -> Picture:
     """Turn an upright picture back to how it is stored: the inverse of `upright`."""
+    return np.ascontiguousarray(oriented_as_stored(picture, orientation))  # type: ignore[return-value]
+
+
+def oriented_as_stored(picture: Picture, orientation: int) -> Picture:
+    """Return a view of an upright picture as it is stored."""
     turns, mirrored = _UPRIGHT[orientation]
     turned = np.rot90(picture, -turns)
-    return np.ascontiguousarray(turned[:, ::-1] if mirrored else turned)  # type: ignore[return-value]
+    return turned[:, ::-1] if mirrored else turned  # type: ignore[return-value]
 
 
 _SAME_ASPECT = 0.01
