@@ -59,6 +59,8 @@ def read_photograph(path: Path) -> Photograph:
         f_number=metadata.f_number,
         focus_distance_m=metadata.focus_distance_m,
         sensor_width_mm=sensor_width_mm,
+        sensor_doubt="" if sensor is None else sensor.doubt,
+        rough_focus_m=metadata.rough_focus_m,
         exposure_time_s=metadata.exposure_time_s,
         iso=metadata.iso,
         orientation=orientation,

@@ -16,6 +16,14 @@ UINT16_MAX = 0xFFFF
 UINT8_MAX = 0xFF
 _CM_PER_M = 100.0
 _CANON_INFINITY_CM = 65535.0
+_CANON_INFINITY_CODES = (UINT16_MAX // 10, UINT16_MAX)
+"""All ones, by bodies of 2007 and later divided by ten and rounded down."""
+_CANONS_IN_MM = range(0x1010000, 0x1190000)
+"""Model numbers of Canon's PowerShots and IXUS before the G3, which count mm where later ones count cm."""
+_MOST_APERTURE_CODE = 500
+"""Canon's code of an aperture is 32 times its APEX value, 416 for f/90; more is a maker note whose offsets are lost."""
+_ALL_NINES = 9999
+"""HP writes 9999/100 m for all that is far."""
 
 Tags = Mapping[str, str]
 
@@ -136,6 +144,8 @@ def _rational_distance(tags: Tags, names: tuple[str, ...]) -> FocusReading | Non
             return at_infinity(source)
         if denominator > 0:
             distance_m, nearest_m, farthest_m = ((numerator + digit) / denominator for digit in (0.0, -0.5, 0.5))
+            if numerator == _ALL_NINES:
+                return at_infinity(source)
             return FocusReading.from_film_plane(distance_m, nearest_m, farthest_m, source)
     return None
 
@@ -143,7 +153,7 @@ def _rational_distance(tags: Tags, names: tuple[str, ...]) -> FocusReading | Non
 def _canon_interval(tags: Tags) -> FocusReading | None:
     """Read the farthest and the nearest distance in cm from Canon's file info. The middle is taken in dioptres, in which blur is linear."""
     names = ("Exif.CanonFi.FocusDistanceUpper", "Exif.CanonFi.FocusDistanceLower")
-    farthest_cm, nearest_cm = (_unsigned(tags, name) for name in names)
+    farthest_cm, nearest_cm = (_unsigned(tags, name) for name in names) if _is_whole_maker_note(tags) else (0.0, 0.0)
     source = f"Exif.CanonFi.FocusDistanceLower, Upper = {nearest_cm:g}, {farthest_cm:g} cm"
     return canon_reading(nearest_cm / _CM_PER_M, farthest_cm / _CM_PER_M, source)
 
@@ -154,20 +164,27 @@ def _unsigned(tags: Tags, name: str) -> float:
 
 
 def _canon_shot(tags: Tags) -> FocusReading | None:
-    """Read Canon's shot info: cm, but mm in the PowerShots that write CRW.
+    """Read Canon's shot info: cm, but mm in the PowerShots and IXUS before the G3, and in those that write CRW.
 
-    exiv2 and exiftool read cm throughout. A G2's JPEG says 1.50 m in EXIF and 1503 here; an S40 that fills its frame
-    (7.1 mm lens, 7.26 mm sensor) with a box of 0.2 m says 188.
+    exiv2 and exiftool read cm throughout. JPEGs of a G2, A20, S30 and IXUS 300 say 1.50 m in EXIF and 1503 here; an S40 that fills its
+    frame (7.1 mm lens, 7.26 mm sensor) with a box of 0.2 m says 188. A maker note whose other numbers are impossible is not believed.
     """
     name = "Exif.CanonSi.SubjectDistance"
     value = _unsigned(tags, name)
-    if value == 0.0:
+    if value == 0.0 or not _is_whole_maker_note(tags):
         return None
-    if value >= _CANON_INFINITY_CM:
+    if value in _CANON_INFINITY_CODES:
         return at_infinity(f"{name} = {value:g}")
-    in_mm = tags.get("mime_type") == "image/x-canon-crw" and "PowerShot" in tags.get("Exif.Image.Model", "")
+    of_old = int(number(tags.get("Exif.Canon.ModelID")) or 0) in _CANONS_IN_MM
+    in_mm = of_old or (tags.get("mime_type") == "image/x-canon-crw" and "PowerShot" in tags.get("Exif.Image.Model", ""))
     per_m, unit = (MM_PER_M, "mm") if in_mm else (_CM_PER_M, "cm")
     return FocusReading.from_film_plane(value / per_m, (value - 0.5) / per_m, (value + 0.5) / per_m, f"{name} = {value:g} {unit}")
+
+
+def _is_whole_maker_note(tags: Tags) -> bool:
+    """Return whether Canon's own code of the widest aperture is one of an aperture; programs that move the note leave other bytes there."""
+    code = number(tags.get("Exif.CanonCs.MaxAperture"))
+    return code is None or 0 < code <= _MOST_APERTURE_CODE
 
 
 def _nikon(tags: Tags) -> FocusReading | None:

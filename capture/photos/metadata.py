@@ -15,7 +15,15 @@ from pathlib import Path
 from typing import Any
 
 from capture.photos.focus_metadata import FocusReading, Tags, at_infinity, canon_reading, number, read_focus
-from capture.photos.photo_metadata import PhotoMetadata, SensorReading, parse_time, read_sensor, sensor_of_model, stated_size_px
+from capture.photos.photo_metadata import (
+    PhotoMetadata,
+    SensorReading,
+    parse_time,
+    read_sensor,
+    sensor_of_model,
+    size_as_taken_px,
+    size_of,
+)
 from mrbokeh.images.heif import is_heif
 from mrbokeh.system.errors import InputError, require_file
 
@@ -179,7 +187,8 @@ def read_metadata_of(paths: Sequence[Path], advance: Callable[[], None] = lambda
         if _has_gaps(found[index]):
             found[index] = found[index].filled_from(metadata_from_tags(read_tags_with_exifread(paths[index])))
     # HEIC is decoded upright (irot, imir); its Exif tells the same turn again.
-    return [replace(each, orientation=None) if is_heif(path) else each for path, each in zip(paths, found, strict=True)]
+    turned = [replace(each, orientation=None) if is_heif(path) else each for path, each in zip(paths, found, strict=True)]
+    return [each if each.is_possible else replace(each, focal_length_mm=None, f_number=None) for each in turned]
 
 
 def read_tags(path: Path) -> dict[str, str]:
@@ -202,12 +211,11 @@ def read_tags(path: Path) -> dict[str, str]:
 def metadata_from_tags(tags: Tags) -> PhotoMetadata:
     """Return shooting data from exiv2's tags."""
     focal_length_mm = _focal_length_mm(tags)
-    width_px, height_px = number(tags.get("width_px")), number(tags.get("height_px"))
-    size_px = (int(width_px), int(height_px)) if width_px and height_px else None
-    orientation = number(tags.get("Exif.Image.Orientation"))
+    size_px = size_of([tags.get("width_px"), tags.get("height_px")])
+    sensor, orientation = read_sensor(tags, focal_length_mm, size_px), number(tags.get("Exif.Image.Orientation"))
     return PhotoMetadata(
         focal_length_mm=focal_length_mm,
-        f_number=_first_positive(tags, "Exif.Photo.FNumber", "Exif.Image.FNumber") or _from_apex(tags, "Exif.Photo.ApertureValue", 0.5),
+        f_number=_f_number(tags),
         exposure_time_s=_first_positive(tags, "Exif.Photo.ExposureTime", "Exif.Image.ExposureTime")
         or _from_apex(tags, "Exif.Photo.ShutterSpeedValue", -1.0),
         iso=_iso(tags),
@@ -215,9 +223,9 @@ def metadata_from_tags(tags: Tags) -> PhotoMetadata:
         camera_model=_text(tags, "Exif.Image.Model", "Exif.Image.UniqueCameraModel"),
         lens_model=_text(tags, "Exif.Photo.LensModel", "Exif.Canon.LensModel", "Xmp.aux.Lens"),
         focus=read_focus(tags),
-        sensor=read_sensor(tags, focal_length_mm, size_px),
+        sensor=sensor,
         orientation=int(orientation) if orientation else None,
-        taken_size_px=stated_size_px(tags),
+        taken_size_px=size_as_taken_px(tags),
     )
 
 
@@ -248,6 +256,10 @@ def _from_apex(tags: Tags, name: str, power: float) -> float | None:
     """Convert an APEX value, which is a logarithm: f-number = 2^(Av / 2), exposure time = 2^-Tv."""
     value = number(tags.get(name))
     return None if value is None else 2.0 ** (value * power)
+
+
+def _f_number(tags: Tags) -> float | None:
+    return _first_positive(tags, "Exif.Photo.FNumber", "Exif.Image.FNumber") or _from_apex(tags, "Exif.Photo.ApertureValue", 0.5)
 
 
 def _focal_length_mm(tags: Tags) -> float | None:

@@ -1,5 +1,6 @@
 """Options of `mrbokeh composite` alone, in groups."""
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
@@ -7,6 +8,8 @@ from typing import Annotated
 import typer
 
 from mrbokeh.commands import _insertion_options as shared
+from mrbokeh.system.errors import InputError
+from mrbokeh.system.typed_numbers import numbers_in
 
 PhotoArgument = Annotated[
     Path,
@@ -83,7 +86,6 @@ class ObjectOptions:
         float | None,
         typer.Option(
             metavar="METRES",
-            min=0.001,
             help="Height of the camera above the ground, where there is no depth. Default: by the focus, or 1.5.",
         ),
     ] = None
@@ -103,6 +105,76 @@ class ObjectOptions:
         float | None, typer.Option(min=0.0, max=1.0, help="Darkness of the object's shadow; 1, the default, is what its light gives.")
     ] = None
     plain: Annotated[bool, typer.Option("--plain", help="Guess nothing: even light, no shadow, a level camera, no grain.")] = False
+
+    def require_meant(self, photo: Path, depth: Path | None, catch: str | None) -> None:
+        """Raise InputError, before anything is opened, where options contradict one another or are no numbers of their kind."""
+        if self.at and self.at_pixel:
+            raise InputError("--at and --at-pixel both say where the object stands: give one of them")
+        if self.object_ is not None and not self.at and not self.at_pixel:
+            raise InputError("where does the object stand? Give --at X,Y,Z in metres, or --at-pixel X,Y")
+        for given, typed in ((self.at, typed_place_m), (self.at_pixel, typed_pixel), (self.sun, typed_sun), (self.height, typed_height)):
+            if given is not None:
+                typed(given)
+        if self.sun and self.environment:
+            raise InputError(
+                f"--sun {self.sun} is a light beside what the photograph tells, which --environment replaces: a panorama has its own sun, "
+                f"so leave one of them out"
+            )
+        if self.sun and self.plain:
+            raise InputError(f"--sun {self.sun} needs the light that --plain leaves out: leave one of them out")
+        if self.object_ is not None and catch == "shadow" and not (self.plain or self.sun or self.environment):
+            raise InputError(
+                "--catch shadow shows shadows of lights, and the photograph tells of none: say where one is with --sun RIGHT,ABOVE"
+            )
+        if self.pitch is not None and not -90.0 < self.pitch < 90.0:
+            raise InputError(f"--pitch: expected how far the camera looks down, between -90 and 90 degrees, got {self.pitch:g}")
+        if self.camera_height is not None and not 0.0 < self.camera_height < math.inf:
+            raise InputError(f"--camera-height: expected metres above 0, got {self.camera_height:g}")
+        if self.camera_height is not None and (depth is not None or photo.is_dir() or not self.at_pixel or self.plain):
+            raise InputError(_NO_USE_OF_HEIGHT.format(self.camera_height))
+
+    def require_no_depth(self) -> None:
+        """Raise InputError where an option is given that only a photograph without depth needs."""
+        if self.camera_height is not None:
+            raise InputError(_NO_USE_OF_HEIGHT.format(self.camera_height))
+
+
+_NO_USE_OF_HEIGHT = (
+    "--camera-height {:g} tells how far away --at-pixel is where there is no depth: leave it out with depth, a stack, --plain or --at"
+)
+
+
+def typed_place_m(text: str) -> tuple[float, float, float]:
+    """Return X,Y,Z of --at in metres."""
+    x_m, y_m, z_m = numbers_in(text, "--at expects 3 numbers with commas between", (3,))
+    if not z_m > 0.0:
+        raise InputError(f"--at: expected a place in front of the lens, with Z above 0 m, got {text!r}")
+    return x_m, y_m, z_m
+
+
+def typed_pixel(text: str) -> tuple[float, float]:
+    """Return X,Y of --at-pixel."""
+    x_px, y_px = numbers_in(text, "--at-pixel expects 2 numbers with commas between", (2,))
+    return x_px, y_px
+
+
+def typed_sun(text: str) -> tuple[float, float]:
+    """Return degrees to the right and above the horizon of --sun."""
+    right_deg, above_deg = numbers_in(text, "--sun expects degrees to the right and above the horizon, such as -60,40", (2,))
+    if not 0.0 < above_deg <= 90.0:
+        raise InputError(f"--sun: expected a light above 0 and up to 90 degrees over the horizon, got {text!r}")
+    return right_deg, above_deg
+
+
+def typed_height(text: str) -> tuple[float, bool]:
+    """Return the number of --height, and whether it counts pixels."""
+    try:
+        number = float(text.removesuffix("px"))
+    except ValueError:
+        number = math.nan
+    if not 0.0 < number < math.inf:
+        raise InputError(f"--height: expected metres above 0 such as 0.1, or pixels such as 120px, got {text!r}")
+    return number, text.endswith("px")
 
 
 @dataclass(frozen=True)
@@ -134,10 +206,28 @@ class LensOptions:
 
 @dataclass(frozen=True)
 class ResultOptions:
-    """Files beside OUT."""
+    """Options of OUT and of files beside it."""
 
+    preview: Annotated[
+        bool,
+        typer.Option(
+            "--preview", help="OUT is small, with the ground in metres, a box around the --object, its distance, size and blur: to try."
+        ),
+    ] = False
     save_layer: Annotated[Path | None, typer.Option(help="Also write the blurred virtual layer (EXR with alpha).")] = None
     save_deep: Annotated[
         Path | None, typer.Option(metavar="FILE.exr", help="Also write the sharp virtual layers as a deep EXR, one sample per layer.")
     ] = None
     overwrite: shared.OverwriteOption = False
+
+    def require_meant(self, out: Path, *, is_object: bool, all_slices: bool) -> None:
+        """Raise InputError for a preview of something else than one object in one picture for the screen."""
+        from mrbokeh.images.image_io import require_suffix
+
+        if not self.preview:
+            return
+        require_suffix(out, (".png", ".jpg", ".jpeg"), "--out of a --preview")
+        if not is_object or all_slices or self.save_layer is not None or self.save_deep is not None:
+            raise InputError(
+                "--preview shows where an --object stands: give that, and leave --all-slices, --save-layer and --save-deep out"
+            )

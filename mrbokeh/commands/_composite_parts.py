@@ -10,7 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mrbokeh.commands._composite_options import LensOptions, ObjectOptions, PlateOptions, RenderingOptions, ResultOptions
+from mrbokeh.commands._composite_options import (
+    LensOptions,
+    ObjectOptions,
+    PlateOptions,
+    RenderingOptions,
+    ResultOptions,
+    typed_height,
+    typed_place_m,
+    typed_sun,
+)
 from mrbokeh.commands._insertion_options import ColourOptions, LookGroup, VirtualOptions, near_far_of
 from mrbokeh.commands._level_ground import HIGH_SHARE, pair_of
 from mrbokeh.compositing.ground import ended_shadow, ground_under
@@ -41,7 +50,6 @@ from mrbokeh.system.atomic_files import require_safe_outputs
 from mrbokeh.system.channel import guess, warn
 from mrbokeh.system.console import flag
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.typed_numbers import numbers_in
 from mrbokeh.video.image_sequence import read_numbers
 
 
@@ -77,7 +85,7 @@ def plate_by(
     source = options.depth or (photo if near_far_m or options.depth_scale else None)
     if source is not None:
         before_m, plate = plate.depth_m, with_depth(plate, source, DepthSettings(near_far_m, options.depth_scale))
-        plate = replace(plate, depth_note="")
+        plate = replace(plate, depth_note="", metres_guessed=plate.metres_guessed and photo.is_dir())
         if own is not None and plate.blur_from and before_m is not None:
             plate = with_blur_in_metres(plate, before_m, focus_m)
     return plate if options.matte is None else with_matte(plate, options.matte)
@@ -177,7 +185,7 @@ def placing_warning(sharp: Sequence[Layer], plate: Plate, mode: str, height: str
     mend = f"--height {height} may be wrong" if height else unit
     if not alpha.any():
         return None
-    if float(alpha[alpha > 0.5].sum()) < 1.0:
+    if max(float(layer.alpha.sum()) for layer in sharp) < 1.0:
         return f"what is put in is smaller than a pixel; {mend}"
     whole = len(rows) and (np.ptp(rows) + 1, np.ptp(columns) + 1) == alpha.shape
     if whole:
@@ -330,16 +338,10 @@ def _object_layers(
 ) -> LayersFor:
     from mrbokeh.scene.staging.scene_description import OneObject
 
-    if options.at and options.at_pixel:
-        raise InputError("--at and --at-pixel both say where the object stands: give one of them")
-    stands_at_m = _triple(options.at) if options.at else first.point_under_pixel_m(*pair_of(options.at_pixel))
+    stands_at_m = typed_place_m(options.at) if options.at else first.point_under_pixel_m(*pair_of(options.at_pixel))
     foot_px = pair_of(options.at_pixel) if options.at_pixel else _pixel_of(first.camera, stands_at_m)
-    world_from_camera = _upright(options, first, foot_px)
+    world_from_camera = np.eye(3) if first.world_from_camera is None else first.world_from_camera
     catches = rendering.catch or ("shadow" if options.plain else "light")
-    if catches == "shadow" and not (options.plain or options.sun or options.environment):
-        raise InputError(
-            "--catch shadow shows shadows of lights, and the photograph tells of none: say where one is with --sun RIGHT,ABOVE"
-        )
     usual = 0.0 if options.plain else _DARK if catches == "shadow" else 1.0
     shadow = usual if options.shadow is None else options.shadow
     one = OneObject(
@@ -370,21 +372,21 @@ def _pixel_of(camera: Camera, place_m: tuple[float, float, float]) -> tuple[floa
     return x_px, y_px
 
 
-def _upright(options: ObjectOptions, plate: Plate, foot_px: tuple[float, float]) -> np.ndarray:
-    """Return the rotation from camera axes to upright ones: as told, as known of the plate, by the ground at the foot, or none."""
+def held_upright(plate: Plate, options: ObjectOptions) -> Plate:
+    """Return the plate with the turn of its camera: as told, as known already, by the ground at the foot of an object, or none."""
     if options.pitch is not None:
-        return looking_down(math.radians(options.pitch))
-    if plate.world_from_camera is not None:
-        return plate.world_from_camera
-    if options.plain or not options.at_pixel:
-        return np.eye(3)
+        return replace(plate, world_from_camera=looking_down(math.radians(options.pitch)))
+    if plate.world_from_camera is not None or options.plain or not options.at_pixel:
+        return plate
+    foot_px = pair_of(options.at_pixel)
+    plate.require_pixel(*foot_px)
     found = ground_under(plate, foot_px)
     if found is None:
         guess("the depth around the foot is no ground with a slope: a level camera is taken (--pitch DEGREES says how far it looks down)")
-        return np.eye(3)
+        return plate
     down_deg = math.degrees(math.asin(float(np.clip(found[1, 2], -1.0, 1.0))))
     guess(f"by the depth around the foot the camera looks down by {down_deg:.0f} degrees (else --pitch DEGREES)")
-    return found
+    return replace(plate, world_from_camera=found)
 
 
 def _light(
@@ -394,39 +396,25 @@ def _light(
     from mrbokeh.compositing.plate_light import picture_light
     from mrbokeh.scene.staging.scene_description import Lighting
 
-    if options.sun and (options.environment or options.plain):
-        raise InputError(
-            f"--sun {options.sun} adds a main light to what the photograph tells of light: leave --environment and --plain out, or --sun"
-        )
     if options.environment or options.plain:
         return Lighting(options.environment, exposure=options.exposure)
     lit = picture_light if kept is None else kept.light
-    made = lit(plate, foot_px, world_from_camera, None if options.sun is None else _sun_degrees(options.sun))
-    guess(
-        "the object's light is guessed from the photograph (--exposure makes it brighter or darker, --sun RIGHT,ABOVE says where most "
-        "of it comes from, --environment PANORAMA replaces it, --plain leaves it even and without a shadow)"
-    )
+    made = lit(plate, foot_px, world_from_camera, None if options.sun is None else typed_sun(options.sun))
+    if options.sun is None:
+        guess("the object's light is guessed from the photograph (else --exposure, --sun RIGHT,ABOVE, --environment or --plain)")
+    else:
+        guess("how strong --sun is beside the sky is that of a clear day, and all light is as bright as the photograph (--exposure)")
     return Lighting(exposure=options.exposure, made=made)
-
-
-def _sun_degrees(text: str) -> tuple[float, float]:
-    right_deg, above_deg = numbers_in(text, "--sun expects degrees to the right and above the horizon, such as -60,40", (2,))
-    if not 0.0 < above_deg <= 90.0:
-        raise InputError(f"--sun: expected a light above 0 and up to 90 degrees over the horizon, got {text!r}")
-    return right_deg, above_deg
 
 
 def _height_m(text: str | None, plate: Plate, depth_m: float) -> float | None:
     """Return metres as told, or of so many pixels at that depth; None keeps the size of the file, unless metres are guessed."""
     if text is None:
         return plate.length_m(HIGH_SHARE * plate.rgb.shape[0], depth_m) if plate.metres_guessed else None
-    try:
-        number = float(text.removesuffix("px"))
-    except ValueError:
-        number = math.nan
-    if not 0.0 < number < math.inf:
-        raise InputError(f"--height: expected metres above 0 such as 0.1, or pixels such as 120px, got {text!r}")
-    height_px = number if text.endswith("px") else number / plate.length_m(1.0, depth_m)
+    number, in_pixels = typed_height(text)
+    if plate.metres_guessed and not in_pixels:
+        warn(f"--height {text} counts metres, but those of the photograph's depth are guessed: such as --height 120px says better")
+    height_px = number if in_pixels else number / plate.length_m(1.0, depth_m)
     if height_px > _HIGHEST * plate.rgb.shape[0]:
         raise InputError(
             f"--height {text} is {height_px / plate.rgb.shape[0]:.0f} times as high as the picture at {depth_m:.3g} m: expected metres, or "
@@ -468,10 +456,3 @@ def _filmed(
         return filmed.at(lambda _: seen_by(plate), time_s, sharp_rgb)
 
     return layers
-
-
-def _triple(text: str) -> tuple[float, float, float]:
-    x_m, y_m, z_m = numbers_in(text, "--at expects 3 numbers with commas between", (3,))
-    if not z_m > 0.0:
-        raise InputError(f"--at: expected a place in front of the lens, with Z above 0 m, got {text!r}")
-    return x_m, y_m, z_m

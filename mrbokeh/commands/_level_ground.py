@@ -7,13 +7,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.commands._composite_options import ObjectOptions
+from mrbokeh.commands._composite_options import ObjectOptions, typed_pixel
 from mrbokeh.compositing.plate import Plate
 from mrbokeh.scene.staging.scene_description import looking_down
 from mrbokeh.solving.solved_camera import GUESSED, KNOWN, LOW, SolvedCamera, read_solved_camera
 from mrbokeh.system.channel import guess, say, warn
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.typed_numbers import numbers_in
 
 HIGH_SHARE = 0.25
 """Share of the picture's height that an object takes whose size is neither told nor known."""
@@ -27,8 +26,7 @@ def pair_of(at_pixel: str | None) -> tuple[float, float]:
     """Return X and Y of --at-pixel. Raises InputError."""
     if at_pixel is None:
         raise InputError("where does the object stand? Give --at X,Y,Z in metres, or --at-pixel X,Y")
-    x_px, y_px = numbers_in(at_pixel, "--at-pixel expects 2 numbers with commas between", (2,))
-    return x_px, y_px
+    return typed_pixel(at_pixel)
 
 
 def with_camera_of_file(plate: Plate, path: Path) -> tuple[Plate, float | None]:
@@ -50,9 +48,7 @@ def on_level_ground(plate: Plate, standing: ObjectOptions, known_height_m: float
     known_height_m: of a solved camera; --camera-height comes before it. Raises InputError for a pixel that shows no ground.
     """
     x_px, y_px = pair_of(standing.at_pixel)
-    if not (0 <= x_px < plate.camera.width_px and 0 <= y_px < plate.camera.height_px):
-        size = f"{plate.camera.width_px}x{plate.camera.height_px} px"
-        raise InputError(f"pixel {x_px:g},{y_px:g} lies outside the photograph of {size}: choose one within")
+    plate.require_pixel(x_px, y_px)
     taken = []
     if standing.pitch is not None:
         plate = replace(plate, world_from_camera=looking_down(math.radians(standing.pitch)))
@@ -114,7 +110,8 @@ def _camera_height_m(plate: Plate, told_m: float | None, nearest_m: float) -> tu
     height_m = focus_m / nearest_m
     if _LOWEST_M <= height_m <= _HIGHEST_M:
         told = f"the object to stand where the lens is focused, {focus_m:.3g} m away and {height_m:.2g} m below the camera"
-        return height_m, f"{told} (--camera-height METRES)"
+        rough = "" if plate.rough_focus_m is None else ", roughly: {:.2g} to {:.2g} m by its file".format(*plate.rough_focus_m)
+        return height_m, f"{told}{rough} (--camera-height METRES)"
     warn(
         f"the lens is focused at {focus_m:.3g} m, but ground that far away at this pixel would be {height_m:.2g} m below the camera: "
         f"another place is in focus, or the file is wrong (--focus METRES)"

@@ -55,7 +55,7 @@ PANELS = {
     "Tracking": "camera-model cameras delay focus-from freed lens-table longest-gap map mapper max-image-size metres-per-unit opentrackio "
     "phone phone-camera pose rig smooth steadier",
     "The page": "captures interface lan max-rate pictures port project qr tls tls-key webcam",
-    "The result": "constant-rate encoding format leaks no-distortion ocio output-space overwrite save-deep save-depth "
+    "The result": "constant-rate encoding format leaks no-distortion ocio output-space overwrite preview save-deep save-depth "
     "save-layer sheet virtual-only allow-absent strict",
     "The work": "cluster device epochs max-width segment threads work workers",
 }

@@ -50,6 +50,7 @@ def composite(
         alpha_lost,
         blur_told,
         check_outputs,
+        held_upright,
         layers_by,
         nothing_seen,
         placing_warning,
@@ -58,6 +59,7 @@ def composite(
         write_results,
     )
     from mrbokeh.commands._level_ground import on_level_ground, pair_of, with_camera_of_file
+    from mrbokeh.commands._preview import smaller, write_preview_of
     from mrbokeh.compositing.choose import best_mode, insertion_of
     from mrbokeh.compositing.ground import with_ground_behind
     from mrbokeh.compositing.plate_look.finishing import finished
@@ -78,31 +80,40 @@ def composite(
     )
     if taken.all_slices:
         require_options_of_stacks(taken, optics, look, colour, result)
+    standing.require_meant(photo, taken.depth, rendering.catch)
+    require_one_focus(focus=optics.focus, focus_at=optics.focus_at)
+    result.require_meant(out, is_object=standing.object_ is not None, all_slices=taken.all_slices)
     check_outputs(out, result, read, all_slices=taken.all_slices)
     bundle = read_bundle(photo) if is_bundle(photo) else None
     lens, renderer = lens_and_renderer(optics.lens, optics.renderer or (bundle.renderer if bundle and optics.lens is None else None))
     lens = lens and facts.on(lens, renderer)
-    require_one_focus(focus=optics.focus, focus_at=optics.focus_at)
     on_ground = standing.object_ is not None and bool(standing.at_pixel) and not photo.is_dir() and not standing.plain
     stated = {} if lens else facts.given
     open_focused = partial(plate_by, photo, taken, colour, bundle, lens=lens, facts=stated, guessing=on_ground)
     plate = open_focused(focus_m=optics.focus if optics.focus_at is None else 1.0)  # then only its depth is asked for
     if optics.focus_at is not None:
         plate = open_focused(focus_m=focused_at_pixel(plate.lens, plate.depth_m, optics.focus_at).focus_distance_m)
+    if plate.depth_m is not None:
+        standing.require_no_depth()
     _tell_metres(photo, virtual, standing, lens)
     guess(plate.depth_note)
-    known_height_m = None
+    known_height_m, scale = None, 1.0
+    if result.preview:
+        plate, standing, scale = smaller(plate, standing)
     if virtual.camera is not None and standing.object_ is not None and virtual.scene is None:
         plate, known_height_m = with_camera_of_file(plate, virtual.camera)
     if on_ground and plate.depth_m is None:
         plate, standing = on_level_ground(plate, standing, known_height_m)
+    if standing.object_ is not None:
+        plate = held_upright(plate, standing)
     layers_for = layers_by(virtual, standing, rendering, plate, bundle)
     mode = virtual.mode or best_mode(plate)
     insertion = insertion_of(mode, taken.near_distance, exact_depth=taken.exact_depth)
     if taken.all_slices:
         _into_all_slices(photo, out, layers_for, insertion, renderer, lens)
         return
-    finishing = _finishing(photo, plate, look, matching=standing.object_ is not None and not standing.plain)
+    matching = standing.object_ is not None and not standing.plain
+    finishing = _finishing(photo, plate, look, matching=matching, is_linear=out.suffix.lower() == ".exr" or result.preview)
     sharp = layers_for(plate)
     if not any((layer.alpha > 0).any() for layer in sharp):
         nothing_seen(standing, virtual)
@@ -112,6 +123,9 @@ def composite(
         warn(warning)
     with working("blurring"):
         inserted = finished(insertion.insert(plate, sharp, renderer), plate, finishing)
+    if result.preview:
+        tell(f"wrote the preview {out}: {write_preview_of(out, inserted, plate, sharp[0], scale)}")
+        return
     write_results(out, inserted, plate, sharp, colour, result)
     if lost := alpha_lost(out, plate):
         warn(lost)
@@ -119,14 +133,16 @@ def composite(
     tell(f"wrote {out} ({mode}; {told})", known, mode=mode, **figures)
 
 
-def _finishing(photo: Path, plate: "Plate", look: LookGroup, *, matching: bool) -> "Finishing":
+def _finishing(photo: Path, plate: "Plate", look: LookGroup, *, matching: bool, is_linear: bool) -> "Finishing":
     """Return what makes virtual light look photographed: as told, and of a photograph in a file also as it is."""
     from mrbokeh.compositing.plate_look.finishing import finishing_of, matched_finishing
 
     if photo.is_dir() or not matching:
         return finishing_of(look.wanted, plate.rgb, None if photo.is_dir() else photo)
-    finishing, matched = matched_finishing(look.wanted, plate.rgb, photo)
-    guess(f"black and grain are matched to the photograph ({' off, '.join(matched)} off)" if matched else "")
+    finishing, matched = matched_finishing(look.wanted, plate.rgb, photo, is_linear=is_linear)
+    guess(
+        f"black, grain and compression are the photograph's, as far as they can be told ({' off, '.join(matched)} off)" if matched else ""
+    )
     return finishing
 
 

@@ -10,7 +10,7 @@ Every insertion owes these (tests/compositing/test_compositing.py asks all of th
 """
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -20,10 +20,12 @@ from jaxtyping import Float, Float32
 
 from mrbokeh.depth.depth_map import DepthSettings
 from mrbokeh.depth.open_depth import open_depth
-from mrbokeh.depth.phone_depth import PhoneFocus, PhonePhoto, read_phone_photo
+from mrbokeh.depth.phone_depth import read_phone_photo
+from mrbokeh.depth.phone_photo import PhoneFocus, PhonePhoto
 from mrbokeh.images.alpha_io import is_straight, read_alpha
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
+from mrbokeh.images.xmp import jpeg_xmp
 from mrbokeh.optics.camera import Camera, camera_of_lens
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
@@ -46,9 +48,11 @@ class Plate:
     near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects, sharp; or None.
     alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
     depth_note: what is known and what is guessed of a phone's own depth and focus, in words.
-    metres_guessed: of a stack that knows no focus distance; blur is right in pixels all the same. blur_from: where the lens has its blur
-        from, in words, if its focal length and f-number are made up. focus_known: False where nothing tells it. view_known: False where the
-        field of view is guessed. world_from_camera: (3, 3) turns camera axes into upright ones, where that is known.
+    metres_guessed: of a stack that knows no focus distance, and of a phone's depth without a unit; blur is right in pixels all the same.
+    blur_from: where the lens has its blur from, in words, if its focal length and f-number are made up.
+    focus_known, view_known: False where nothing tells the focus, and where the field of view is guessed.
+    rough_focus_m: nearest and farthest distance that the focus in the photograph's file may mean, where that is a wide range.
+    world_from_camera: (3, 3) turns camera axes into upright ones, where that is known.
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -64,6 +68,7 @@ class Plate:
     view_known: bool = True
     world_from_camera: Float[np.ndarray, "3 3"] | None = None
     depth_note: str = ""
+    rough_focus_m: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         size = self.rgb.shape[:2]
@@ -86,12 +91,16 @@ class Plate:
         x_m, y_m, z_m = self.camera.unproject(np.array([x_px, y_px], np.float64), np.array(depth_m))
         return float(x_m), float(y_m), float(z_m)
 
+    def require_pixel(self, x_px: float, y_px: float) -> None:
+        """Raise InputError for a pixel outside the photograph."""
+        height, width = self.rgb.shape[:2]
+        if not (0 <= x_px < width and 0 <= y_px < height):
+            raise InputError(f"pixel {x_px:g},{y_px:g} lies outside the photograph of {width}x{height} px: choose one within")
+
     def depth_at_m(self, x_px: float, y_px: float) -> float:
         """Return the depth at a pixel of a photograph with depth. Raises InputError if it lies outside."""
         assert self.depth_m is not None
-        height, width = self.depth_m.shape
-        if not (0 <= x_px < width and 0 <= y_px < height):
-            raise InputError(f"pixel {x_px:g},{y_px:g} lies outside the photograph of {width}x{height} px: choose one within")
+        self.require_pixel(x_px, y_px)
         return float(self.depth_m[int(y_px), int(x_px)])
 
     def length_m(self, pixels: float, depth_m: float) -> float:
@@ -132,14 +141,18 @@ def open_plate(
 
 def photograph_plate(photo: Path, photograph: Photograph, phone: PhonePhoto | None, wishes: "LensWishes") -> Plate:
     """Return the plate of a photograph that was read from its file, with what a phone put into it."""
+    if wishes.lens is None and not wishes.facts:
+        _require_no_panorama(photo, photograph)
     held = held_lens(photo, photograph, phone, wishes)
     plate = with_own_alpha(plate_of(photograph.rgb, held.lens), photo, read_alpha(photo, photograph.orientation))
     if phone is None:
-        return replace(plate, focus_known=held.focus_known, view_known=held.view_known)
+        return replace(plate, focus_known=held.focus_known, view_known=held.view_known, rough_focus_m=held.rough_focus_m)
     original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
-    is_focus_guessed = phone.focus is not None and bool(phone.focus.note) and wishes.lens is None and wishes.focus_m is None
-    note = f"{photo}: {phone.depth.note}" + (f"; {phone.focus.note}" if phone.focus is not None and is_focus_guessed else "")
-    return replace(with_depth(plate, photo, DepthSettings()), sharp_rgb=original, blur_from=held.blur_from, depth_note=note)
+    stated = wishes.lens is not None or wishes.focus_m is not None or photograph.focus_distance_m is not None
+    guessed = [] if phone.focus is None else [phone.focus.note * (not stated), phone.focus.blur_note * bool(held.blur_from)]
+    note = "; ".join(each for each in (f"{photo}: {phone.depth.note}", *guessed) if each)
+    deep = with_depth(plate, photo, DepthSettings())
+    return replace(deep, sharp_rgb=original, blur_from=held.blur_from, depth_note=note, metres_guessed=not phone.has_unit)
 
 
 @dataclass(frozen=True)
@@ -154,12 +167,13 @@ class LensWishes:
 
 @dataclass(frozen=True)
 class HeldLens:
-    """Lens of a photograph. blur_from, focus_known, view_known: as in `Plate`."""
+    """Lens of a photograph. blur_from, focus_known, view_known, rough_focus_m: as in `Plate`."""
 
     lens: Lens
     blur_from: str = ""
     focus_known: bool = True
     view_known: bool = True
+    rough_focus_m: tuple[float, float] | None = None
 
 
 def held_lens(photo: Path, photograph: Photograph, phone: PhonePhoto | None, wishes: LensWishes) -> HeldLens:
@@ -179,7 +193,24 @@ def held_lens(photo: Path, photograph: Photograph, phone: PhonePhoto | None, wis
     elif phone is not None and phone.focus is not None and photograph.focus_distance_m is None:
         photograph = replace(photograph, focus_distance_m=phone.focus.focus_distance_m)
     lens = photograph.lens(photo, focus_m) if lens is None else lens_for_photograph(lens, photograph, photo)
-    return HeldLens(lens if focus_m is None else lens.focused_at(focus_m), blur_from, focus_known, view_known)
+    rough_m = photograph.rough_focus_m if phone is None and focus_m is None else None
+    focused = lens if focus_m is None else lens.focused_at(focus_m)
+    return HeldLens(focused, blur_from, focus_known, view_known=view_known, rough_focus_m=rough_m)
+
+
+def _require_no_panorama(photo: Path, photograph: Photograph) -> None:
+    """Raise InputError for a panorama that says so (GPano), and warn of a picture that is shaped as one: a lens draws neither."""
+    height_px, width_px = photograph.rgb.shape[:2]
+    advice = "cut out a part, and say --focal-length and --sensor-width of that"
+    told = jpeg_xmp(photo.read_bytes(), photo) if photo.suffix.lower() in (".jpg", ".jpeg") else {}
+    if told.get(_GPANO + "ProjectionType") or told.get(_GPANO + "FullPanoWidthPixels"):
+        raise InputError(f"{photo} is a panorama, as its XMP tells (GPano), in which straight lines are bent: {advice}")
+    if width_px > _PANORAMIC * height_px and photograph.cut_from_px is None:
+        _log.warning(f"{photo} of {width_px}x{height_px} px is shaped as a panorama, for which its lens would be wrong: {advice}")
+
+
+_GPANO = "{http://ns.google.com/photos/1.0/panorama/}"
+_PANORAMIC = 2.2
 
 
 def phone_photo(photo: Path) -> PhonePhoto | None:
@@ -223,6 +254,29 @@ def with_blur_in_metres(plate: Plate, before_m: Float32[np.ndarray, "height widt
 def plate_of(rgb: Float32[np.ndarray, "height width 3"], lens: Lens, depth_m: Float32[np.ndarray, "height width"] | None = None) -> Plate:
     """A picture through the pinhole of its lens, which looks at its middle."""
     return Plate(rgb, depth_m, lens, camera_of_lens(lens, rgb.shape[1], rgb.shape[0]))
+
+
+def shrunk(plate: Plate, width_px: int, height_px: int) -> Plate:
+    """Return the plate with fewer pixels; depth is picked, as a mean of two surfaces is none."""
+    import cv2
+
+    size_px = (width_px, height_px)
+
+    def by(method: int) -> Callable[[np.ndarray | None], np.ndarray | None]:
+        return lambda plane: None if plane is None else np.ascontiguousarray(cv2.resize(plane, size_px, interpolation=method))
+
+    mean, picked = by(cv2.INTER_AREA), by(cv2.INTER_NEAREST)
+    rgb = mean(plate.rgb)
+    assert rgb is not None
+    return replace(
+        plate,
+        rgb=rgb,
+        depth_m=picked(plate.depth_m),
+        camera=plate.camera.resized(*size_px),
+        sharp_rgb=mean(plate.sharp_rgb),
+        near_alpha=mean(plate.near_alpha),
+        alpha=mean(plate.alpha),
+    )
 
 
 def with_own_alpha(plate: Plate, path: Path, alpha: Float32[np.ndarray, "height width"] | None) -> Plate:

@@ -93,11 +93,25 @@ def upright(picture: Picture, orientation: int) -> Picture:
     return np.ascontiguousarray(np.rot90(picture[:, ::-1] if mirrored else picture, turns))  # type: ignore[return-value]
 
 
+def upright_place(x: float, y: float, orientation: int) -> tuple[float, float]:
+    """Return where a place of the stored picture lies in the upright one; both in shares of width and height."""
+    turns, mirrored = _UPRIGHT[orientation]
+    x = 1.0 - x if mirrored else x
+    for _ in range(turns):
+        x, y = y, 1.0 - x
+    return x, y
+
+
 def as_stored(picture: Picture, orientation: int) -> Picture:
     """Turn an upright picture back to how it is stored: the inverse of `upright`."""
+    return np.ascontiguousarray(oriented_as_stored(picture, orientation))  # type: ignore[return-value]
+
+
+def oriented_as_stored(picture: Picture, orientation: int) -> Picture:
+    """Return a view of an upright picture as it is stored."""
     turns, mirrored = _UPRIGHT[orientation]
     turned = np.rot90(picture, -turns)
-    return np.ascontiguousarray(turned[:, ::-1] if mirrored else turned)  # type: ignore[return-value]
+    return turned[:, ::-1] if mirrored else turned  # type: ignore[return-value]
 
 
 _SAME_ASPECT = 0.01

@@ -70,8 +70,8 @@ def plane_of(picture: Any) -> np.ndarray:
     codes = np.frombuffer(data, np.uint16).reshape(height, width, channels)
     # libheif leaves the codes of 10 or 12 bits at the upper end of 16.
     bits = int(getattr(picture, "info", {}).get("bit_depth", 16))
-    top = ((1 << bits) - 1) << (16 - bits)
-    return np.round(codes * (65535.0 / top)).astype(np.uint16)
+    whole_range = np.round(np.arange(1 << bits) * (65535.0 / ((1 << bits) - 1))).astype(np.uint16)
+    return np.take(whole_range, codes >> (16 - bits))
 
 
 def heif_exif(path: Path) -> bytes:

@@ -210,7 +210,11 @@ def _by_profile(profile: ColourProfile, codes: Shaped[np.ndarray, "height width 
     import cv2
 
     tables = profile.tables(int(_INTEGER_RANGE[codes.dtype]))
-    light = np.dstack([np.take(tables[:, i], codes[..., i]) for i in range(3)])
+    light = (
+        cv2.LUT(np.ascontiguousarray(codes), tables[:, None])
+        if codes.dtype == np.uint8
+        else cv2.merge([np.take(np.ascontiguousarray(tables[:, i]), codes[..., i]) for i in range(3)])
+    )
     return np.asarray(cv2.transform(light, profile.rec709_from_rgb.astype(np.float32)))
 
 

@@ -43,7 +43,8 @@ class Photograph:
 
     rgb: (H, W, 3) linear Rec.709, upright. sensor_width_mm: along the rows of the upright picture. focus_distance_m: from the lens.
     orientation: EXIF's, by which the picture came upright. cut_from_px: width and height of the whole that this is a part of, or None if
-    it is the whole.
+    it is the whole. sensor_doubt: what speaks against the stated sensor, in words. rough_focus_m: nearest and farthest distance that the
+    stated focus may mean, where that is a wide range.
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -55,6 +56,8 @@ class Photograph:
     iso: float | None = None
     orientation: int = AS_STORED
     cut_from_px: tuple[int, int] | None = None
+    sensor_doubt: str = ""
+    rough_focus_m: tuple[float, float] | None = None
 
     @property
     def quarter_turns(self) -> int:
@@ -64,10 +67,11 @@ class Photograph:
     def stating(self, facts: Mapping[str, float]) -> "Photograph":
         """Return the photograph as if its file stated these facts: focal_length_mm, f_number, sensor_width_mm of the camera held level."""
         told = dict(facts)
+        doubt = "" if "sensor_width_mm" in told else self.sensor_doubt
         if "sensor_width_mm" in told and self.quarter_turns % 2:
             width_px, height_px = self.cut_from_px or (self.rgb.shape[1], self.rgb.shape[0])
             told["sensor_width_mm"] *= width_px / height_px
-        return replace(self, **told)  # type: ignore[arg-type]
+        return replace(self, sensor_doubt=doubt, **told)  # type: ignore[arg-type]
 
     def guessing(self) -> tuple["Photograph", str]:
         """Return the photograph with a guess for all of its lens but the focus that its file does not tell, and the guesses in words."""
@@ -106,6 +110,8 @@ class Photograph:
                 f"{path} does not tell its lens (unknown: {', '.join(missing)}): give "
                 f"{' '.join(_OPTION_OF[name] for name in missing)}, or --lens LENS.json (see `mrbokeh lens new`)"
             )
+        if self.sensor_doubt:
+            _log.warning(f"{path}: {self.sensor_doubt} (--sensor-width MM)")
         if self.cut_from_px is not None:
             _log.warning(
                 f"{self.cut_told(path)}: {self.sensor_width_mm:.3g} mm of the sensor are taken along its width; if it was made smaller "

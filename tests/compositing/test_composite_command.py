@@ -1,11 +1,14 @@
 """`mrbokeh composite` as a user meets it: a layer or an object into a photograph or a slice, and what it refuses."""
 
+import re
 import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
@@ -97,6 +100,25 @@ def test_without_depth_an_object_stands_on_level_ground(files: Path, composite: 
     assert code == 0 and "28 mm on 36 mm of sensor" in told and "f/8" in told and "to look down by" in told
 
 
+def test_a_preview_is_small_and_tells_the_size_in_pixels_of_the_photograph(tmp_path: Path, composite: Composite) -> None:
+    """24 px of 144 are 240 of 1440; the picture is 1000 px wide and has the grid's colour beside the object, not on it."""
+    photo, out = tmp_path / "large.exr", tmp_path / "preview.png"
+    write_image(photo, np.repeat(np.repeat(plate_rgb(), 10, axis=0), 10, axis=1))
+    words = (photo, "--object", CAKE, "--at-pixel", "1000,700", "--height", "240px", "--preview", "--out", out)
+    code, told = composite(*words, "--focal-length", 35, "--sensor-width", 23.5, "--f-number", 4, "--focus", 3)
+    assert code == 0, told
+    height_px = int(re.search(r"x(\d+) px, ", told).group(1))  # type: ignore[union-attr]
+    assert 220 < height_px < 290 and "cells of 0.2 m" in told, told
+    shown = cv2.imread(str(out))[..., ::-1].astype(int)
+    assert shown.shape == (667, 1000, 3)
+    yellow = np.abs(shown - (255, 225, 40)).max(axis=2) < 60
+    assert yellow[500:640].sum() > 500 and not yellow[430:480, 660:730].any()
+    code, told = composite(*words[:-1], tmp_path / "preview.exr")
+    assert code == 2 and "expected a name that ends in .png" in told
+    code, told = composite(*words, "--save-layer", tmp_path / "layer.exr", "--overwrite")
+    assert code == 2 and "--preview shows where an --object stands" in told
+
+
 def test_a_slice_of_a_stack_brings_lens_focus_and_depth(files: Path, composite: Composite) -> None:
     stack_folder = files / "stack"
     for i in range(3):
@@ -138,22 +160,33 @@ def test_objects_are_placed_in_camera_axes_wherever_the_camera_stood(tmp_path: P
     ({"--object": "cake", "--at-pixel": "10,10", "--pitch": "0"}, "above the horizon"),
     ({"--object": "cake", "--at-pixel": "10,60", "--camera": "lens.json"}, "expected a camera of `mrbokeh capture solve`"),
     ({"--object": "cake", "--at": "1,2"}, "--at expects 3 numbers"),
+    ({"--object": "cake", "--at": "0,0,1", "--at-pixel": "10,80"}, "--at and --at-pixel both say where the object stands"),
+    ({"--object": "cake", "--at-pixel": "10,80", "--sun": "0,40", "--environment": "sky.hdr"}, "a panorama has its own sun"),
+    ({"--object": "cake", "--at-pixel": "10,80", "--sun": "0,40", "--plain": True}, "needs the light that --plain leaves out"),
+    ({"--object": "cake", "--at-pixel": "10,80", "--sun": "0,95"}, "above 0 and up to 90 degrees over the horizon"),
+    ({"--object": "cake", "--at-pixel": "10,80", "--pitch": "95"}, "--pitch: expected how far the camera looks down, between -90"),
+    ({"--object": "cake", "--at-pixel": "10,80", "--height": "high"}, "--height: expected metres above 0"),
+    ({"--object": "cake", "--at-pixel": "10,80", "--catch": "shadow"}, "the photograph tells of none"),
+    ({"--object": "cake", "--at-pixel": "10,80", "--camera-height": "0"}, "--camera-height: expected metres above 0, got 0"),
+    ({"--object": "cake", "--at": "0,0,1", "--camera-height": "1.2"}, "leave it out with depth, a stack, --plain or --at"),
+    ({"--object": "cake", "--at-pixel": "10,80", "--depth": "depth.exr", "--camera-height": "1.2"}, "leave it out with depth"),
     ({"--layer": "card.exr", "--renderer": "magic"}, "expected a renderer"),
     ({"--layer": "card.exr", "--out": "photo.exr"}, "is read and would be written over"),
     ({"--layer": "card.exr", "--out": "depth.exr"}, "exists already: give another name, or --overwrite"),
     ({"--layer": "card.exr", "--slice": "1"}, "not a folder"),
     ({"--layer": "card.exr", "--out": "out.gif"}, "expected a name that ends in .exr or .png"),
 ])  # fmt: skip
-def test_mistakes_end_in_one_sentence(files: Path, composite: Composite, change: dict[str, str | None], message: str) -> None:
+def test_mistakes_end_in_one_sentence(files: Path, composite: Composite, change: dict[str, Any], message: str) -> None:
+    """And none of them comes after a line that says what was guessed."""
     options = {"--lens": "lens.json", "--out": "out.exr"} | change
     words: list[object] = []
     for option, value in options.items():
         if value is not None:
-            path = CAKE if value == "cake" else files / value if "." in value and "," not in value else value
-            words += [option, path]
+            path = CAKE if value == "cake" else files / value if str(value).endswith((".exr", ".json", ".gif", ".hdr")) else value
+            words += [option] if value is True else [option, path]
     code, told = composite(files / "photo.exr", *words)
     assert code == 2
-    assert message in told and "Traceback" not in told
+    assert message in told and "Traceback" not in told and "guessed" not in told and "there is no depth: mrbokeh" not in told
     assert not (files / "out.exr").exists() and not (files / "out.gif").exists()
 
 

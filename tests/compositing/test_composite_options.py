@@ -4,18 +4,19 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from mrbokeh import composite
 from mrbokeh.commands._composite_options import PlateOptions
-from mrbokeh.commands._composite_parts import plate_by
+from mrbokeh.commands._composite_parts import placing_warning, plate_by
 from mrbokeh.commands._insertion_options import ColourOptions
 from mrbokeh.commands.composite import app
 from mrbokeh.compositing.choose import best_mode, insertion_of
 from mrbokeh.compositing.ground import ended_shadow, with_ground_behind
-from mrbokeh.compositing.plate import plate_of, with_blur_in_metres
+from mrbokeh.compositing.plate import open_plate, plate_of, with_blur_in_metres
 from mrbokeh.demo.plan import DATA
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.exr_io import read_exr
@@ -342,3 +343,40 @@ def test_what_is_told_of_a_phones_lens_is_no_f_number(shared_data: Path, tmp_pat
     words = ("--object", CAKE, "--at-pixel", "380,700", "--height", "200px", "--out", tmp_path / "out.png")
     done = mrbokeh("composite", shared_data / "rgbd" / "phone_lens_blur_gdepth.jpg", *words)
     assert done.returncode == 0 and "the phone's own blur, focused at" in done.stdout and "f/" not in done.stdout, done.stderr
+
+
+def test_metres_of_depth_without_a_unit_are_doubted(shared_data: Path, tmp_path: Path) -> None:
+    """Lens Blur's depth goes from 12.42 to 390.6 of no unit, in which a cake of 0.1 is a speck."""
+    path = shared_data / "rgbd" / "phone_lens_blur_gdepth.jpg"
+    assert open_plate(path).metres_guessed
+    told = plate_by(path, PlateOptions(disparity="0.5:4"), ColourOptions(), None, lens=None, focus_m=None, facts={})
+    assert not told.metres_guessed
+    words = ("--object", CAKE, "--at-pixel", "380,700", "--height", "0.1", "--out", tmp_path / "out.png")
+    assert "--height 0.1 counts metres, but those of the photograph's depth are guessed" in mrbokeh("composite", path, *words).stderr
+
+
+def test_glass_is_no_speck() -> None:
+    """Half a pixel is told, and 400 pixels that let 70 % of the light through are not."""
+    alpha = np.zeros((HEIGHT, WIDTH), np.float32)
+    alpha[20:40, 20:40] = 0.3
+    speck = np.zeros_like(alpha)
+    speck[20, 20] = 0.6
+    black, far = np.zeros((HEIGHT, WIDTH, 3), np.float32), np.float32(np.inf)
+    layers = [Layer(black, each, np.where(each > 0, np.float32(1.0), far)) for each in (alpha, speck)]
+    plate = plate_of(plate_rgb(), LENS)
+    assert placing_warning(layers[:1], plate, "over", "0.1") is None
+    assert "smaller than a pixel" in str(placing_warning(layers[1:], plate, "over", "0.1"))
+
+
+def test_panoramas_are_refused_or_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    plain = cv2.imencode(".jpg", np.full((100, 300, 3), 90, np.uint8))[1].tobytes()
+    (tmp_path / "wide.jpg").write_bytes(plain)
+    open_plate(tmp_path / "wide.jpg", focus_m=1.0, guessing=True)
+    assert "300x100 px is shaped as a panorama" in caplog.text
+    packet = b"http://ns.adobe.com/xap/1.0/\0" + (
+        b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description '
+        b'xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" GPano:ProjectionType="equirectangular"/></rdf:RDF></x:xmpmeta>'
+    )
+    (tmp_path / "gpano.jpg").write_bytes(plain[:2] + b"\xff\xe1" + (len(packet) + 2).to_bytes(2, "big") + packet + plain[2:])
+    refused("is a panorama, as its XMP tells", open_plate, tmp_path / "gpano.jpg", focus_m=1.0, guessing=True)
+    assert open_plate(tmp_path / "gpano.jpg", lens=LENS).lens == LENS, "which somebody states"

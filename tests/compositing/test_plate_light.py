@@ -57,13 +57,43 @@ def test_the_ground_gets_the_irradiance_of_a_white_surface() -> None:
 
 
 def test_a_main_light_takes_its_share_of_the_light() -> None:
-    """The sun from the right and 30 degrees above the horizon travels left and down, and the ground keeps its irradiance."""
+    """The sun from the right and 30 degrees above the horizon travels left and down, and the ground keeps its irradiance.
+
+    On a clear day the sky then gives 11.8 of 53.7 klx (Illuminating Engineering Society, RP-21), and is bluer than the sun.
+    """
     plate = photograph()
     environment, (main,) = picture_light(plate, (24.0, 28.0), np.eye(3), (90.0, 30.0))
     np.testing.assert_allclose(main.direction, (-np.cos(np.pi / 6), 0.5, 0.0), atol=1e-9)
     upwards = np.maximum(-directions(32, 64)[..., 1], 0.0) * solid_angles_sr(32, 64)
     irradiance = (environment.radiance * upwards[..., None]).sum(axis=(0, 1)) + 0.5 * np.array(main.rgb)
     np.testing.assert_allclose(irradiance / np.pi, white_at(plate.rgb, 0.5, 28 / HEIGHT), rtol=0.03)
+    shade = 1.0 - 0.5 * np.array(main.rgb) / irradiance
+    assert float(luminance(shade[None].astype(np.float32))[0]) == pytest.approx(11.8 / 53.7, rel=0.05)
+    assert shade[2] > 1.5 * shade[1] > 1.5 * 1.2 * shade[0]
+
+
+@pytest.mark.parametrize("factor", [0.01, 40.0])
+def test_a_picture_twice_as_bright_tells_of_light_twice_as_bright(factor: float) -> None:
+    """Whatever the exposure: of a night, and of light far above the white of a screen."""
+    plate = photograph((1.3, 1.0, 0.6))
+    brighter = replace(plate, rgb=plate.rgb * np.float32(factor))
+    environment, (main,) = picture_light(plate, (24.0, 28.0), np.eye(3), (90.0, 30.0))
+    other, (brighter_main,) = picture_light(brighter, (24.0, 28.0), np.eye(3), (90.0, 30.0))
+    np.testing.assert_allclose(other.radiance, factor * environment.radiance, rtol=1e-3)
+    np.testing.assert_allclose(brighter_main.rgb, factor * np.array(main.rgb), rtol=1e-3)
+
+
+def test_a_street_under_sodium_lamps_makes_no_red_object() -> None:
+    """What faces the camera there, and what lies flat, is lit by two channels at least: red is no more than 2.2 times green."""
+    plate = photograph((0.1, 0.03, 0.003))
+    environment, _ = picture_light(plate, (24.0, 28.0), np.eye(3))
+    weights = solid_angles_sr(32, 64)[..., None]
+    for faces in ((0.0, -1.0, 0.0), (0.0, 0.0, -1.0)):
+        red, green, blue = (environment.radiance * weights * np.maximum(directions(32, 64) @ np.array(faces), 0.0)[..., None]).sum((0, 1))
+        assert green < red < 2.2 * green and blue > 0.2 * green
+    lamp = plate.rgb.copy()
+    lamp[2:5, 2:5] = 500.0
+    np.testing.assert_allclose(white_at(lamp, 0.5, 0.8), white_at(plate.rgb, 0.5, 0.8), rtol=0.3, err_msg="a lamp is no white wall")
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.004])

@@ -6,15 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.ndimage import gaussian_filter
 
 from mrbokeh.compositing.over import OverPhotograph, behind
 from mrbokeh.compositing.plate import Inserted, Plate, plate_of
 from mrbokeh.compositing.plate_look.colour_match import ColourMatch
+from mrbokeh.compositing.plate_look.compression import JpegCompression
 from mrbokeh.compositing.plate_look.finishing import Finishing, LightWrap, LookOptions, finished, matched_finishing
 from mrbokeh.compositing.plate_look.grain import Grain, GrainDraw, add_grain_to, measured_grain
 from mrbokeh.compositing.plate_look.noise_measurement import NoiseLevel
 from mrbokeh.compositing.plate_look.vignetting import RadialFalloff
+from mrbokeh.images.color import linear_to_srgb, srgb_codes
+from mrbokeh.images.exif import as_stored, upright
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.pixel_box import lit_box
@@ -25,6 +29,7 @@ from tests.compositing.test_plate_look_grain import READ, SHOT, smooth_scene, un
 from tests.support.refusals import refused
 
 SIZE = (256, 384)
+NO_FILE = Path("no_file.png")
 LENS = Lens(50.0, 2.0, 1.0, 36.0)
 GRAIN = Grain(NoiseLevel((4e-4, 2e-4, 6e-4), (2e-5, 1e-5, 4e-5)))
 ALL = Finishing(ColourMatch((1.2, 1.0, 0.8), (0.01, 0.02, 0.03)), RadialFalloff(-0.4), GRAIN, LightWrap(0.5, 4.0))
@@ -271,18 +276,46 @@ def test_light_wrap_adds_the_light_beside_the_edge_that_it_says() -> None:
 
 
 def test_black_and_grain_are_matched_as_far_as_a_photograph_surely_has_them() -> None:
-    """Grain of a deviation of 0.01 on a black of 0.01 is found; sand of 0.04 on 0.3 is no grain so strong, and not black."""
+    """Grain of a deviation of 0.003 on a black of 0.01 is found; sand of 0.04 on 0.3 is no grain so strong, and not black."""
     rng = np.random.default_rng(8)
     level = np.linspace(0.01, 0.4, 256)[:, None, None] * np.ones((1, 320, 3))
-    noisy = (level + 0.01 * rng.standard_normal(level.shape)).astype(np.float32)
-    found, matched = matched_finishing(LookOptions(), noisy)
+    noisy = (level + 0.003 * rng.standard_normal(level.shape)).astype(np.float32)
+    found, matched = matched_finishing(LookOptions(), noisy, NO_FILE)
     assert matched == ["--match-black", "--grain"]
     assert found.grain is not None and found.colour is not None
-    assert np.sqrt(found.grain.level.variance(np.full(3, 0.18))) == pytest.approx(np.full(3, 0.01), rel=0.15)
+    assert np.sqrt(found.grain.level.variance(np.full(3, 0.18))) == pytest.approx(np.full(3, 0.003), rel=0.15)
     assert found.colour.black == pytest.approx((0.01, 0.01, 0.01), abs=0.005)
     sand = (0.3 + 0.04 * rng.standard_normal(level.shape)).clip(0.1).astype(np.float32)
-    found, matched = matched_finishing(LookOptions(), sand)
+    found, matched = matched_finishing(LookOptions(), sand, NO_FILE)
     assert matched == ["--grain"] and found.grain is not None
-    assert np.sqrt(found.grain.level.variance(np.full(3, 0.18)).max()) == pytest.approx(0.015, rel=1e-3)
-    assert matched_finishing(LookOptions(match_black="off", grain="off"), noisy)[0].is_nothing
-    assert not matched_finishing(LookOptions(), np.full((8, 8, 3), 0.001, np.float32))[1], "too small to tell"
+    levels = np.linspace(0.01, 0.6, 60)
+    shown = linear_to_srgb((levels + np.sqrt(found.grain.level.variance(levels[:, None] * np.ones(3)).max(axis=1))).astype(np.float32))
+    assert 0.012 < (shown - linear_to_srgb(levels.astype(np.float32))).max() < 0.022
+    assert matched_finishing(LookOptions(match_black="off", grain="off"), noisy, NO_FILE)[0].is_nothing
+    assert not matched_finishing(LookOptions(), np.full((8, 8, 3), 0.001, np.float32), NO_FILE)[1], "too small to tell"
+
+
+@pytest.mark.parametrize("orientation", [1, 6])
+@pytest.mark.parametrize("subsampling", [0, 2])
+def test_what_is_put_into_a_jpeg_is_compressed_as_it_is(tmp_path: Path, orientation: int, subsampling: int) -> None:
+    """Against the whole picture, saved by Pillow as the photograph was: the same pixels where something was put in, others untouched."""
+    stored = np.asarray(np.random.default_rng(3).uniform(60, 160, (80, 112, 3)), np.uint8)
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    quality = {"quality": 30, "subsampling": subsampling}
+    Image.fromarray(stored).save(tmp_path / "photo.jpg", exif=exif, **quality)
+    photo_rgb = read_image(tmp_path / "photo.jpg") if orientation == 1 else upright(read_image(tmp_path / "photo.jpg"), orientation)
+    alpha = np.zeros(photo_rgb.shape[:2], np.float32)
+    alpha[20:61, 33:70] = 1.0
+    layer = Layer(alpha[..., None] * np.float32((0.6, 0.1, 0.05)), alpha, np.where(alpha > 0, 2.0, np.inf).astype(np.float32))
+    compression = JpegCompression.of(tmp_path / "photo.jpg")
+    assert compression is not None
+    plate = plate_of(photo_rgb, LENS)
+    done = finished(Inserted(behind(photo_rgb, layer), layer), plate, Finishing(compression=compression)).rgb
+    whole = as_stored(behind(photo_rgb, layer) + layer.rgb, orientation)
+    Image.fromarray(srgb_codes(whole, np.uint8)).save(tmp_path / "whole.jpg", **quality)
+    expected = upright(read_image(tmp_path / "whole.jpg"), orientation)
+    np.testing.assert_allclose(done[alpha > 0], expected[alpha > 0], atol=1e-6)
+    np.testing.assert_array_equal(done[alpha == 0], photo_rgb[alpha == 0])
+    assert np.ptp(done[alpha > 0][:, 0]) > 0.05, "it rings"
+    assert JpegCompression.of(NO_FILE) is None

@@ -38,18 +38,22 @@ def xmp_of(kind: str = "disparity", low: float = 1.0, high: float = 4.0, accurac
     ).encode()
 
 
-def exif_of(rendered: int = 8, orientation: int = 1) -> bytes:
-    """An iPhone's wide camera, without a focus distance."""
+def exif_of(rendered: int = 8, orientation: int = 1, **more: object) -> bytes:
+    """An iPhone's wide camera, without a focus distance. more: subject_area=(x, y, width, height), focus_m=..."""
     exif = Image.Exif()
     exif[0x0112] = orientation
     exif.get_ifd(0x8769).update({0x920A: IFDRational(57, 10), 0x829D: IFDRational(15, 10), 0xA405: 26, 0xA401: rendered})
+    if "subject_area" in more:
+        exif.get_ifd(0x8769)[0x9214] = more["subject_area"]
+    if "focus_m" in more:
+        exif.get_ifd(0x8769)[0x9206] = IFDRational(int(1000 * float(str(more["focus_m"]))), 1000)
     return exif.tobytes()
 
 
-def heic(path: Path, xmp: bytes, *more: bytes, rendered: int = 8) -> Path:
+def heic(path: Path, xmp: bytes, *more: bytes, rendered: int = 8, orientation: int = 1, **facts: object) -> Path:
     pytest.importorskip("pi_heif")
     depth = Item(LEVELS, (auxiliary(DEPTH), *more), xmp=xmp)
-    return write_heic(path, Item(GREY, (nclx(1, 13), *more), exif=exif_of(rendered)[6:]), depth)
+    return write_heic(path, Item(GREY, (nclx(1, 13), *more), exif=exif_of(rendered, orientation, **facts)[6:]), depth)
 
 
 def jpeg(path: Path, xmp: bytes, orientation: int = 1) -> Path:
@@ -98,6 +102,8 @@ def test_depth_of_absolute_accuracy_is_metres(tmp_path: Path) -> None:
     depth = found(heic(tmp_path / "p.heic", xmp_of("depth", 0.5, 3.0, "absolute"))).depth
     np.testing.assert_allclose(depth.depth_m[[10, 40]].mean(axis=1), (0.5, 3.0), rtol=0.03)
     assert "metres, as the phone measured them" in depth.note
+    endless = heic(tmp_path / "q.heic", xmp_of("depth", 0.5, 3.0, "absolute"))
+    refused("linear in metres, so that FAR cannot be infinite", read_phone_photo, endless, (0.5, np.inf))
 
 
 def test_depth_is_turned_with_its_picture(tmp_path: Path) -> None:
@@ -118,9 +124,26 @@ def test_a_portrait_tells_its_blur_and_its_focus_is_guessed(tmp_path: Path) -> N
     focus = found(heic(tmp_path / "p.heic", xmp_of())).focus
     assert focus is not None and focus.focus_distance_m == pytest.approx(0.25, rel=0.02)
     assert focus.coc_px_per_dioptre(128, 96) == pytest.approx(26 / 2800 * 26 / 43.2666 * 160, rel=1e-3)
-    assert "focus is guessed" in focus.note and "full frame at f/2.8" in focus.note
+    assert "focus is guessed" in focus.note and "full frame at f/2.8" in focus.blur_note
     plain = found(heic(tmp_path / "q.heic", xmp_of(), rendered=0)).focus
-    assert plain is not None and plain.blur_at_infinity is None and "f/2.8" not in plain.note
+    assert plain is not None and plain.blur_at_infinity is None and not plain.blur_note
+
+
+def test_the_subject_area_is_turned_with_a_picture_held_upside_down(tmp_path: Path) -> None:
+    """Exif counts it in the picture as stored, whose upper middle, 1 m away, comes to lie in the lower middle."""
+    area = {"subject_area": (64, 12, 20, 20)}
+    assert found(heic(tmp_path / "p.heic", xmp_of(), **area)).focus.focus_distance_m == pytest.approx(1.0, rel=0.03)
+    for quarters, orientation in ((2, 3), (1, 8), (3, 6)):
+        path = heic(tmp_path / f"{orientation}.heic", xmp_of(), turned(quarters), orientation=orientation, **area)
+        assert found(path).focus.focus_distance_m == pytest.approx(1.0, rel=0.03), "which irot turns"
+    upright_area = {"subject_area": (64, 84, 20, 20)}
+    assert found(heic(tmp_path / "u.heic", xmp_of(), turned(2), orientation=3, **upright_area)).focus.focus_distance_m < 0.3
+
+
+def test_a_focus_that_exif_states_is_not_called_guessed(tmp_path: Path) -> None:
+    plate = open_plate(heic(tmp_path / "p.heic", xmp_of(), focus_m=0.5))
+    assert plate.lens.focus_distance_m == pytest.approx(0.5, rel=0.02)
+    assert "focus is guessed" not in plate.depth_note and "full frame at f/2.8" in plate.depth_note
 
 
 def test_composite_takes_depth_lens_and_blur_from_the_file(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from mrbokeh.images.color import convert, linear_to_srgb, srgb_to_linear
 from mrbokeh.images.color_profiles import ADOBE_RGB, UnreadableProfileError, nclx_profile, parsed_icc
 from mrbokeh.images.exr_io import P3_D65, rec709_from_chromaticities
 from mrbokeh.images.image_io import read_image
+from mrbokeh.images.picture_codec import _by_profile
 from mrbokeh.stacks.photograph import read_photograph
 from tests.support.made_heic import Item, icc, nclx, write_heic
 
@@ -141,3 +142,14 @@ def test_profiles_of_heic(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> N
     hdr = read_image(write_heic(tmp_path / "hdr.heic", Item(smooth, (nclx(9, 16),))))
     assert "HDR (PQ)" in caplog.text and "taken for sRGB" in caplog.text
     np.testing.assert_allclose(255 * linear_to_srgb(hdr), smooth, atol=1.5)
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_tables_by_opencv_give_what_curves_give(dtype: type) -> None:
+    """The twin applies each curve to each code and multiplies by the matrix."""
+    top = np.iinfo(dtype).max
+    profile = nclx_profile({"color_primaries": 12, "transfer_characteristics": 4})
+    assert profile is not None
+    codes = np.random.default_rng(0).integers(0, top, (20, 30, 3), dtype, endpoint=True)
+    light = np.stack([curve(codes[..., i] / top) for i, curve in enumerate(profile.curves)], axis=2)
+    np.testing.assert_allclose(_by_profile(profile, codes), light @ profile.rec709_from_rgb.T, rtol=1e-5, atol=2e-7)

@@ -2,6 +2,7 @@
 
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from capture.stacks.ingest import ingest
 from mrbokeh.commands.composite import app
 from mrbokeh.images.color import linear_to_srgb, srgb_to_linear
 from mrbokeh.images.exif import stored_orientation
+from mrbokeh.images.heif import plane_of
 from mrbokeh.images.image_io import read_image, write_image, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.images.picture_codec import stored_rgb
@@ -153,3 +155,12 @@ def test_a_damaged_heic_is_one_sentence(tmp_path: Path) -> None:
     for left in (0, 100, len(whole) - 400):
         path.write_bytes(whole[:left])
         refused(r"a\.heic (is empty|cannot be read)", read_image, path)
+
+
+@pytest.mark.parametrize("bits", [10, 12])
+def test_codes_of_more_than_8_bits_span_16(bits: int) -> None:
+    """The twin is the division by the largest code, for every code there is."""
+    codes = (np.arange(1 << bits).astype(np.uint16) << (16 - bits)).reshape(1, -1, 1)
+    picture = SimpleNamespace(data=codes.tobytes(), mode="L;16", size=(codes.size, 1), info={"bit_depth": bits})
+    plain = np.round(np.arange(1 << bits) / ((1 << bits) - 1) * 65535.0)
+    np.testing.assert_array_equal(plane_of(picture)[0, :, 0], plain)

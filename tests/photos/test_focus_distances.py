@@ -43,6 +43,12 @@ from tests.support.made_photographs import LENS, make_shoot, only_stack, sources
         ({"Exif.CanonSi.SubjectDistance": "65535"}, math.inf),
         ({"Exif.CanonSi.SubjectDistance": "-1"}, math.inf),
         ({"Exif.CanonSi.SubjectDistance": "150", "Exif.Image.Model": "Canon EOS 20D"}, 1.5),
+        # A tenth of all ones, and HP's nines, stand for infinity; the models before the G3 count mm, as a G2 that also says 7416/1000 m.
+        ({"Exif.CanonSi.SubjectDistance": "6553"}, math.inf),
+        ({"Exif.Photo.SubjectDistance": "9999/100"}, math.inf),
+        ({"Exif.CanonSi.SubjectDistance": "7416", "Exif.Canon.ModelID": "17825792"}, 7.416),
+        # f/5000 as the widest aperture: the maker note was moved, and its bytes mean nothing.
+        ({"Exif.CanonSi.SubjectDistance": "384", "Exif.CanonCs.MaxAperture": "21848"}, None),
         # EXIF goes before the maker's number, of which models differ in the unit.
         ({"Exif.CanonSi.SubjectDistance": "1503", "Exif.Photo.SubjectDistance": "1503/1000"}, 1.503),
         ({"Exif.NikonLd3.FocusDistance": "80"}, 1.0),

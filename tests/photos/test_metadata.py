@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 import capture.photos.metadata
+from capture.photos.focus_metadata import FocusReading
 from capture.photos.metadata import (
     metadata_from_exiftool,
     metadata_from_tags,
@@ -229,8 +230,8 @@ def test_cameras_that_do_not_tell_are_looked_up(make: str, model: str, width_mm:
     assert "lensfun" in sensor.source
     assert sensor.width_mm(6000, 4000) == pytest.approx(width_mm, rel=1e-3)
     assert sensor.width_mm(6000, 4000) == pytest.approx(by_data_sheet_mm, rel=0.012)
-    stated = read_sensor(tags | {"Exif.Photo.FocalPlaneXResolution": "25400/10"}, None, (2400, 1600))
-    assert "FocalPlaneXResolution" in stated.source, "the file goes before the table"
+    agreeing = {"Exif.Photo.FocalPlaneXResolution": f"{round(25.4 * 6000 / by_data_sheet_mm)}/1"}
+    assert "FocalPlaneXResolution" in read_sensor(tags | agreeing, None, (6000, 4000)).source, "the file goes before the table"
 
 
 def test_unknown_sensors_are_not_guessed() -> None:
@@ -248,3 +249,91 @@ def test_sensor_width_of_resized_cut_and_turned_pictures() -> None:
     assert sensor.width_mm(3000, 3000) == pytest.approx(18.0)  # cut
     assert sensor.width_mm(4000, 6000) == pytest.approx(24.0)  # turned
     assert sensor.width_mm(1000, 1500) == pytest.approx(24.0)  # turned and resized
+
+
+CANONS_G2 = {
+    "Exif.Image.Make": "Canon",
+    "Exif.Photo.FocalPlaneXResolution": "2272000/280",
+    "Exif.Photo.FocalPlaneYResolution": "1704000/210",
+    "Exif.Photo.FocalPlaneResolutionUnit": "2",
+}
+
+
+@pytest.mark.parametrize(
+    ("tags", "stored_px", "width_mm"),
+    [
+        # 2272 pixels on 0.280 inch, which is 7.112 mm; upright 0.210 inch.
+        ({"Exif.Photo.PixelXDimension": "2272", "Exif.Photo.PixelYDimension": "1704"}, (2272, 1704), 7.112),
+        ({"Exif.Photo.PixelXDimension": "640", "Exif.Photo.PixelYDimension": "480"}, (640, 480), 7.112),
+        ({"Exif.Photo.PixelXDimension": "480", "Exif.Photo.PixelYDimension": "640"}, (480, 640), 5.334),
+        ({}, (640, 480), 7.112),
+        # A digital zoom shows the middle of the sensor: twice the pixels are counted, on the same 0.280 inch.
+        (
+            {
+                "Exif.Photo.FocalPlaneXResolution": "4544000/280",
+                "Exif.Photo.FocalPlaneYResolution": "3408000/210",
+                "Exif.Photo.PixelXDimension": "2272",
+                "Exif.Photo.PixelYDimension": "1704",
+                "Exif.Photo.DigitalZoomRatio": "2272/1136",
+            },
+            (2272, 1704),
+            3.556,
+        ),
+        # The same without the tag for it, made smaller by a program that left the size that the camera stated.
+        (
+            {
+                "Exif.Photo.FocalPlaneXResolution": "4544000/280",
+                "Exif.Photo.FocalPlaneYResolution": "3408000/210",
+                "Exif.Photo.PixelXDimension": "2272",
+                "Exif.Photo.PixelYDimension": "1704",
+            },
+            (1136, 852),
+            3.556,
+        ),
+    ],
+)
+def test_a_canon_made_smaller_keeps_its_sensor(tags: dict[str, str], stored_px: tuple[int, int], width_mm: float) -> None:
+    """Canon's fractions count thousandths of pixels and of an inch, whatever size the program that saved the picture wrote elsewhere."""
+    told = CANONS_G2 | tags | {"width_px": str(stored_px[0]), "height_px": str(stored_px[1])}
+    sensor = read_sensor(told, 21.0, stored_px)
+    assert sensor.width_mm(*stored_px) == pytest.approx(width_mm, rel=1e-3)
+    assert not sensor.doubt
+
+
+def test_pixels_that_contradict_the_model_are_doubted() -> None:
+    """At 100 pixels a millimetre 640 are 6.4 mm; a 50 mm lens that sees like 75 mm has 23.1 mm at 4:3 (a diagonal of 43.27 / 1.5)."""
+    tags = {
+        "Exif.Photo.FocalPlaneXResolution": "25400/10",
+        "Exif.Photo.PixelXDimension": "640",
+        "Exif.Photo.PixelYDimension": "480",
+        "Exif.Photo.FocalLengthIn35mmFilm": "75",
+    }
+    sensor = read_sensor(tags, 50.0, (640, 480))
+    assert sensor.width_mm(640, 480) == pytest.approx(23.08, rel=1e-3)
+    assert "6.4 mm" in sensor.doubt and "23.1 mm" in sensor.doubt
+    related = read_sensor(tags | {"Exif.Iop.RelatedImageWidth": "2400", "Exif.Iop.RelatedImageLength": "1800"}, 50.0, (640, 480))
+    assert related.width_mm(640, 480) == pytest.approx(24.0) and not related.doubt
+    tiny = {"Exif.Photo.FocalPlaneXResolution": "25400/10", "Exif.Photo.PixelXDimension": "200", "Exif.Photo.PixelYDimension": "150"}
+    assert read_sensor(tiny, None, (200, 150)) is None, "a sensor of 2 mm"
+
+
+def test_lenses_that_nobody_makes_are_unknown() -> None:
+    """2.4 mm on a diagonal of 28 mm would see 161 degrees straight, and f/0.2 is beyond what air allows (f/0.5)."""
+    sensor = SensorReading(0.004, (6000, 4000), "test")
+    assert not PhotoMetadata(focal_length_mm=2.4, f_number=4.0, sensor=sensor).is_possible
+    assert not PhotoMetadata(focal_length_mm=50.0, f_number=0.2, sensor=sensor).is_possible
+    assert PhotoMetadata(focal_length_mm=8.0, f_number=0.95, sensor=sensor).is_possible
+
+
+def test_a_focus_beyond_what_the_lens_tells_apart_is_rough() -> None:
+    """7 mm f/2.8 on a diagonal of 9 mm has its hyperfocal distance at 7^2 / (2.8 * 9 / 1500) mm = 2.92 m."""
+    sensor = SensorReading(9.0 / 2840.0, (2272, 1704), "test")
+
+    def rough(distance_m: float, nearest_m: float, farthest_m: float, focal_mm: float = 7.0) -> tuple[float, float] | None:
+        focus = FocusReading(distance_m, nearest_m, farthest_m, "lens", "test")
+        return PhotoMetadata(focal_length_mm=focal_mm, f_number=2.8, sensor=sensor, focus=focus).rough_focus_m
+
+    assert rough(0.5, 0.5, 0.5) is None
+    assert rough(5.8, 5.8, 5.8) == (pytest.approx(1.0 / (1 / 5.8 + 1 / 2.917), rel=1e-3), math.inf)
+    assert rough(5.8, 5.8, 5.8, focal_mm=50.0) is None, "which is 149 m with a lens of 50 mm"
+    assert rough(2.7, 1.8, 5.2, focal_mm=50.0) == pytest.approx((1.8, 5.2), rel=1e-6), "a wide zone that the camera states"

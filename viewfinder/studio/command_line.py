@@ -60,7 +60,7 @@ def options_of(state: StudioState) -> CompositeOptions:
         height=state.height,
         turn=state.turn_deg,
         pitch=state.pitch_deg,
-        camera_height=state.camera_height_m,
+        camera_height=None if state.plain or state.depth is not None else state.camera_height_m,
         sun=None if state.sun_deg is None else _numbers(state.sun_deg),
         exposure=state.exposure,
         shadow=state.shadow,

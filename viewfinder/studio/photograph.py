@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
+from mrbokeh.commands._composite_parts import held_upright
 from mrbokeh.commands._insertion_options import focused_at_pixel, require_one_focus
 from mrbokeh.commands._level_ground import HIGH_SHARE, on_level_ground, pair_of, usual_tilt_rad, with_camera_of_file
 from mrbokeh.compositing.plate import HeldLens, LensWishes, Plate, held_lens, phone_photo, photograph_plate, with_depth
@@ -88,7 +89,7 @@ class OpenedPhotograph:
         if options.virtual.camera is not None:
             plate, known_height_m = with_camera_of_file(plate, options.virtual.camera)
         if plate.depth_m is not None or standing.plain:
-            return plate, renderer, known_height_m
+            return held_upright(plate, self.small(options, most_px).standing), renderer, known_height_m
         if standing.pitch is not None:
             plate = replace(plate, world_from_camera=looking_down(np.radians(standing.pitch)))
         elif plate.world_from_camera is None:
@@ -156,7 +157,15 @@ def shrunk(plate: Plate, width_px: int, height_px: int) -> Plate:
 
 def _with_lens(plate: Plate, held: HeldLens) -> Plate:
     camera = camera_of_lens(held.lens, plate.rgb.shape[1], plate.rgb.shape[0])
-    return replace(plate, lens=held.lens, camera=camera, blur_from=held.blur_from, focus_known=held.focus_known, view_known=held.view_known)
+    return replace(
+        plate,
+        lens=held.lens,
+        camera=camera,
+        blur_from=held.blur_from,
+        focus_known=held.focus_known,
+        view_known=held.view_known,
+        rough_focus_m=held.rough_focus_m,
+    )
 
 
 @lru_cache(maxsize=8)
@@ -180,6 +189,8 @@ def placed(state: StudioState, opened: OpenedPhotograph) -> StudioState:
 
     Raises InputError for a place that is no ground.
     """
+    if opened.has_depth and state.camera_height_m is not None:
+        state = replace(state, camera_height_m=None)
     is_told = state.camera is not None or state.pitch_deg is not None
     whole = state.height is not None and (opened.has_depth or (state.camera_height_m is not None and is_told))
     if not state.is_complete or state.plain or whole:
@@ -189,6 +200,8 @@ def placed(state: StudioState, opened: OpenedPhotograph) -> StudioState:
     standing = opened.small(options, MOST_PX).standing
     high_px = HIGH_SHARE * plate.rgb.shape[0]
     if plate.depth_m is not None:
+        if plate.metres_guessed:
+            return replace(state, height=f"{HIGH_SHARE * opened.size_px[1]:.0f}px")
         depth_m = plate.point_under_pixel_m(*pair_of(standing.at_pixel))[2]
         return replace(state, height=f"{plate.length_m(high_px, depth_m):.3g}")
     if not is_told:

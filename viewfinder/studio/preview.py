@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.commands._composite_kept import KeptParts
-from mrbokeh.commands._composite_parts import blur_told, layers_by, nothing_seen, placing_warning
+from mrbokeh.commands._composite_parts import blur_told, held_upright, layers_by, nothing_seen, placing_warning
 from mrbokeh.commands._level_ground import on_level_ground, pair_of
 from mrbokeh.compositing.choose import best_mode, insertion_of
 from mrbokeh.compositing.ground import with_ground_behind
@@ -51,9 +51,13 @@ def preview_of(photograph: OpenedPhotograph, options: CompositeOptions, kept: Ke
         plate, renderer, known_height_m = photograph.upright(options, most_px)
         small = photograph.small(options, most_px)
         standing = small.standing
+        standing.require_meant(photograph.path, small.taken.depth, small.rendering.catch)
+        if plate.depth_m is not None:
+            standing.require_no_depth()
         guess(plate.depth_note)
         if plate.depth_m is None and not standing.plain:
             plate, standing = on_level_ground(plate, standing, known_height_m)
+        plate = held_upright(plate, standing)
         layers_for = layers_by(small.virtual, standing, small.rendering, plate, None, kept)
         mode = "over" if kept.draft and plate.depth_m is not None else best_mode(plate)
         finishing = Finishing() if kept.draft else _finishing(photograph, plate, small)
@@ -79,13 +83,12 @@ def preview_of(photograph: OpenedPhotograph, options: CompositeOptions, kept: Ke
 
 
 def _finishing(photograph: OpenedPhotograph, plate: Plate, options: CompositeOptions) -> Finishing:
-    """Return what makes the object look photographed; a draft goes without."""
-    wanted = options.look.wanted
-    return (
-        finishing_of(wanted, plate.rgb, photograph.path)
-        if options.standing.plain
-        else matched_finishing(wanted, plate.rgb, photograph.path)[0]
-    )
+    """Return what makes the object look photographed; a photograph made smaller shows no trace of its compression."""
+    wanted, path = options.look.wanted, photograph.path
+    if options.standing.plain:
+        return finishing_of(wanted, plate.rgb, path)
+    is_smaller = plate.rgb.shape[1::-1] != photograph.size_px
+    return matched_finishing(wanted, plate.rgb, path, is_linear=is_smaller)[0]
 
 
 def _box(layer: Layer) -> list[float] | None:

@@ -5,7 +5,8 @@
 2. Vignetting: the share of light that the lens sends to a place of the sensor, so after the blur has brought it there.
 3. Black: glare and offset lie over everything evenly, so they do not fall off towards the corners.
 4. Light wrap: light of the photograph, which has 1 to 3 in it already.
-5. Grain: made by the sensor from all light that arrives, so last.
+5. Grain: made by the sensor from all light that arrives.
+6. Compression: made of the finished picture, so last.
 """
 
 from contextlib import suppress
@@ -26,18 +27,22 @@ from mrbokeh.compositing.plate_look.colour_match import (
     patch_colour,
     triple_of,
 )
+from mrbokeh.compositing.plate_look.compression import JpegCompression
 from mrbokeh.compositing.plate_look.exposure_match import Exposure, matched_exposure, stated_exposure, white_balance_gain
 from mrbokeh.compositing.plate_look.grain import Grain, GrainDraw, add_grain_to, measured_grain, measured_grain_of_pair, read_grain
 from mrbokeh.compositing.plate_look.noise_measurement import NoiseLevel
 from mrbokeh.compositing.plate_look.vignetting import RadialFalloff, Vignetting, darkened, falloff_at, falloff_of_photo, read_flat_field
+from mrbokeh.images.color import srgb_to_linear
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.pixel_box import Box, lit_box
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.typed_numbers import numbers_in
 
 _SIGMAS = 3
-_LEAST_PX, _SURELY_BLACK, _MOST_GRAIN = 64, 0.02, 0.015
-"""Sides of a picture that tells its black; the lightest black that is surely one; standard deviation of strong grain on a grey card."""
+_LEAST_PX, _SURELY_BLACK, _MOST_GRAIN, _SHOWN = 64, 0.02, 0.015, np.linspace(0.1, 0.8, 8, dtype=np.float32)
+"""Sides of a picture that tells its black; the lightest black that is surely one; standard deviation of strong grain on a screen of 0 to 1,
+and the levels there at which it is looked at.
+"""
 
 Picture = Float32[np.ndarray, "height width 3"]
 AUTO, OFF = "auto", "off"
@@ -92,12 +97,14 @@ class Finishing:
     vignetting: Vignetting | None = None
     grain: Grain | None = None
     light_wrap: LightWrap | None = None
+    compression: JpegCompression | None = None
 
     @property
     def is_nothing(self) -> bool:
         colour = self.colour is None or self.colour.is_nothing
         grain = self.grain is None or self.grain.is_nothing
-        return colour and grain and self.vignetting is None and (self.light_wrap is None or self.light_wrap.strength == 0.0)
+        bare = self.vignetting is None and self.compression is None
+        return colour and grain and bare and (self.light_wrap is None or self.light_wrap.strength == 0.0)
 
 
 def finished(inserted: Inserted, plate: Plate, finishing: Finishing, frame: int = 0) -> Inserted:
@@ -122,7 +129,8 @@ def finished(inserted: Inserted, plate: Plate, finishing: Finishing, frame: int 
         add_grain_to(light, part.alpha, photo_rgb, box.of(plate.rgb), draw)
     rgb = inserted.virtual.rgb.copy()
     box.of(rgb)[...] = light
-    return replace(inserted, virtual=replace(inserted.virtual, rgb=rgb))
+    done = replace(inserted, virtual=replace(inserted.virtual, rgb=rgb))
+    return done if finishing.compression is None else finishing.compression.compressed(done)
 
 
 def _lit(layer: Layer, photo_rgb: np.ndarray, finishing: Finishing, box: Box) -> Layer:
@@ -169,9 +177,10 @@ def finishing_of(options: LookOptions, plate_rgb: Picture, photo: Path | None = 
     return Finishing(None if colour.is_nothing else colour, vignetting, grain, _light_wrap(options.light_wrap))
 
 
-def matched_finishing(options: LookOptions, plate_rgb: Picture, photo: Path | None = None) -> tuple[Finishing, list[str]]:
-    """Build a Finishing with black and grain as the photograph has them, where the options say nothing of these; and what was matched.
+def matched_finishing(options: LookOptions, plate_rgb: Picture, photo: Path, *, is_linear: bool = False) -> tuple[Finishing, list[str]]:
+    """Build a Finishing with black, grain and compression as the photograph has them, where the options say nothing of these.
 
+    Also returns the options of what was matched. is_linear: the picture is written in linear light, which is not compressed.
     What a scene shows can be lighter than black, and textured where it seems to be noise: no black is lifted that is not surely one, and
     grain is never stronger than that of high ISO. So an object in a picture of sand alone gets neither.
     """
@@ -184,15 +193,17 @@ def matched_finishing(options: LookOptions, plate_rgb: Picture, photo: Path | No
     if options.grain is None:
         with suppress(InputError):
             finishing = replace(finishing, grain=_at_most(measured_grain(plate_rgb, options.seed)))
-    if finishing.grain is not None and options.grain is None and not finishing.grain.is_nothing:
+        finishing = replace(finishing, compression=None if is_linear else JpegCompression.of(photo))
+    if options.grain is None and (finishing.compression or (finishing.grain is not None and not finishing.grain.is_nothing)):
         matched.append("--grain")
     return finishing, matched
 
 
 def _at_most(grain: Grain) -> Grain:
-    """Return the grain, weakened as a whole if it is stronger on a grey card than that of high ISO."""
-    variance = float(grain.level.variance(np.full(3, GREY_CARD)).max())
-    factor = min(1.0, _MOST_GRAIN**2 / max(variance, 1e-12))
+    """Return the grain, weakened as a whole where it would be stronger on a screen than that of high ISO, at any level."""
+    shown = np.square(_MOST_GRAIN * np.diff(srgb_to_linear(_SHOWN)) / np.diff(_SHOWN))  # what a step on the screen is in linear light
+    seen = grain.level.variance(np.repeat(srgb_to_linear(_SHOWN[:-1])[:, None], 3, axis=1)).max(axis=1)
+    factor = float(np.minimum(1.0, shown / np.maximum(seen, 1e-12)).min())
     shot, read = (triple_of(factor * np.array(each)) for each in (grain.level.shot, grain.level.read))
     return replace(grain, level=NoiseLevel(shot, read))
 
