@@ -16,6 +16,7 @@ from tests.support.made_viewfinder import Made, made_viewfinder
 from viewfinder.server.access import Access, host_name, is_loopback, needed_role, objection
 from viewfinder.server.sessions import RateLimit, Role, Sessions
 from viewfinder.server.site import PAGE
+from viewfinder.studio.site import PAGE as STUDIO_PAGE
 
 FOCUS = {"focus": {"distance_m": 1.0}}
 
@@ -237,7 +238,7 @@ def hash_of_sources() -> str:
 
 
 def test_the_built_page_belongs_to_its_sources_and_loads_nothing_from_elsewhere() -> None:
-    for name in ("viewfinder.js", "camera.js"):
+    for name in ("viewfinder.js", "camera.js", "studio.js"):
         first = (BUILT / name).read_text(encoding="utf-8").splitlines()[0]
         assert re.search(r"sources: ([0-9a-f]{64})$", first), first
         assert first.endswith(hash_of_sources()), f"{name} is older than its sources: `npm ci && npm run build` in viewfinder/page_source"
@@ -248,8 +249,8 @@ def test_the_built_page_belongs_to_its_sources_and_loads_nothing_from_elsewhere(
 
 
 def test_every_file_that_the_page_names_is_served_to_everybody() -> None:
-    assert {name for name, _ in PAGE.values()} == {path.name for path in BUILT.iterdir()} - {"README.md"}
-    assert all(needed_role(path) is None for path in PAGE)
+    assert {name for page in (PAGE, STUDIO_PAGE) for name, _ in page.values()} == {path.name for path in BUILT.iterdir()} - {"README.md"}
+    assert all(needed_role(path) is None for path in (*PAGE, *STUDIO_PAGE))
     for html in BUILT.glob("*.html"):
         named = re.findall(r'(?:src|href)="([^"]+)"', html.read_text(encoding="utf-8"))
-        assert all(f"/{name}" in PAGE for name in named if not name.startswith("data:"))
+        assert all(f"/{name}" in PAGE | STUDIO_PAGE for name in named if not name.startswith(("data:", "#")))

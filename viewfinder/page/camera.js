@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 8e9606e5f387591f93a7d24b5b87ffbce01f0b1f9e61d3a6483ef3ea7cf49894
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 2a92817596fc4eff75bee0e67ce1f95286036e53fe27230a96d18f75acd144a2
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 8e9606e5f387591f93a7d24b5b87ffbce01f0b1f9e61d3a6483ef3ea7cf49894
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 2a92817596fc4eff75bee0e67ce1f95286036e53fe27230a96d18f75acd144a2
 "use strict";
 (() => {
   // src/model.ts
@@ -762,14 +762,14 @@
       this.quiet = setTimeout(() => this.stage.classList.add("resting"), DRAWN_AGAIN_MS);
     }
     path(kind, data) {
-      const path = document.createElementNS("http://www.w3.org/2000/svg", "path");
+      const path = document.createElementNS(this.ground.namespaceURI, "path");
       path.setAttribute("d", data);
       path.setAttribute("vector-effect", "non-scaling-stroke");
       if (kind) path.setAttribute("class", kind);
       this.ground.append(path);
     }
     words(text, x, y, scale) {
-      const words = document.createElementNS("http://www.w3.org/2000/svg", "text");
+      const words = document.createElementNS(this.ground.namespaceURI, "text");
       words.textContent = text;
       words.setAttribute("transform", `translate(${x} ${y}) scale(${scale})`);
       this.ground.append(words);

@@ -119,7 +119,7 @@ export class PictureStage {
   }
 
   private path(kind: string, data: string): void {
-    const path = document.createElementNS("http://www.w3.org/2000/svg", "path");
+    const path = document.createElementNS(this.ground.namespaceURI, "path");
     path.setAttribute("d", data);
     path.setAttribute("vector-effect", "non-scaling-stroke");
     if (kind) path.setAttribute("class", kind);
@@ -127,7 +127,7 @@ export class PictureStage {
   }
 
   private words(text: string, x: number, y: number, scale: number): void {
-    const words = document.createElementNS("http://www.w3.org/2000/svg", "text");
+    const words = document.createElementNS(this.ground.namespaceURI, "text");
     words.textContent = text;
     words.setAttribute("transform", `translate(${x} ${y}) scale(${scale})`);
     this.ground.append(words);
