@@ -13,6 +13,7 @@ from mrbokeh.commands._composite_parts import held_upright
 from mrbokeh.commands._insertion_options import focused_at_pixel, require_one_focus
 from mrbokeh.commands._level_ground import HIGH_SHARE, on_level_ground, pair_of, usual_tilt_rad, with_camera_of_file
 from mrbokeh.compositing.plate import HeldLens, LensWishes, Plate, held_lens, phone_photo, photograph_plate, with_depth
+from mrbokeh.compositing.plate_look.finishing import Finishing
 from mrbokeh.depth.depth_map import DepthSettings
 from mrbokeh.depth.phone_depth import PhonePhoto
 from mrbokeh.optics.camera import camera_of_lens
@@ -38,6 +39,7 @@ class OpenedPhotograph:
     """Photograph in memory, at most MOST_PX of it.
 
     depth: file of its depth, in place of its own. told: what its file states, with the size of the whole but none of its light.
+    finishings: what was measured of black and grain, by the options and the size.
     """
 
     path: Path
@@ -45,6 +47,7 @@ class OpenedPhotograph:
     told: Photograph
     phone: PhonePhoto | None
     plate: Plate
+    finishings: dict[object, Finishing] = field(default_factory=dict)
     _smaller: dict[tuple[int, int], Plate] = field(default_factory=dict)
 
     @property

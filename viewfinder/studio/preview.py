@@ -32,6 +32,7 @@ DRAFT_S = 0.12
 """Time that a draft should take; drafts get as many pixels as that allows."""
 _FEWEST_PX, _MOST_DRAFT_PX, _FIRST_PX = 6e4, 5e5, 2e5
 _DRAFT_QUALITY, _QUALITY = 80, 92
+_MOST_FINISHINGS = 3
 
 
 @dataclass(frozen=True)
@@ -83,12 +84,21 @@ def preview_of(photograph: OpenedPhotograph, options: CompositeOptions, kept: Ke
 
 
 def _finishing(photograph: OpenedPhotograph, plate: Plate, options: CompositeOptions) -> Finishing:
-    """Return what makes the object look photographed; a photograph made smaller shows no trace of its compression."""
+    """Return what makes the object look photographed, measured once for each size of the photograph.
+
+    A photograph made smaller shows no trace of its compression.
+    """
     wanted, path = options.look.wanted, photograph.path
-    if options.standing.plain:
-        return finishing_of(wanted, plate.rgb, path)
-    is_smaller = plate.rgb.shape[1::-1] != photograph.size_px
-    return matched_finishing(wanted, plate.rgb, path, is_linear=is_smaller)[0]
+    key = (options.look, options.standing.plain, plate.rgb.shape)
+    if key not in photograph.finishings:
+        if len(photograph.finishings) > _MOST_FINISHINGS:
+            photograph.finishings.clear()
+        if options.standing.plain:
+            photograph.finishings[key] = finishing_of(wanted, plate.rgb, path)
+        else:
+            is_smaller = plate.rgb.shape[1::-1] != photograph.size_px
+            photograph.finishings[key] = matched_finishing(wanted, plate.rgb, path, is_linear=is_smaller)[0]
+    return photograph.finishings[key]
 
 
 def _box(layer: Layer) -> list[float] | None:
