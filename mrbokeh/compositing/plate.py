@@ -52,6 +52,7 @@ class Plate:
     blur_from: where the lens has its blur from, in words, if its focal length and f-number are made up. focus_known: False where nothing
         tells it.
     rough_focus_m: nearest and farthest distance that the focus in the photograph's file may mean, where that is a wide range.
+    white_lux: illuminance under which a white surface shows 1.0, by the exposure of the photograph (`Photograph.white_lux`).
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -66,6 +67,7 @@ class Plate:
     focus_known: bool = True
     depth_note: str = ""
     rough_focus_m: tuple[float, float] | None = None
+    white_lux: float | None = None
 
     def __post_init__(self) -> None:
         size = self.rgb.shape[:2]
@@ -132,7 +134,7 @@ def open_plate(
     photograph, phone = read_photograph(photo).stating(facts or {}), _phone(photo)
     if lens is None and not facts:
         _require_no_panorama(photo, photograph)
-    blur_from, focus_known = "", True
+    blur_from, focus_known, white_lux = "", True, photograph.white_lux
     is_focus_guessed = lens is None and focus_m is None and photograph.focus_distance_m is None
     if guessing and lens is None and phone is None:
         photograph, guesses = photograph.guessing()
@@ -146,6 +148,7 @@ def open_plate(
     lens = photograph.lens(photo, focus_m) if lens is None else lens_for_photograph(lens, photograph, photo)
     focused = lens if focus_m is None else lens.focused_at(focus_m)
     plate = with_own_alpha(plate_of(photograph.rgb, focused), photo, read_alpha(photo, photograph.orientation))
+    plate = replace(plate, white_lux=white_lux)
     if phone is None:
         return replace(plate, focus_known=focus_known, rough_focus_m=photograph.rough_focus_m if focus_m is None else None)
     original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None

@@ -6,6 +6,9 @@ bright as it must be to light a white surface where the object stands. How brigh
 picture are taken for nearly white, and a picture as a whole for grey (exposure meters do), near the foot as well as over the frame. All of
 it is relative: a picture twice as bright tells of light twice as bright.
 
+Sunshine shows in the exposure: a white surface has more than 40 klx then. In 67 of 88 photographs of all kinds, whose files tell it, 14 had
+more, 13 of them sunny and one under bright clouds, and none of those taken indoors, at night, in fog or with flash.
+
 A main light that is told is the sun of a clear day: the sky gives the share of the light that the daylight of clear days has (`sky_share`),
 bluer than the sun. Cast shadows in eight photographs of sunny days kept 0.02 to 0.18 of the light, where it gives 0.15 to 0.22 from 30
 degrees up: cameras deepen shadows.
@@ -35,6 +38,11 @@ _COLOURED = 0.25
 """Share of a picture's cast that is taken for light: cameras balance most of it, and the rest is as often paint."""
 _PALER_RAD = 0.5
 """Angle beyond the frame in which colours fade by a factor of e."""
+_SUNLIT_LUX = 40_000.0
+"""What an overcast sky seldom gives, and the sun does from 30 degrees up."""
+_USUAL_SUN, _SPOT_POWER = (-150.0, 60.0), 8.0
+"""Where the sun is taken to be if nothing but the exposure tells of it: high, and behind the photographer. It is made 47 degrees wide (to
+half its brightness), so that it is harder than an overcast sky, and its direction, which is a guess, tells little."""
 _SUN_RGB, _SKY_RGB = (1.130, 0.983, 0.783), (0.733, 1.010, 1.682)
 """Colour of direct sunlight (daylight of 5300 K) and of a clear sky (15000 K) of the same luminance, by the locus of CIE 15:2004."""
 
@@ -50,17 +58,33 @@ def picture_light(
     foot_px: where the object stands. world_from_camera: rotation of the camera in that world. sun_degrees: where the main light comes
     from: degrees to the right of the view, and above the horizon.
     """
-    small = _small(plate)
-    white = white_at(small, foot_px[0] / plate.rgb.shape[1], foot_px[1] / plate.rgb.shape[0])
+    small, white = _small_and_white(plate, foot_px)
     seen = _panorama_of(small, plate, world_from_camera, white / luminance(white[None])[0])
-    if sun_degrees is None:
+    if sun_degrees is None and not is_sunlit(plate, foot_px):
         return Environment(_lit_from_above(seen, white)), ()
-    right, above = (math.radians(each) for each in sun_degrees)
+    right, above = (math.radians(each) for each in sun_degrees or _USUAL_SUN)
     travels = (-math.sin(right) * math.cos(above), math.sin(above), -math.cos(right) * math.cos(above))
     by_sky = sky_share(above) * np.array(_SKY_RGB)
     by_sky /= by_sky + (1.0 - sky_share(above)) * np.array(_SUN_RGB)
+    lit_by_sky = _lit_from_above(seen, by_sky * white)
+    if sun_degrees is None:
+        return Environment(lit_by_sky + _wide_light(travels, (1.0 - by_sky) * white)), ()
     red, green, blue = (math.pi * (1.0 - by_sky) * white / max(math.sin(above), 0.1)).tolist()
-    return Environment(_lit_from_above(seen, by_sky * white)), (sun(travels, (red, green, blue)),)
+    return Environment(lit_by_sky), (sun(travels, (red, green, blue)),)
+
+
+def is_sunlit(plate: Plate, foot_px: tuple[float, float]) -> bool:
+    """Return whether the exposure of a photograph tells that the sun shines where an object stands."""
+    _, white = _small_and_white(plate, foot_px)
+    return plate.white_lux is not None and plate.white_lux * float(luminance(white[None])[0]) > _SUNLIT_LUX
+
+
+def _wide_light(travels: tuple[float, float, float], white: Triple) -> Rgb:
+    """Return the panorama of a light that travels so and comes from a wide spot of the sky, by which a white surface shows `white`."""
+    towards = directions(*_PANORAMA_PX)
+    spot = np.maximum(towards @ -np.array(travels), 0.0)[..., None] ** _SPOT_POWER * (towards[..., 1:2] < 0.0)
+    ground = float((spot * np.maximum(-towards[..., 1:2], 0.0) * solid_angles_sr(*_PANORAMA_PX)[..., None]).sum())
+    return (math.pi * white / ground * spot).astype(np.float32)
 
 
 def sky_share(above_rad: float) -> float:
@@ -98,11 +122,13 @@ def _cast(picture: Rgb, bright: float) -> Triple:
     return cast / luminance(cast[None])[0]
 
 
-def _small(plate: Plate) -> Rgb:
+def _small_and_white(plate: Plate, foot_px: tuple[float, float]) -> tuple[Rgb, Triple]:
+    """Return the photograph in few pixels, and what a white surface would show at a pixel of it."""
     rgb = plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb
     height_px, width_px = rgb.shape[:2]
     size = (min(width_px, _WIDTH_PX), max(1, round(height_px * min(1.0, _WIDTH_PX / width_px))))
-    return np.maximum(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.float32(0.0))
+    small = np.maximum(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.float32(0.0))
+    return small, white_at(small, foot_px[0] / width_px, foot_px[1] / height_px)
 
 
 def _panorama_of(

@@ -7,7 +7,7 @@ import pytest
 
 from mrbokeh.compositing.ground import ground_under
 from mrbokeh.compositing.plate import Plate, plate_of
-from mrbokeh.compositing.plate_light import picture_light, white_at
+from mrbokeh.compositing.plate_light import is_sunlit, picture_light, white_at
 from mrbokeh.demo.plan import DATA
 from mrbokeh.images.color import luminance
 from mrbokeh.optics.camera import Camera
@@ -70,6 +70,26 @@ def test_a_main_light_takes_its_share_of_the_light() -> None:
     shade = 1.0 - 0.5 * np.array(main.rgb) / irradiance
     assert float(luminance(shade[None].astype(np.float32))[0]) == pytest.approx(11.8 / 53.7, rel=0.05)
     assert shade[2] > 1.5 * shade[1] > 1.5 * 1.2 * shade[0]
+
+
+def test_sunshine_shows_in_the_exposure() -> None:
+    """By the rule of f/16 at 1 / ISO s a white surface in full sun, about 100 klx, is just white; five stops more are needed at 3 klx.
+
+    The light then comes from a spot behind the camera, and the ground keeps its irradiance.
+    """
+    sunny, dull = (Photograph(np.zeros((3, 4, 3), np.float32), 50.0, 16.0, exposure_time_s=time_s, iso=100.0) for time_s in (0.01, 0.32))
+    assert sunny.white_lux == pytest.approx(100_000.0, rel=0.05)
+    assert dull.white_lux == pytest.approx(100_000.0 / 32, rel=0.05)
+    plate = photograph()
+    assert not is_sunlit(plate, (24.0, 28.0)) and not is_sunlit(replace(plate, white_lux=dull.white_lux), (24.0, 28.0))
+    bright = replace(plate, white_lux=sunny.white_lux)
+    assert is_sunlit(bright, (24.0, 28.0))
+    radiance = picture_light(bright, (24.0, 28.0), np.eye(3))[0].radiance[..., 1]
+    towards, weights = directions(32, 64), solid_angles_sr(32, 64)
+    from_behind = towards[..., 2] < 0.0
+    upwards = np.maximum(-towards[..., 1], 0.0) * weights
+    assert (radiance * upwards)[from_behind].sum() > 0.7 * (radiance * upwards).sum()
+    assert (radiance * upwards).sum() / np.pi == pytest.approx(white_at(plate.rgb, 0.5, 28 / HEIGHT)[1], rel=0.03)
 
 
 @pytest.mark.parametrize("factor", [0.01, 40.0])
