@@ -36,6 +36,7 @@ _DARKEST = 1e-3
 """Light of the darkest surroundings that are measured, in units of the brightest parts."""
 _COLOURED = 0.25
 """Share of a picture's cast that is taken for light: cameras balance most of it, and the rest is as often paint."""
+_LEAST_PALENESS = 0.02
 _PALER_RAD = 0.5
 """Angle beyond the frame in which colours fade by a factor of e."""
 _SUNLIT_LUX = 40_000.0
@@ -126,8 +127,10 @@ def _without_lamps(picture: Rgb) -> Rgb:
 
 
 def _cast(picture: Rgb) -> Triple:
-    """Return the colour of the light, with a luminance of 1."""
-    cast = np.sqrt((_without_lamps(picture).reshape(-1, 3).astype(np.float64) ** 2).mean(axis=0))
+    """Return the colour of the light, with a luminance of 1: that of all pixels, of which strong colours, which are paint, count little."""
+    paint = _without_lamps(picture).reshape(-1, 3).astype(np.float64)
+    paleness = paint.min(axis=1) / np.maximum(paint.max(axis=1), 1e-9) + _LEAST_PALENESS
+    cast = np.sqrt(np.average(paint**2, axis=0, weights=paleness))
     cast = (cast / cast.max()) ** _COLOURED if cast.max() > 0.0 else np.ones(3)
     return cast / luminance(cast[None])[0]
 
