@@ -10,7 +10,7 @@ Sunshine shows in the exposure: white surfaces near the foot have more than 40 k
 had more, 15 of them sunny and one under bright clouds, and none of those taken indoors, at dusk or night, in fog or with flash.
 
 A main light that is told is the sun of a clear day: the sky gives the share of the light that the daylight of clear days has (`sky_share`),
-bluer than the sun. Cast shadows in eight photographs of sunny days kept 0.02 to 0.18 of the light, where it gives 0.15 to 0.22 from 30
+bluer than the sun. Seven cast shadows in five photographs of sunny days kept 0.02 to 0.18 of the light, where it gives 0.15 to 0.22 from 30
 degrees up: cameras deepen shadows.
 """
 
