@@ -53,6 +53,7 @@ class Plate:
     focus_known, view_known: False where nothing tells the focus, and where the field of view is guessed.
     rough_focus_m: nearest and farthest distance that the focus in the photograph's file may mean, where that is a wide range.
     world_from_camera: (3, 3) turns camera axes into upright ones, where that is known.
+    white_lux: illuminance under which a white surface shows 1.0, by the exposure of the photograph (`Photograph.white_lux`).
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -69,6 +70,7 @@ class Plate:
     world_from_camera: Float[np.ndarray, "3 3"] | None = None
     depth_note: str = ""
     rough_focus_m: tuple[float, float] | None = None
+    white_lux: float | None = None
 
     def __post_init__(self) -> None:
         size = self.rgb.shape[:2]
@@ -139,7 +141,7 @@ def open_plate(
     photograph, phone = read_photograph(photo).stating(facts or {}), _phone(photo)
     if lens is None and not facts:
         _require_no_panorama(photo, photograph)
-    blur_from, focus_known, view_known = "", True, True
+    blur_from, focus_known, view_known, white_lux = "", True, True, photograph.white_lux
     is_focus_guessed = lens is None and focus_m is None and photograph.focus_distance_m is None
     if guessing and lens is None and phone is None:
         stated = (photograph.focal_length_mm, photograph.sensor_width_mm)
@@ -155,6 +157,7 @@ def open_plate(
     lens = photograph.lens(photo, focus_m) if lens is None else lens_for_photograph(lens, photograph, photo)
     focused = lens if focus_m is None else lens.focused_at(focus_m)
     plate = with_own_alpha(plate_of(photograph.rgb, focused), photo, read_alpha(photo, photograph.orientation))
+    plate = replace(plate, white_lux=white_lux)
     if phone is None:
         rough_m = photograph.rough_focus_m if focus_m is None else None
         return replace(plate, focus_known=focus_known, view_known=view_known, rough_focus_m=rough_m)
