@@ -153,7 +153,7 @@ def _rational_distance(tags: Tags, names: tuple[str, ...]) -> FocusReading | Non
 def _canon_interval(tags: Tags) -> FocusReading | None:
     """Read the farthest and the nearest distance in cm from Canon's file info. The middle is taken in dioptres, in which blur is linear."""
     names = ("Exif.CanonFi.FocusDistanceUpper", "Exif.CanonFi.FocusDistanceLower")
-    farthest_cm, nearest_cm = (_unsigned(tags, name) for name in names) if _is_whole_maker_note(tags) else (0.0, 0.0)
+    farthest_cm, nearest_cm = (_unsigned(tags, name) for name in names) if is_whole_canon_note(tags) else (0.0, 0.0)
     source = f"Exif.CanonFi.FocusDistanceLower, Upper = {nearest_cm:g}, {farthest_cm:g} cm"
     return canon_reading(nearest_cm / _CM_PER_M, farthest_cm / _CM_PER_M, source)
 
@@ -171,7 +171,7 @@ def _canon_shot(tags: Tags) -> FocusReading | None:
     """
     name = "Exif.CanonSi.SubjectDistance"
     value = _unsigned(tags, name)
-    if value == 0.0 or not _is_whole_maker_note(tags):
+    if value == 0.0 or not is_whole_canon_note(tags):
         return None
     if value in _CANON_INFINITY_CODES:
         return at_infinity(f"{name} = {value:g}")
@@ -181,7 +181,7 @@ def _canon_shot(tags: Tags) -> FocusReading | None:
     return FocusReading.from_film_plane(value / per_m, (value - 0.5) / per_m, (value + 0.5) / per_m, f"{name} = {value:g} {unit}")
 
 
-def _is_whole_maker_note(tags: Tags) -> bool:
+def is_whole_canon_note(tags: Tags) -> bool:
     """Return whether Canon's own code of the widest aperture is one of an aperture; programs that move the note leave other bytes there."""
     code = number(tags.get("Exif.CanonCs.MaxAperture"))
     return code is None or 0 < code <= _MOST_APERTURE_CODE

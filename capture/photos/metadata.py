@@ -14,7 +14,16 @@ from datetime import datetime
 from pathlib import Path
 from typing import Any
 
-from capture.photos.focus_metadata import FocusReading, Tags, at_infinity, canon_reading, number, read_focus
+from capture.photos.focus_metadata import (
+    UINT16_MAX,
+    FocusReading,
+    Tags,
+    at_infinity,
+    canon_reading,
+    is_whole_canon_note,
+    number,
+    read_focus,
+)
 from capture.photos.photo_metadata import (
     PhotoMetadata,
     SensorReading,
@@ -273,9 +282,18 @@ def _focal_length_mm(tags: Tags) -> float | None:
 
 
 def _iso(tags: Tags) -> float | None:
-    """Read EXIF; else Nikon's maker note "0 400"."""
+    """Read EXIF; else Nikon's maker note "0 400"; else Canon's base speed and gain, as 32nds of a stop."""
     nikon = tags.get("Exif.Nikon3.ISOSpeed", "").split() or [""]
-    return _first_positive(tags, "Exif.Photo.ISOSpeedRatings", "Exif.Image.ISOSpeedRatings") or number(nikon[-1]) or None
+    return _first_positive(tags, "Exif.Photo.ISOSpeedRatings", "Exif.Image.ISOSpeedRatings") or number(nikon[-1]) or _canons_iso(tags)
+
+
+def _canons_iso(tags: Tags) -> float | None:
+    base = number(tags.get("Exif.CanonSi.ISOSpeed"))
+    if not base or not is_whole_canon_note(tags):
+        return None
+    gain = number(tags.get("Exif.CanonSi.AutoISO")) or 0.0
+    signed = gain - (UINT16_MAX + 1) * (gain > UINT16_MAX // 2)
+    return 100.0 / 32.0 * 2.0 ** ((base + signed) / 32.0)
 
 
 def _taken_at(tags: Tags) -> datetime | None:

@@ -193,7 +193,8 @@ def stack_remarks(work: StackWork, reference: Photo, lens: Lens | None, missing:
     if lens is None:
         remarks.append(f"no lens: {missing}. Give what is missing in a lens.toml beside the photographs and ingest again")
     elif reference.sidecar.sensor_width_mm is None and (sensor := reference.metadata.sensor) is not None:
-        remarks.append(f"sensor width {lens.sensor_width_mm:.4g} mm from {sensor.source}")
+        doubt = f" ({sensor.doubt})" if sensor.doubt else ""
+        remarks.append(f"sensor width {lens.sensor_width_mm:.4g} mm from {sensor.source}{doubt}")
     return remarks + lens_remarks(photos) + _order_remarks(photos)
 
 

@@ -393,17 +393,19 @@ def _light(
     options: ObjectOptions, plate: Plate, foot_px: tuple[float, float], world_from_camera: np.ndarray, kept: "KeptParts | None"
 ) -> "Lighting":
     """Return the light of an object: its panorama, even light, or what the photograph tells of it."""
-    from mrbokeh.compositing.plate_light import picture_light
+    from mrbokeh.compositing.plate_light import is_sunlit, picture_light
     from mrbokeh.scene.staging.scene_description import Lighting
 
     if options.environment or options.plain:
         return Lighting(options.environment, exposure=options.exposure)
     lit = picture_light if kept is None else kept.light
     made = lit(plate, foot_px, world_from_camera, None if options.sun is None else typed_sun(options.sun))
-    if options.sun is None:
+    if options.sun is None and is_sunlit(plate, foot_px):
+        guess("by the exposure the sun shines: a soft light from behind the camera is taken (--sun RIGHT,ABOVE says where it is)")
+    elif options.sun is None:
         guess("the object's light is guessed from the photograph (else --exposure, --sun RIGHT,ABOVE, --environment or --plain)")
     else:
-        guess("how strong --sun is beside the sky is that of a clear day, and all light is as bright as the photograph (--exposure)")
+        guess("--sun is as strong beside the sky as on a clear day; how bright both are is guessed from the photograph (--exposure)")
     return Lighting(exposure=options.exposure, made=made)
 
 

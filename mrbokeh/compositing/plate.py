@@ -53,6 +53,7 @@ class Plate:
     focus_known, view_known: False where nothing tells the focus, and where the field of view is guessed.
     rough_focus_m: nearest and farthest distance that the focus in the photograph's file may mean, where that is a wide range.
     world_from_camera: (3, 3) turns camera axes into upright ones, where that is known.
+    white_lux: illuminance under which a white surface shows 1.0, by the exposure of the photograph (`Photograph.white_lux`).
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -69,6 +70,7 @@ class Plate:
     world_from_camera: Float[np.ndarray, "3 3"] | None = None
     depth_note: str = ""
     rough_focus_m: tuple[float, float] | None = None
+    white_lux: float | None = None
 
     def __post_init__(self) -> None:
         size = self.rgb.shape[:2]
@@ -145,6 +147,7 @@ def photograph_plate(photo: Path, photograph: Photograph, phone: PhonePhoto | No
         _require_no_panorama(photo, photograph)
     held = held_lens(photo, photograph, phone, wishes)
     plate = with_own_alpha(plate_of(photograph.rgb, held.lens), photo, read_alpha(photo, photograph.orientation))
+    plate = replace(plate, white_lux=held.white_lux)
     if phone is None:
         return replace(plate, focus_known=held.focus_known, view_known=held.view_known, rough_focus_m=held.rough_focus_m)
     original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
@@ -167,20 +170,21 @@ class LensWishes:
 
 @dataclass(frozen=True)
 class HeldLens:
-    """Lens of a photograph. blur_from, focus_known, view_known, rough_focus_m: as in `Plate`."""
+    """Lens of a photograph. blur_from, focus_known, view_known, rough_focus_m, white_lux: as in `Plate`."""
 
     lens: Lens
     blur_from: str = ""
     focus_known: bool = True
     view_known: bool = True
     rough_focus_m: tuple[float, float] | None = None
+    white_lux: float | None = None
 
 
 def held_lens(photo: Path, photograph: Photograph, phone: PhonePhoto | None, wishes: LensWishes) -> HeldLens:
     """Return the lens of a photograph in a file, by what the file states and what is wished; only the size of its rgb counts."""
     lens, focus_m = wishes.lens, wishes.focus_m
     photograph = photograph.stating(wishes.facts)
-    blur_from, focus_known, view_known = "", True, True
+    blur_from, focus_known, view_known, white_lux = "", True, True, photograph.white_lux
     if wishes.guessing and lens is None and phone is None:
         stated = (photograph.focal_length_mm, photograph.sensor_width_mm)
         photograph, guesses = photograph.guessing()
@@ -195,7 +199,7 @@ def held_lens(photo: Path, photograph: Photograph, phone: PhonePhoto | None, wis
     lens = photograph.lens(photo, focus_m) if lens is None else lens_for_photograph(lens, photograph, photo)
     rough_m = photograph.rough_focus_m if phone is None and focus_m is None else None
     focused = lens if focus_m is None else lens.focused_at(focus_m)
-    return HeldLens(focused, blur_from, focus_known, view_known=view_known, rough_focus_m=rough_m)
+    return HeldLens(focused, blur_from, focus_known=focus_known, view_known=view_known, rough_focus_m=rough_m, white_lux=white_lux)
 
 
 def _require_no_panorama(photo: Path, photograph: Photograph) -> None:

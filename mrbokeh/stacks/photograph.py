@@ -26,8 +26,6 @@ from mrbokeh.system.errors import InputError
 _log = logging.getLogger(__name__)
 _USUAL_FOCAL_MM, _LONG_SIDE_MM, _USUAL_F_NUMBER, _SHORTEST_MM = 28.0, 36.0, 8.0, 14.0
 """What most phones have, as of full frame, an f-number at which nearly all is sharp, and what is short on full frame."""
-_SHORTEST, _LONGEST = 0.3, 40.0
-"""Focal lengths in widths of the sensor between which one is believed: fisheyes and spotting scopes lie beyond."""
 _OPTION_OF = {
     "focal length": "--focal-length MM",
     "f-number": "--f-number N",
@@ -64,6 +62,16 @@ class Photograph:
         """Return the counter-clockwise quarter turns that brought the stored picture upright."""
         return quarter_turns(self.orientation)
 
+    @property
+    def white_lux(self) -> float | None:
+        """Return the illuminance under which a white matte surface shows 1.0, by the exposure; None where the file does not tell it.
+
+        1.0 is where the sensor is full, by the speed of ISO 12232 (78 lx s / S), for a lens that lets 0.65 of the light through.
+        """
+        if not self.f_number or not self.exposure_time_s or not self.iso:
+            return None
+        return float(np.pi) * 78.0 / 0.65 * self.f_number**2 / (self.exposure_time_s * self.iso)
+
     def stating(self, facts: Mapping[str, float]) -> "Photograph":
         """Return the photograph as if its file stated these facts: focal_length_mm, f_number, sensor_width_mm of the camera held level."""
         told = dict(facts)
@@ -76,10 +84,6 @@ class Photograph:
     def guessing(self) -> tuple["Photograph", str]:
         """Return the photograph with a guess for all of its lens but the focus that its file does not tell, and the guesses in words."""
         guessed, words = self, []
-        if self.focal_length_mm and self.sensor_width_mm and not _SHORTEST <= self.focal_length_mm / self.sensor_width_mm <= _LONGEST:
-            told = f"{self.focal_length_mm:.4g} mm on {self.sensor_width_mm:.4g} mm of sensor width, which no photograph has, are left out"
-            rest, guesses = replace(self, focal_length_mm=None, f_number=None, sensor_width_mm=None).guessing()
-            return rest, f"{told}; {guesses}"
         if self.focal_length_mm is None and self.sensor_width_mm is not None:
             width_mm, focal_mm = self.sensor_width_mm, _USUAL_FOCAL_MM / _LONG_SIDE_MM * self.sensor_width_mm
         else:

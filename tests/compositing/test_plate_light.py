@@ -8,7 +8,7 @@ import pytest
 
 from mrbokeh.compositing.ground import ground_under
 from mrbokeh.compositing.plate import Plate, plate_of
-from mrbokeh.compositing.plate_light import picture_light, white_at
+from mrbokeh.compositing.plate_light import is_sunlit, picture_light, white_at
 from mrbokeh.demo.plan import DATA
 from mrbokeh.images.color import luminance
 from mrbokeh.optics.camera import Camera
@@ -72,6 +72,29 @@ def test_a_main_light_takes_its_share_of_the_light() -> None:
     assert shade[2] > 1.5 * shade[1] > 1.5 * 1.2 * shade[0]
 
 
+def test_sunshine_shows_in_the_exposure() -> None:
+    """By the rule of f/16 at 1 / ISO s a white surface in full sun, about 100 klx, is just white; five stops more are needed at 3 klx.
+
+    The light then comes from a spot behind the camera, and the ground keeps its irradiance.
+    """
+    sunny, dull = (Photograph(np.zeros((3, 4, 3), np.float32), 50.0, 16.0, exposure_time_s=time_s, iso=100.0) for time_s in (0.01, 0.32))
+    assert sunny.white_lux == pytest.approx(100_000.0, rel=0.05)
+    assert dull.white_lux == pytest.approx(100_000.0 / 32, rel=0.05)
+    plate = photograph()
+    assert not is_sunlit(plate, (24.0, 28.0)) and not is_sunlit(replace(plate, white_lux=dull.white_lux), (24.0, 28.0))
+    bright = replace(plate, white_lux=sunny.white_lux)
+    assert is_sunlit(bright, (24.0, 28.0))
+    shaded = bright.rgb.copy()
+    shaded[20:, :20] *= 0.1
+    assert not is_sunlit(replace(bright, rgb=shaded), (8.0, 30.0)), "in the shade"
+    radiance = picture_light(bright, (24.0, 28.0), np.eye(3))[0].radiance[..., 1]
+    towards, weights = directions(32, 64), solid_angles_sr(32, 64)
+    from_behind = towards[..., 2] < 0.0
+    upwards = np.maximum(-towards[..., 1], 0.0) * weights
+    assert (radiance * upwards)[from_behind].sum() > 0.7 * (radiance * upwards).sum()
+    assert (radiance * upwards).sum() / np.pi == pytest.approx(white_at(plate.rgb, 0.5, 28 / HEIGHT)[1], rel=0.03)
+
+
 @pytest.mark.parametrize("factor", [0.01, 40.0])
 def test_a_picture_twice_as_bright_tells_of_light_twice_as_bright(factor: float) -> None:
     """Whatever the exposure: of a night, and of light far above the white of a screen."""
@@ -92,8 +115,8 @@ def test_a_street_under_sodium_lamps_makes_no_red_object() -> None:
         red, green, blue = (environment.radiance * weights * np.maximum(directions(32, 64) @ np.array(faces), 0.0)[..., None]).sum((0, 1))
         assert green < red < 2.2 * green and blue > 0.2 * green
     lamp = plate.rgb.copy()
-    lamp[2:5, 2:5] = 500.0
-    np.testing.assert_allclose(white_at(lamp, 0.5, 0.8), white_at(plate.rgb, 0.5, 0.8), rtol=0.3, err_msg="a lamp is no white wall")
+    lamp[2:5, 2:5] = (500.0, 150.0, 15.0)
+    np.testing.assert_allclose(white_at(lamp, 0.5, 0.8), white_at(plate.rgb, 0.5, 0.8), rtol=0.05, err_msg="a lamp is no white wall")
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.004])

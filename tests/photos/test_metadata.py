@@ -337,3 +337,11 @@ def test_a_focus_beyond_what_the_lens_tells_apart_is_rough() -> None:
     assert rough(5.8, 5.8, 5.8) == (pytest.approx(1.0 / (1 / 5.8 + 1 / 2.917), rel=1e-3), math.inf)
     assert rough(5.8, 5.8, 5.8, focal_mm=50.0) is None, "which is 149 m with a lens of 50 mm"
     assert rough(2.7, 1.8, 5.2, focal_mm=50.0) == pytest.approx((1.8, 5.2), rel=1e-6), "a wide zone that the camera states"
+
+
+@pytest.mark.parametrize(("base", "gain", "iso"), [("128", "0", 50.0), ("160", "39", 232.7), ("160", "65523", 75.5)])
+def test_canons_speed_counts_in_32nds_of_a_stop(base: str, gain: str, iso: float) -> None:
+    """A base of 160 is ISO 100, five stops above 100 / 32, and the gain has a sign; exiftool gives the same numbers."""
+    tags = {"Exif.CanonSi.ISOSpeed": base, "Exif.CanonSi.AutoISO": gain}
+    assert metadata_from_tags(tags).iso == pytest.approx(iso, rel=1e-3)
+    assert metadata_from_tags(tags | {"Exif.CanonCs.MaxAperture": "21848"}).iso is None, "a maker note that was moved"

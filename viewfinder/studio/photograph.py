@@ -161,7 +161,7 @@ def shrunk(plate: Plate, width_px: int, height_px: int) -> Plate:
 def _with_lens(plate: Plate, held: HeldLens) -> Plate:
     camera = camera_of_lens(held.lens, plate.rgb.shape[1], plate.rgb.shape[0])
     known = {"blur_from": held.blur_from, "focus_known": held.focus_known, "view_known": held.view_known}
-    return replace(plate, lens=held.lens, camera=camera, rough_focus_m=held.rough_focus_m, **known)  # type: ignore[arg-type]
+    return replace(plate, lens=held.lens, camera=camera, rough_focus_m=held.rough_focus_m, white_lux=held.white_lux, **known)  # type: ignore[arg-type]
 
 
 @lru_cache(maxsize=8)

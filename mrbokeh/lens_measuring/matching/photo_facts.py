@@ -17,6 +17,8 @@ _PIXEL_WIDTH, _PIXEL_HEIGHT, _PLANE_RESOLUTION, _PLANE_UNIT = 0xA002, 0xA003, 0x
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0}
 _FULL_FRAME_DIAGONAL_MM = float(np.hypot(36.0, 24.0))
 _INFINITELY_FAR = 0xFFFFFFFF
+_PLAUSIBLE_MM = (3.0, 60.0)
+"""Width of sensors; a picture made smaller counts too few pixels on too little of them."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +88,7 @@ def _sensor_width_mm(tags: dict[int, Any], focal_length_mm: float | None, size_p
     stated_px = _pixels(tags.get(_PIXEL_WIDTH)), _pixels(tags.get(_PIXEL_HEIGHT))
     cut_px = cut_from_px(size_px, stated_px)
     pixels = float(size_px[0] if cut_px else stated_px[0] or size_px[0])
-    if resolution is not None and unit is not None and 1.0 < pixels / resolution * unit < 100.0:
+    if resolution is not None and unit is not None and _PLAUSIBLE_MM[0] < pixels / resolution * unit < _PLAUSIBLE_MM[1]:
         return pixels / resolution * unit
     film_mm = positive_rational(tags.get(_FOCAL_LENGTH_35MM))
     if film_mm is None or focal_length_mm is None:
