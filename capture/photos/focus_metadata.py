@@ -144,7 +144,7 @@ def _rational_distance(tags: Tags, names: tuple[str, ...]) -> FocusReading | Non
             return at_infinity(source)
         if denominator > 0:
             distance_m, nearest_m, farthest_m = ((numerator + digit) / denominator for digit in (0.0, -0.5, 0.5))
-            if numerator == _ALL_NINES:
+            if parts == (_ALL_NINES, 100):
                 return at_infinity(source)
             return FocusReading.from_film_plane(distance_m, nearest_m, farthest_m, source)
     return None

@@ -287,13 +287,17 @@ def _iso(tags: Tags) -> float | None:
     return _first_positive(tags, "Exif.Photo.ISOSpeedRatings", "Exif.Image.ISOSpeedRatings") or number(nikon[-1]) or _canons_iso(tags)
 
 
+_MOST_STOPS = 24
+
+
 def _canons_iso(tags: Tags) -> float | None:
     base = number(tags.get("Exif.CanonSi.ISOSpeed"))
     if not base or not is_whole_canon_note(tags):
         return None
     gain = number(tags.get("Exif.CanonSi.AutoISO")) or 0.0
     signed = gain - (UINT16_MAX + 1) * (gain > UINT16_MAX // 2)
-    return 100.0 / 32.0 * 2.0 ** ((base + signed) / 32.0)
+    steps = (base + signed) / 32.0
+    return 100.0 / 32.0 * 2.0**steps if abs(steps) < _MOST_STOPS else None
 
 
 def _taken_at(tags: Tags) -> datetime | None:

@@ -161,8 +161,8 @@ def typed_pixel(text: str) -> tuple[float, float]:
 def typed_sun(text: str) -> tuple[float, float]:
     """Return degrees to the right and above the horizon of --sun."""
     right_deg, above_deg = numbers_in(text, "--sun expects degrees to the right and above the horizon, such as -60,40", (2,))
-    if not 0.0 < above_deg <= 90.0:
-        raise InputError(f"--sun: expected a light above 0 and up to 90 degrees over the horizon, got {text!r}")
+    if not 0.0 < above_deg <= 90.0 or abs(right_deg) > 360.0:
+        raise InputError(f"--sun: expected a light within a turn, above 0 and up to 90 degrees over the horizon, got {text!r}")
     return right_deg, above_deg
 
 
@@ -220,14 +220,14 @@ class ResultOptions:
     ] = None
     overwrite: shared.OverwriteOption = False
 
-    def require_meant(self, out: Path, *, is_object: bool, all_slices: bool) -> None:
+    def require_meant(self, out: Path, *, only_object: bool, all_slices: bool) -> None:
         """Raise InputError for a preview of something else than one object in one picture for the screen."""
         from mrbokeh.images.image_io import require_suffix
 
         if not self.preview:
             return
         require_suffix(out, (".png", ".jpg", ".jpeg"), "--out of a --preview")
-        if not is_object or all_slices or self.save_layer is not None or self.save_deep is not None:
+        if not only_object or all_slices or self.save_layer is not None or self.save_deep is not None:
             raise InputError(
-                "--preview shows where an --object stands: give that, and leave --all-slices, --save-layer and --save-deep out"
+                "--preview shows where an --object stands: give that, and no --layer, --all-slices, --save-layer or --save-deep"
             )

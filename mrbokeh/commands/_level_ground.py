@@ -56,7 +56,7 @@ def on_level_ground(plate: Plate, standing: ObjectOptions, known_height_m: float
         plate = _by_lines(plate)
     ray = plate.camera.unproject(np.array([x_px, y_px]), np.array(1.0))
     if plate.world_from_camera is None:
-        down_rad = 0.0 if standing.plain else usual_tilt_rad(plate, ray)
+        down_rad = usual_tilt_rad(plate, ray)
         down_rad = down_rad if math.degrees(down_rad) >= 1.0 else 0.0
         plate = replace(plate, world_from_camera=looking_down(down_rad))
         held = f"to look down by {math.degrees(down_rad):.0f} degrees" if down_rad else "to be level"
@@ -65,16 +65,27 @@ def on_level_ground(plate: Plate, standing: ObjectOptions, known_height_m: float
     height_m, told = _camera_height_m(plate, standing.camera_height or known_height_m, nearest_m)
     distance_m = height_m * nearest_m
     taken += [told] if told else []
-    if not plate.focus_known:
+    if plate.rough_focus_m is not None and plate.rough_focus_m[0] <= distance_m <= plate.rough_focus_m[1]:
+        plate = replace(plate, lens=plate.lens.focused_at(distance_m))
+    elif not plate.focus_known:
         taken.append(f"the focus to be on the object, {distance_m:.3g} m away (--focus METRES)")
         plate = replace(plate, lens=plate.lens.focused_at(distance_m))
     guess(f"there is no depth: mrbokeh takes {', '.join(taken)}" if taken else "")
     height = standing.height
     if height is None:
-        height = f"{HIGH_SHARE * plate.rgb.shape[0]:.0f}px"
+        height = f"{max(1.0, HIGH_SHARE * plate.rgb.shape[0]):.0f}px"
         guess(f"the object is made {height} high, a quarter of the picture (--height METRES or such as 300px)")
     place = ",".join(f"{each:.9g}" for each in distance_m * ray)
     return plate, replace(standing, at=place, at_pixel=None, height=height)
+
+
+def focused_on_foot(plate: Plate, standing: ObjectOptions) -> Plate:
+    """Return a plate with depth focused on the foot of an object, where nothing tells its focus."""
+    foot_m = plate.depth_at_m(*pair_of(standing.at_pixel))
+    if plate.focus_known or not 0.0 < foot_m < math.inf:
+        return plate
+    guess(f"nothing tells the focus: it is taken to be on the object, {foot_m:.3g} m away (--focus METRES, --focus-at X,Y)")
+    return replace(plate, lens=plate.lens.focused_at(foot_m))
 
 
 def usual_tilt_rad(plate: Plate, ray: Float[np.ndarray, "3"]) -> float:
@@ -108,10 +119,13 @@ def _camera_height_m(plate: Plate, told_m: float | None, nearest_m: float) -> tu
     if not plate.focus_known or focus_m >= _FARTHEST_M:
         return _EYES_M, f"the camera to be {_EYES_M:g} m above the ground (--camera-height METRES)"
     height_m = focus_m / nearest_m
+    if plate.rough_focus_m is not None and plate.rough_focus_m[0] <= _EYES_M * nearest_m <= plate.rough_focus_m[1]:
+        told = f"the camera to be {_EYES_M:g} m above the ground (--camera-height METRES) and the focus on the object"
+        near_m, far_m = plate.rough_focus_m
+        return _EYES_M, f"{told}, as the photograph tells {near_m:.2g} to {far_m:.2g} m of it (--focus METRES)"
     if _LOWEST_M <= height_m <= _HIGHEST_M:
         told = f"the object to stand where the lens is focused, {focus_m:.3g} m away and {height_m:.2g} m below the camera"
-        rough = "" if plate.rough_focus_m is None else ", roughly: {:.2g} to {:.2g} m by its file".format(*plate.rough_focus_m)
-        return height_m, f"{told}{rough} (--camera-height METRES)"
+        return height_m, f"{told} (--camera-height METRES, --focus METRES)"
     warn(
         f"the lens is focused at {focus_m:.3g} m, but ground that far away at this pixel would be {height_m:.2g} m below the camera: "
         f"another place is in focus, or the file is wrong (--focus METRES)"

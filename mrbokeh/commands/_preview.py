@@ -21,7 +21,7 @@ _CELLS, _POINTS, _NEAREST = 12, 97, 0.05
 _STEPS_M = np.outer(10.0 ** np.arange(-3, 4), (1.0, 2.0, 5.0)).ravel()
 _CELL_SHARE = 0.12
 """Width of a cell of the grid, in widths of the picture where the object stands."""
-_GRID, _BOX, _INK, _PAPER = (255, 225, 40), (60, 230, 255), (255, 255, 255), 0.35
+_GRID, _BOX, _INK, _PAPER, _GRID_SHARE = (255, 225, 40), (60, 230, 255), (255, 255, 255), 0.35, 0.6
 _BAR_PX, _FONT, _FONT_SCALE = 24, cv2.FONT_HERSHEY_SIMPLEX, 0.5
 
 
@@ -31,15 +31,16 @@ def smaller(plate: Plate, standing: ObjectOptions) -> tuple[Plate, ObjectOptions
     scale = min(1.0, _LONGEST_PX / max(height_px, width_px))
     if scale == 1.0:
         return plate, standing, 1.0
+    small_px = (max(1, round(scale * width_px)), max(1, round(scale * height_px)))
     pixel = None
     if standing.at_pixel is not None:
         plate.require_pixel(*pair_of(standing.at_pixel))
-        pixel = ",".join(f"{scale * each:.9g}" for each in pair_of(standing.at_pixel))
+        x_px, y_px = np.multiply(pair_of(standing.at_pixel), small_px) / (width_px, height_px)
+        pixel = f"{x_px:.9g},{y_px:.9g}"
     height = standing.height
     if height is not None and height.endswith("px"):
         height = f"{scale * float(height.removesuffix('px')):.9g}px"
-    small = shrunk(plate, max(1, round(scale * width_px)), max(1, round(scale * height_px)))
-    return small, replace(standing, at_pixel=pixel, height=height), scale
+    return shrunk(plate, *small_px), replace(standing, at_pixel=pixel, height=height), scale
 
 
 def write_preview_of(out: Path, inserted: Inserted, plate: Plate, objects: Layer, scale: float) -> str:
@@ -61,14 +62,15 @@ def write_preview_of(out: Path, inserted: Inserted, plate: Plate, objects: Layer
     over = drawn.copy()
     for line_px in _grid_px(plate, foot_m, step_m):
         cv2.polylines(over, [np.round(line_px * 16).astype(np.int32)], False, _GRID, 1, cv2.LINE_AA, 4)
-    drawn = np.where((objects.alpha > 0.5)[..., None], drawn, over)
+    drawn = np.where((objects.alpha > 0.5)[..., None], drawn, cv2.addWeighted(over, _GRID_SHARE, drawn, 1.0 - _GRID_SHARE, 0.0))
     cv2.rectangle(drawn, (int(left), int(top)), (int(right), int(bottom)), _BOX, 1)
     coc_px = np.abs(plate.lens.coc_px(np.array([nearest_m, farthest_m]), plate.rgb.shape[1])) / scale
     unit = "guessed m" if plate.metres_guessed else "m"
+    is_cut = left == 0 or top == 0 or right == objects.width_px - 1 or bottom == objects.height_px - 1
+    high = f"{plate.length_m(float(bottom - top + 1), float(np.median(seen_m))):.2g} {unit} high"
     told = (
         f"{nearest_m:.3g} to {farthest_m:.3g} {unit} away, {(right - left + 1) / scale:.0f}x{(bottom - top + 1) / scale:.0f} px, "
-        f"{plate.length_m(float(bottom - top + 1), float(np.median(seen_m))):.2g} {unit} high, blurred by {coc_px.min():.1f} to "
-        f"{coc_px.max():.1f} px; cells of {step_m:g} {unit}"
+        f"{'cut off by the frame' if is_cut else high}, blurred by {coc_px.min():.1f} to {coc_px.max():.1f} px; cells of {step_m:g} {unit}"
     )
     write_stored(out, _with_line(drawn, told))
     return told

@@ -58,7 +58,7 @@ def composite(
         require_options_of_stacks,
         write_results,
     )
-    from mrbokeh.commands._level_ground import on_level_ground, pair_of, with_camera_of_file
+    from mrbokeh.commands._level_ground import focused_on_foot, on_level_ground, pair_of, with_camera_of_file
     from mrbokeh.commands._preview import smaller, write_preview_of
     from mrbokeh.compositing.choose import best_mode, insertion_of
     from mrbokeh.compositing.ground import with_ground_behind
@@ -66,6 +66,7 @@ def composite(
     from mrbokeh.renderers.choose import lens_and_renderer
     from mrbokeh.stacks.capture_bundle import is_bundle, read_bundle
     from mrbokeh.system.console import working
+    from mrbokeh.system.errors import InputError, require_file
 
     read = (
         photo,
@@ -82,7 +83,11 @@ def composite(
         require_options_of_stacks(taken, optics, look, colour, result)
     standing.require_meant(photo, taken.depth, rendering.catch)
     require_one_focus(focus=optics.focus, focus_at=optics.focus_at)
-    result.require_meant(out, is_object=standing.object_ is not None, all_slices=taken.all_slices)
+    if standing.object_ is not None:
+        require_file(standing.object_, "a GLB file")
+    result.require_meant(out, only_object=standing.object_ is not None and not virtual.layer, all_slices=taken.all_slices)
+    if virtual.camera is not None and virtual.scene is None and standing.object_ is None:
+        raise InputError(f"--camera {virtual.camera} is for a --scene or an --object: give one, or leave it out")
     check_outputs(out, result, read, all_slices=taken.all_slices)
     bundle = read_bundle(photo) if is_bundle(photo) else None
     lens, renderer = lens_and_renderer(optics.lens, optics.renderer or (bundle.renderer if bundle and optics.lens is None else None))
@@ -98,12 +103,17 @@ def composite(
     _tell_metres(photo, virtual, standing, lens)
     guess(plate.depth_note)
     known_height_m, scale = None, 1.0
-    if result.preview:
-        plate, standing, scale = smaller(plate, standing)
-    if virtual.camera is not None and standing.object_ is not None and virtual.scene is None:
+    if virtual.camera is not None and virtual.scene is None:
         plate, known_height_m = with_camera_of_file(plate, virtual.camera)
     if on_ground and plate.depth_m is None:
         plate, standing = on_level_ground(plate, standing, known_height_m)
+    elif on_ground:
+        plate = focused_on_foot(plate, standing)
+    matching = standing.object_ is not None and not standing.plain
+    uncompressed = out.suffix.lower() == ".exr" or result.preview or colour.of_plate is not None or colour.of_result is not None
+    finishing = _finishing(photo, plate, look, matching=matching, uncompressed=uncompressed)
+    if result.preview:
+        plate, standing, scale = smaller(plate, standing)
     if standing.object_ is not None:
         plate = held_upright(plate, standing)
     layers_for = layers_by(virtual, standing, rendering, plate, bundle)
@@ -112,8 +122,6 @@ def composite(
     if taken.all_slices:
         _into_all_slices(photo, out, layers_for, insertion, renderer, lens)
         return
-    matching = standing.object_ is not None and not standing.plain
-    finishing = _finishing(photo, plate, look, matching=matching, is_linear=out.suffix.lower() == ".exr" or result.preview)
     sharp = layers_for(plate)
     if not any((layer.alpha > 0).any() for layer in sharp):
         nothing_seen(standing, virtual)
@@ -133,13 +141,13 @@ def composite(
     tell(f"wrote {out} ({mode}; {told})", known, mode=mode, **figures)
 
 
-def _finishing(photo: Path, plate: "Plate", look: LookGroup, *, matching: bool, is_linear: bool) -> "Finishing":
+def _finishing(photo: Path, plate: "Plate", look: LookGroup, *, matching: bool, uncompressed: bool) -> "Finishing":
     """Return what makes virtual light look photographed: as told, and of a photograph in a file also as it is."""
     from mrbokeh.compositing.plate_look.finishing import finishing_of, matched_finishing
 
     if photo.is_dir() or not matching:
         return finishing_of(look.wanted, plate.rgb, None if photo.is_dir() else photo)
-    finishing, matched = matched_finishing(look.wanted, plate.rgb, photo, is_linear=is_linear)
+    finishing, matched = matched_finishing(look.wanted, plate.rgb, photo, uncompressed=uncompressed)
     guess(
         f"black, grain and compression are the photograph's, as far as they can be told ({' off, '.join(matched)} off)" if matched else ""
     )

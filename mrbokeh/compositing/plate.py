@@ -11,6 +11,7 @@ Every insertion owes these (tests/compositing/test_compositing.py asks all of th
 
 import logging
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -197,7 +198,7 @@ def held_lens(photo: Path, photograph: Photograph, phone: PhonePhoto | None, wis
     elif phone is not None and phone.focus is not None and photograph.focus_distance_m is None:
         photograph = replace(photograph, focus_distance_m=phone.focus.focus_distance_m)
     lens = photograph.lens(photo, focus_m) if lens is None else lens_for_photograph(lens, photograph, photo)
-    rough_m = photograph.rough_focus_m if phone is None and focus_m is None else None
+    rough_m = photograph.rough_focus_m if phone is None and focus_m is None and wishes.lens is None else None
     focused = lens if focus_m is None else lens.focused_at(focus_m)
     return HeldLens(focused, blur_from, focus_known=focus_known, view_known=view_known, rough_focus_m=rough_m, white_lux=white_lux)
 
@@ -206,7 +207,9 @@ def _require_no_panorama(photo: Path, photograph: Photograph) -> None:
     """Raise InputError for a panorama that says so (GPano), and warn of a picture that is shaped as one: a lens draws neither."""
     height_px, width_px = photograph.rgb.shape[:2]
     advice = "cut out a part, and say --focal-length and --sensor-width of that"
-    told = jpeg_xmp(photo.read_bytes(), photo) if photo.suffix.lower() in (".jpg", ".jpeg") else {}
+    told = {}
+    with suppress(InputError):  # what is damaged is told where depth is looked for
+        told = jpeg_xmp(photo.read_bytes(), photo) if photo.suffix.lower() in (".jpg", ".jpeg") else {}
     if told.get(_GPANO + "ProjectionType") or told.get(_GPANO + "FullPanoWidthPixels"):
         raise InputError(f"{photo} is a panorama, as its XMP tells (GPano), in which straight lines are bent: {advice}")
     if width_px > _PANORAMIC * height_px and photograph.cut_from_px is None:

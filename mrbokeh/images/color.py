@@ -81,10 +81,8 @@ def plain_srgb_codes(linear: Float32[np.ndarray, "*shape"], dtype: type) -> Shap
 
 @cache
 def _table(dtype: np.dtype) -> tuple[Shaped[np.ndarray, " cells"], Float32[np.ndarray, " codes"], int]:
-    """Return the lookup table of `srgb_codes`: the code of the least value of each cell of floats from 0 to 1, the least value of each
-    code's
-    code's
-    last, and how many codes at most begin within a cell.
+    """Return the lookup table of `srgb_codes`: the code of the least value of each cell of floats from 0 to 1, the least value of
+    each code's last, and how many codes at most begin within a cell.
     """
     top = np.iinfo(dtype).max
     guess = srgb_to_linear(((np.arange(top) + 0.5) / top).astype(np.float32)).view(np.int32)

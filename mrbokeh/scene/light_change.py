@@ -48,8 +48,8 @@ def light_change(
     catcher: shape of the surface (also one that catches shadows). surface: its approximate material; only light that comes from the
     objects depends on its albedo. A MitsubaTracer counts everything: shadows of lights and of the environment, mirror images, colour
     bleeding, emissive objects; it uses its own number of samples. With any other renderer the surface is matte and only light that is
-    taken away counts: the renderer's shadow mask, and the hidden part of the environment; samples: its rays per pixel towards the
-    environment where objects may hide it.
+    taken away counts: by a ray from the middle of a pixel towards each light, and by so many samples of the environment where objects
+    may hide it.
     """
     if isinstance(renderer, MitsubaTracer):
         from mrbokeh.scene.mitsuba.traced_light_change import traced_light_change
@@ -60,8 +60,7 @@ def light_change(
     if not scene.drawn_meshes or not len(pixels):
         nothing = np.zeros((len(pixels), 3), np.float32)
         return changed(seen, pixels, (nothing, nothing, nothing))
-    mask = renderer.render_shadow_mask(scene, camera, catcher).reshape(-1)[pixels] if scene.lighting[0] else None
-    total, taken = _lost(scene, surfaces, centre_m, samples, mask)
+    total, taken = _lost(scene, surfaces, centre_m, samples)
     return changed(seen, pixels, (total, taken, np.zeros_like(taken)))
 
 
@@ -70,7 +69,7 @@ def light_left(
 ) -> Float32[np.ndarray, "pixels 3"]:
     """Return the share of light that remains on a matte surface in the middle of some pixels (row after row), 1 beside the surface.
 
-    It is what `light_change` computes without Mitsuba, by one shadow ray towards each light.
+    It is what `light_change` computes without Mitsuba.
     """
     ratio = np.ones((len(pixels), 3), np.float32)
     surfaces, centre_m, met = _met_surfaces(camera, catcher, pixels)
@@ -81,13 +80,9 @@ def light_left(
 
 
 def _lost(
-    scene: Scene,
-    surfaces: Surfaces,
-    centre_m: Float64[np.ndarray, "3"],
-    samples: int,
-    mask: Float32[np.ndarray, " points"] | None = None,
+    scene: Scene, surfaces: Surfaces, centre_m: Float64[np.ndarray, "3"], samples: int
 ) -> tuple[Float32[np.ndarray, "points 3"], Float32[np.ndarray, "points 3"]]:
-    """Return the radiance of white surfaces before objects came, and what these take of it. mask: share of all lights that arrives."""
+    """Return the radiance of white surfaces before objects came, and what these take of it."""
     lights, environment = scene.lighting
     objects = _Objects(scene.drawn_meshes)
     total, taken = (np.zeros((len(surfaces.alpha), 3), np.float32) for _ in range(2))
@@ -95,9 +90,7 @@ def _lost(
         towards, distance_m, irradiance = light.arriving_at(surfaces.shadow_origin + centre_m)
         arriving = np.maximum((surfaces.normal * towards).sum(-1, keepdims=True), 0.0) * irradiance / np.pi
         total += arriving
-        if mask is not None:
-            taken += arriving * (1.0 - mask[:, None])
-        elif light.casts_shadow:
+        if light.casts_shadow:
             taken += arriving * objects.hidden(surfaces.shadow_origin + centre_m, towards, distance_m)[:, None]
     if environment is not None:
         maps = lighting_maps(environment)

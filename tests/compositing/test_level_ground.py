@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.commands._composite_options import ObjectOptions
-from mrbokeh.commands._level_ground import on_level_ground, with_camera_of_file
+from mrbokeh.commands._level_ground import focused_on_foot, on_level_ground, with_camera_of_file
 from mrbokeh.compositing.plate import Plate, plate_of
 from mrbokeh.optics.lens import Lens
 from mrbokeh.scene.staging.scene_description import looking_down
@@ -43,6 +43,23 @@ def test_the_focus_tells_the_distance_unless_the_camera_would_float() -> None:
     assert place_m(standing)[2] == pytest.approx(12.1)
     _, standing = on_level_ground(photograph(90.0), replace(FOOT, pitch=0.0))  # 17 m
     assert place_m(standing)[2] == pytest.approx(1.5 * plate_focal_px() / 150.0, rel=1e-3)
+
+
+def test_a_rough_focus_gives_way_to_a_camera_in_the_hand() -> None:
+    """A zone of 1.4 m to infinity allows 1.5 m of height, which is 8.1 m away at that pixel; one of 1.4 to 3 m does not."""
+    rough = replace(photograph(5.0), rough_focus_m=(1.4, float("inf")))
+    plate, standing = on_level_ground(rough, replace(FOOT, pitch=0.0))
+    expected_m = 1.5 * rough.camera.focal_px[1] / 150.0
+    assert place_m(standing)[2] == pytest.approx(expected_m)
+    assert plate.lens.focus_distance_m == pytest.approx(expected_m)
+    plate, standing = on_level_ground(replace(rough, rough_focus_m=(1.4, 6.0)), replace(FOOT, pitch=0.0))
+    assert place_m(standing)[2] == plate.lens.focus_distance_m == pytest.approx(5.0)
+
+
+def test_with_depth_the_focus_is_on_the_foot_where_nothing_tells_it() -> None:
+    deep = replace(photograph(), depth_m=np.full((600, 800), 2.5, np.float32), focus_known=False)
+    assert focused_on_foot(deep, FOOT).lens.focus_distance_m == pytest.approx(2.5)
+    assert focused_on_foot(replace(deep, focus_known=True), FOOT).lens.focus_distance_m == float("inf")
 
 
 def plate_focal_px() -> float:

@@ -11,7 +11,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Material, Mesh, Scene, SceneRenderer, Texture, emitter, matte, rectangle, sphere, sun
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.light import neutral_environment
-from mrbokeh.scene.light_change import LEAST_CHANGE, LightChange, light_change
+from mrbokeh.scene.light_change import LEAST_CHANGE, LightChange, light_change, light_left
 from mrbokeh.system.errors import InputError
 from tests.scene.test_scene_backends import DARK, rays
 
@@ -91,6 +91,17 @@ class TestKnownAnswers:
             error = (change.ratio[..., 0] - (1.0 - hidden / arriving))[where]
             assert abs(error.mean()) < 1.5e-3
             assert error.std() < 0.01
+
+    def test_each_light_has_a_shadow_of_its_own_or_none(self) -> None:
+        """Red light from the left and blue from the right, which throws no shadow: only red is lost, and `light_left` agrees."""
+        red, blue = sun((0.6, 1.0, 0.2), (3.0, 0.0, 0.0)), sun((-0.6, 1.0, 0.2), (0.0, 0.0, 3.0))
+        lit = ball(matte(0.0, 0.0, 0.0)).with_lights(red, replace(blue, casts_shadow=False))
+        scene = replace(lit, environment=DARK)
+        change = light_change(EmbreeRaycaster(), scene, CAMERA, FLOOR)
+        assert change.ratio[..., 0].min() == 0.0 and (change.ratio[..., 0] < 0.5).sum() > 100
+        assert change.ratio[..., 2].min() == 1.0
+        alone = light_left(scene, CAMERA, FLOOR, np.arange(120 * 68)).reshape(change.ratio.shape)
+        np.testing.assert_allclose(alone, change.ratio, atol=1e-6)
 
     def test_nothing_to_see_changes_nothing(self, renderer: SceneRenderer) -> None:
         for change in (light_change(renderer, Scene(), CAMERA, FLOOR), light_change(renderer, ball(matte(0, 0, 0)), CAMERA, _behind())):

@@ -8,7 +8,7 @@ from jaxtyping import Float32
 
 from mrbokeh.commands._composite_kept import KeptParts
 from mrbokeh.commands._composite_parts import layers_by
-from mrbokeh.commands._level_ground import on_level_ground, pair_of
+from mrbokeh.commands._level_ground import focused_on_foot, on_level_ground, pair_of
 from mrbokeh.compositing.choose import best_mode, insertion_of
 from mrbokeh.compositing.plate import Plate, phone_photo
 from mrbokeh.layering.pixel_box import Box, is_same_everywhere
@@ -107,6 +107,7 @@ def _standing(whole: WholePhotograph, options: CompositeOptions) -> tuple[Plate,
     if plate.depth_m is None:
         plate, standing = on_level_ground(plate, standing, known_height_m)
     else:
+        plate = plate if standing.plain else focused_on_foot(plate, standing)
         place_m = plate.point_under_pixel_m(*pair_of(standing.at_pixel))
         standing = replace(standing, at=",".join(f"{each:.9g}" for each in place_m), at_pixel=None)
     return plate, renderer, replace(options, standing=standing)

@@ -13,7 +13,7 @@ from jaxtyping import Float32
 
 from mrbokeh.commands._composite_kept import KeptParts
 from mrbokeh.commands._composite_parts import blur_told, held_upright, layers_by, nothing_seen, placing_warning
-from mrbokeh.commands._level_ground import on_level_ground, pair_of
+from mrbokeh.commands._level_ground import focused_on_foot, on_level_ground, pair_of
 from mrbokeh.compositing.choose import best_mode, insertion_of
 from mrbokeh.compositing.ground import with_ground_behind
 from mrbokeh.compositing.plate import Plate
@@ -58,6 +58,8 @@ def preview_of(photograph: OpenedPhotograph, options: CompositeOptions, kept: Ke
         guess(plate.depth_note)
         if plate.depth_m is None and not standing.plain:
             plate, standing = on_level_ground(plate, standing, known_height_m)
+        elif not standing.plain:
+            plate = focused_on_foot(plate, standing)
         plate = held_upright(plate, standing)
         layers_for = layers_by(small.virtual, standing, small.rendering, plate, None, kept)
         mode = "over" if kept.draft and plate.depth_m is not None else best_mode(plate)
@@ -97,7 +99,7 @@ def _finishing(photograph: OpenedPhotograph, plate: Plate, options: CompositeOpt
             photograph.finishings[key] = finishing_of(wanted, plate.rgb, path)
         else:
             is_smaller = plate.rgb.shape[1::-1] != photograph.size_px
-            photograph.finishings[key] = matched_finishing(wanted, plate.rgb, path, is_linear=is_smaller)[0]
+            photograph.finishings[key] = matched_finishing(wanted, plate.rgb, path, uncompressed=is_smaller)[0]
     return photograph.finishings[key]
 
 

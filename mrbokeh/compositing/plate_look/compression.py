@@ -34,12 +34,12 @@ class JpegCompression:
                     return None
                 subsampling = JpegImagePlugin.get_sampling(picture)
                 tables = {number: list(table) for number, table in picture.quantization.items()}
-        except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
+        except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError):
             return None
         return cls(tables, subsampling, stored_orientation(photo)) if subsampling in (0, 1, 2) else None
 
     def compressed(self, inserted: Inserted) -> Inserted:
-        """Return the picture with its virtual part compressed together with the photograph around it; lights above 1 stay.
+        """Return the picture with its virtual part compressed together with the photograph around it; what no code stands for stays.
 
         The photograph's own pixels stay too: they were compressed already.
         """
@@ -55,6 +55,6 @@ class JpegCompression:
         stream = io.BytesIO()
         Image.fromarray(srgb_codes(whole, np.uint8)).save(stream, "JPEG", qtables=self.tables, subsampling=self.subsampling)
         decoded = srgb_to_linear(np.asarray(Image.open(stream), np.float32) / np.float32(255.0))
-        virtual = (alpha[part] > 0.0)[..., None] & (whole <= 1.0)
+        virtual = (alpha[part] > 0.0)[..., None] & (whole >= 0.0) & (whole <= 1.0)
         light[part] = np.where(virtual, decoded - photo[part], light[part])
         return replace(inserted, virtual=replace(inserted.virtual, rgb=changed))

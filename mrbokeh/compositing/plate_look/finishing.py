@@ -177,10 +177,10 @@ def finishing_of(options: LookOptions, plate_rgb: Picture, photo: Path | None = 
     return Finishing(None if colour.is_nothing else colour, vignetting, grain, _light_wrap(options.light_wrap))
 
 
-def matched_finishing(options: LookOptions, plate_rgb: Picture, photo: Path, *, is_linear: bool = False) -> tuple[Finishing, list[str]]:
+def matched_finishing(options: LookOptions, plate_rgb: Picture, photo: Path, *, uncompressed: bool = False) -> tuple[Finishing, list[str]]:
     """Build a Finishing with black, grain and compression as the photograph has them, where the options say nothing of these.
 
-    Also returns the options of what was matched. is_linear: the picture is written in linear light, which is not compressed.
+    Also returns the options of what was matched. uncompressed: leave the compression out, as for linear light.
     What a scene shows can be lighter than black, and textured where it seems to be noise: no black is lifted that is not surely one, and
     grain is never stronger than that of high ISO. So an object in a picture of sand alone gets neither.
     """
@@ -193,7 +193,7 @@ def matched_finishing(options: LookOptions, plate_rgb: Picture, photo: Path, *, 
     if options.grain is None:
         with suppress(InputError):
             finishing = replace(finishing, grain=_at_most(measured_grain(plate_rgb, options.seed)))
-        finishing = replace(finishing, compression=None if is_linear else JpegCompression.of(photo))
+        finishing = replace(finishing, compression=None if uncompressed else JpegCompression.of(photo))
     if options.grain is None and (finishing.compression or (finishing.grain is not None and not finishing.grain.is_nothing)):
         matched.append("--grain")
     return finishing, matched

@@ -93,7 +93,12 @@ def _finer(
     uneven = (cv2.dilate(change.ratio, window) - cv2.erode(change.ratio, window)).max(axis=2) > _UNEVEN
     hidden = cv2.resize(covered.astype(np.uint8), (width_px, height_px), interpolation=cv2.INTER_NEAREST) > 0
     pixels, ratio = np.flatnonzero(uneven & ~hidden), change.ratio.reshape(-1, 3).copy()
-    ratio[pixels] = light_left(scene, camera.resized(width_px, height_px), catcher, pixels, samples)
+    if scene.lighting[0]:
+        twice, (rows, columns) = camera.resized(2 * width_px, 2 * height_px), 2 * np.array(np.divmod(pixels, width_px))
+        places = [(rows + down) * twice.width_px + columns + right for down in (0, 1) for right in (0, 1)]
+        ratio[pixels] = np.mean([light_left(scene, twice, catcher, each, samples // 4 + 1) for each in places], axis=0)
+    else:
+        ratio[pixels] = light_left(scene, camera.resized(width_px, height_px), catcher, pixels, samples)
     return replace(change, ratio=ratio.reshape(change.ratio.shape))
 
 
@@ -177,7 +182,7 @@ class FilmedLayers:
         if self._filming.catches == "shadow":
             return [self._shadow(scene, camera, ShadowCatcher(catcher, shadow.strength))]
         frame = Box(0, camera.height_px, 0, camera.width_px)
-        box = frame if self._filming.backend == "mitsuba" else self._changed_box(scene, camera, catcher)
+        box = frame if self._filming.backend == "mitsuba" else self._changed_box(scene, camera, catcher, objects.alpha)
         if box.is_empty:
             return [clear(camera.height_px, camera.width_px)]
         alpha = np.ascontiguousarray(box.of(objects.alpha))
@@ -186,12 +191,13 @@ class FilmedLayers:
         part = change.evenly().as_layer(np.zeros_like(change.ratio)) if part_rgb is None else change.as_layer(part_rgb)
         return [part if box == frame else box.placed(part, frame.size_px)]
 
-    def _changed_box(self, scene: Scene, camera: Camera, catcher: Mesh) -> Box:
-        """Return the part of the frame in which one sees the light change, looked at in few pixels."""
+    def _changed_box(self, scene: Scene, camera: Camera, catcher: Mesh, alpha: Float32[np.ndarray, "height width"]) -> Box:
+        """Return the part of the frame in which one sees objects of that alpha or the light change, which is looked at in few pixels."""
         frame = Box(0, camera.height_px, 0, camera.width_px)
         few = _at_most(camera, _FEW_PX)
         ratio = light_change(self._renderer, scene, few, catcher, samples=_FEW_SAMPLES).ratio
-        rows, columns = np.nonzero((ratio.min(axis=2) < 1.0 - _UNSEEN) | (self._objects(scene, few).alpha > 0.0))
+        shown = cv2.resize(alpha, (few.width_px, few.height_px), interpolation=cv2.INTER_AREA) > 0.0
+        rows, columns = np.nonzero((ratio.min(axis=2) < 1.0 - _UNSEEN) | shown)
         if not len(rows):
             return Box(0, 0, 0, 0)
         step = camera.width_px / few.width_px
@@ -210,13 +216,11 @@ class FilmedLayers:
             return light_change(self._renderer, scene, camera, catcher, samples=self._filming.samples)
         change = light_change(self._renderer, scene, _at_most(camera, self._filming.change_px), catcher, samples=samples)
         covered = (cv2.dilate(alpha, np.ones((3, 3))) > _COVERS) & (alpha > 0.0)
-        size_px = np.array([camera.height_px, camera.width_px]) * (2 if scene.lighting[0] else 1)
+        size_px = np.array([camera.height_px, camera.width_px])
         while self._filming.finer_change and change.alpha.shape != tuple(size_px):
             change = _finer(change, scene, camera, catcher, covered, np.minimum(2 * np.array(change.alpha.shape), size_px), samples)
-        way = cv2.INTER_AREA if self._filming.finer_change else cv2.INTER_LINEAR
-        ratio = cv2.resize(change.ratio, (camera.width_px, camera.height_px), interpolation=way)
-        ratio = np.minimum(_beside(covered, ratio) + np.float32(_UNSEEN), np.float32(1.0))
-        return replace(change.enlarged(camera.height_px, camera.width_px), ratio=ratio)
+        change = change.enlarged(camera.height_px, camera.width_px)
+        return replace(change, ratio=np.minimum(_beside(covered, change.ratio) + np.float32(_UNSEEN), np.float32(1.0)))
 
     def _shadow(self, scene: Scene, camera: Camera, catcher: ShadowCatcher) -> Layer:
         """Drawn where hard shadows fall; the path tracer's are soft and may fall anywhere."""
