@@ -109,8 +109,8 @@ def composite(
         plate, standing = on_level_ground(plate, standing, known_height_m)
     elif on_ground:
         plate = focused_on_foot(plate, standing)
-    matching = standing.object_ is not None and not standing.plain
-    uncompressed = out.suffix.lower() == ".exr" or result.preview or colour.of_plate is not None or colour.of_result is not None
+    matching = standing.object_ is not None and not standing.plain and out.suffix.lower() != ".exr"
+    uncompressed = result.preview or colour.of_plate is not None or colour.of_result is not None
     finishing = _finishing(photo, plate, look, matching=matching, uncompressed=uncompressed)
     if result.preview:
         plate, standing, scale = smaller(plate, standing)
