@@ -266,6 +266,7 @@ def test_focus_from_the_blur_of_the_board_follows_the_page(folder: Path) -> None
     with opened(ViewfinderOptions("test", tracking=tracking, focus_from=("board",), **files), Access()) as running:
         controls = running.site.controls
         assert controls.state()["focus_from"] is None, "before the first picture"
+        running.pipeline.__exit__()  # while it prepares, it composites in a thread of its own, and one tracker takes frames of one thread
         steps: list[tuple[float, Callable[[], None]]] = [
             (2.8, lambda: None), (5.6, lambda: controls.set_f_number(5.6)), (2.8, lambda: controls.set_lens("lens")),
         ]  # fmt: skip
