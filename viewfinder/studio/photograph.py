@@ -1,18 +1,16 @@
 """OpenedPhotograph: a photograph read once, made smaller for previews, with the lens of any state and the camera that its lines tell."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.commands._composite_parts import held_upright
 from mrbokeh.commands._insertion_options import focused_at_pixel, require_one_focus
 from mrbokeh.commands._level_ground import HIGH_SHARE, on_level_ground, pair_of, usual_tilt_rad, with_camera_of_file
-from mrbokeh.compositing.plate import HeldLens, LensWishes, Plate, held_lens, phone_photo, photograph_plate, with_depth
+from mrbokeh.compositing.plate import HeldLens, LensWishes, Plate, held_lens, phone_photo, photograph_plate, shrunk, with_depth
 from mrbokeh.compositing.plate_look.finishing import Finishing
 from mrbokeh.depth.depth_map import DepthSettings
 from mrbokeh.depth.phone_depth import PhonePhoto
@@ -135,27 +133,6 @@ def whole_plate(path: Path, photograph: Photograph, phone: PhonePhoto | None, de
     """Return the plate of a photograph in all its pixels, with its own depth or that of a file; its lens means nothing yet."""
     whole = photograph_plate(path, photograph, phone, LensWishes(lens=Lens.default()))
     return whole if depth is None else replace(with_depth(whole, depth, DepthSettings()), depth_note="")
-
-
-def shrunk(plate: Plate, width_px: int, height_px: int) -> Plate:
-    """Return the plate with fewer pixels; depth is picked, as a mean of two surfaces is none."""
-    size_px = (width_px, height_px)
-
-    def by(method: int) -> Callable[[np.ndarray | None], np.ndarray | None]:
-        return lambda plane: None if plane is None else np.ascontiguousarray(cv2.resize(plane, size_px, interpolation=method))
-
-    mean, picked = by(cv2.INTER_AREA), by(cv2.INTER_NEAREST)
-    rgb = mean(plate.rgb)
-    assert rgb is not None
-    return replace(
-        plate,
-        rgb=rgb,
-        depth_m=picked(plate.depth_m),
-        camera=plate.camera.resized(*size_px),
-        sharp_rgb=mean(plate.sharp_rgb),
-        near_alpha=mean(plate.near_alpha),
-        alpha=mean(plate.alpha),
-    )
 
 
 def _with_lens(plate: Plate, held: HeldLens) -> Plate:
