@@ -111,6 +111,8 @@ class Watcher:
     def __init__(self, viewer: Viewer, keeps: bool = True, most: int = 400) -> None:
         self.viewer, self.count = viewer, 0
         self._most, self._keeps, self._shown, self._joined = most, keeps, list[tuple[Any, float]](), dict[int, Seen]()
+        self._start = (0, 0)
+        """How many pairs of a picture and a status agreed on it, and the RTP timestamp of the decoder's first picture."""
         self._task = asyncio.create_task(self._take())
 
     async def _take(self) -> None:
@@ -143,12 +145,18 @@ class Watcher:
         return seen
 
     def seen(self) -> list[Seen]:
-        """Joined by the RTP timestamp; the decoder counts from its first picture, so that the start is the one with which most agree."""
+        """Joined by the RTP timestamp; the decoder counts from its first picture, so that its start is what most ever agreed on."""
         shown, statuses = self._shown[-self._most :], self.viewer.statuses()
         starts = Counter((each["rtp_timestamp"] - frame.pts) & 0xFFFFFFFF for each in statuses for frame, _ in shown)
         if not starts:
             return []
-        [(start, _)] = starts.most_common(1)
+        [(start, agreeing)] = starts.most_common(1)
+        if agreeing > self._start[0]:
+            if start != self._start[1]:
+                # Where few pictures are known a wrong start may have as many votes.
+                self._joined.clear()
+            self._start = (agreeing, start)
+        start = self._start[1]
         by_ticks = {(each["rtp_timestamp"] - start) & 0xFFFFFFFF: each for each in statuses}
         for frame, at_s in shown:
             if frame.pts in by_ticks and frame.pts not in self._joined:
