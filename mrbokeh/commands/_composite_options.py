@@ -1,14 +1,14 @@
 """Options of `mrbokeh composite` alone, in groups."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from mrbokeh.commands import _insertion_options as shared
-from mrbokeh.system.errors import InputError
+from mrbokeh.system.errors import InputError, require_file
 from mrbokeh.system.typed_numbers import numbers_in
 
 PhotoArgument = Annotated[
@@ -105,6 +105,11 @@ class ObjectOptions:
         float | None, typer.Option(min=0.0, max=1.0, help="Darkness of the object's shadow; 1, the default, is what its light gives.")
     ] = None
     plain: Annotated[bool, typer.Option("--plain", help="Guess nothing: even light, no shadow, a level camera, no grain.")] = False
+
+    @property
+    def files(self) -> tuple[Path | None, ...]:
+        """Input files of these options."""
+        return (self.object_, self.environment)
 
     def require_meant(self, photo: Path, depth: Path | None, catch: str | None) -> None:
         """Raise InputError, before anything is opened, where options contradict one another or are no numbers of their kind."""
@@ -231,3 +236,84 @@ class ResultOptions:
             raise InputError(
                 "--preview shows where an --object stands: give that, and no --layer, --all-slices, --save-layer or --save-deep"
             )
+
+
+@dataclass(frozen=True)
+class CompositeOptions:
+    """Options of one run of `mrbokeh composite`, in its groups."""
+
+    photo: PhotoArgument
+    taken: PlateOptions = field(default_factory=PlateOptions)
+    virtual: shared.VirtualOptions = field(default_factory=shared.VirtualOptions)
+    standing: ObjectOptions = field(default_factory=ObjectOptions)
+    rendering: RenderingOptions = field(default_factory=RenderingOptions)
+    look: shared.LookGroup = field(default_factory=shared.LookGroup)
+    optics: LensOptions = field(default_factory=LensOptions)
+    facts: shared.LensFacts = field(default_factory=shared.LensFacts)
+    colour: shared.ColourOptions = field(default_factory=shared.ColourOptions)
+    result: ResultOptions = field(default_factory=ResultOptions)
+
+    @property
+    def read(self) -> tuple[Path | None, ...]:
+        """Input files of these options."""
+        of_plate = (self.photo, self.taken.depth, self.taken.rgb, self.taken.matte)
+        return (*of_plate, *self.virtual.files, *self.standing.files, self.rendering.distortion, self.optics.lens)
+
+    @property
+    def guesses_ground(self) -> bool:
+        """Whether an object stands on a pixel of a photograph in a file, and what is not told of that may be guessed."""
+        standing = self.standing
+        return standing.object_ is not None and bool(standing.at_pixel) and not self.photo.is_dir() and not standing.plain
+
+    def require_meant(self, out: Path) -> None:
+        """Raise InputError, before anything is opened, where options contradict one another, or a file that is needed is missing."""
+        taken, virtual, standing = self.taken, self.virtual, self.standing
+        if taken.all_slices:
+            self._require_options_of_stacks()
+        standing.require_meant(self.photo, taken.depth, self.rendering.catch)
+        shared.require_one_focus(focus=self.optics.focus, focus_at=self.optics.focus_at)
+        if standing.object_ is not None:
+            require_file(standing.object_, "a GLB file")
+        self.result.require_meant(out, only_object=standing.object_ is not None and not virtual.layer, all_slices=taken.all_slices)
+        if virtual.camera is not None and virtual.scene is None and standing.object_ is None:
+            raise InputError(f"--camera {virtual.camera} is for a --scene or an --object: give one, or leave it out")
+
+    def _require_options_of_stacks(self) -> None:
+        """Raise InputError if an option is given that is of one picture, and that --all-slices would not follow."""
+        one_picture = (
+            (self.taken, ("slice_", "depth", "rgb", "disparity", "depth_scale", "matte", "near_distance")),
+            (self.optics, ("focus", "focus_at")),
+            (self.look, tuple(vars(self.look))),
+            (self.colour, ("input_space", "output_space")),
+            (self.result, ("save_layer", "save_deep")),
+        )
+        given = [name for group, names in one_picture for name in names if getattr(group, name) != getattr(type(group)(), name)]
+        if given:
+            told = ", ".join(f"--{name.rstrip('_').replace('_', '-')}" for name in given)
+            raise InputError(
+                f"--all-slices writes every slice with the stack's own depth, focus and colours, but got {told}, of one picture: "
+                f"leave that out, or leave --all-slices out and choose a --slice"
+            )
+
+    def scaled(self, whole_px: tuple[int, int], small_px: tuple[int, int]) -> "CompositeOptions":
+        """Return the options for the photograph made smaller, by its width and height before and after: all that counts pixels follows."""
+        if whole_px == small_px:
+            return self
+        height = self.standing.height
+        if height is not None and height.endswith("px"):
+            height = f"{small_px[1] / whole_px[1] * typed_height(height)[0]:.9g}px"
+        standing = replace(self.standing, at_pixel=_scaled(self.standing.at_pixel, whole_px, small_px), height=height)
+        focus_at = _scaled(self.optics.focus_at, whole_px, small_px)
+        focus_at = focus_at and ",".join(str(int(float(each))) for each in focus_at.split(","))
+        return replace(self, standing=standing, optics=replace(self.optics, focus_at=focus_at))
+
+
+_INSIDE = 1e-3
+
+
+def _scaled(pair: str | None, whole_px: tuple[int, int], small_px: tuple[int, int]) -> str | None:
+    """Return a pixel of the whole as that of the small picture, within it."""
+    if pair is None:
+        return None
+    places = zip(pair.split(","), whole_px, small_px, strict=False)
+    return ",".join(f"{min(float(each) * small / whole, small - _INSIDE):.9g}" for each, whole, small in places)

@@ -23,7 +23,7 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
 
     @wraps(command)
     def with_options(**given: Any) -> None:
-        whole = {name: group(**{each.name: given.pop(each.name) for each in fields(group)}) for name, group in groups.items()}
+        whole = {name: _group_of(group, given) for name, group in groups.items()}
         command(**given, **whole)
 
     shown: list[Parameter] = []
@@ -35,9 +35,24 @@ def grouped(command: Callable[..., None]) -> Callable[..., None]:
     return with_options
 
 
-def _options_of(group: type) -> list[Parameter]:
+def _group_of(group: type, given: dict[str, Any]) -> Any:
+    """Return a group, and groups within it, of what is given, which is taken out of there."""
     hints = get_type_hints(group, include_extras=True)
-    return [Parameter(each.name, Parameter.KEYWORD_ONLY, default=_default(each), annotation=hints[each.name]) for each in fields(group)]
+    values = {
+        each.name: _group_of(hints[each.name], given) if is_dataclass(hints[each.name]) else given.pop(each.name) for each in fields(group)
+    }
+    return group(**values)
+
+
+def _options_of(group: type) -> list[Parameter]:
+    """Return the options of a group, and of groups within it, in their order."""
+    hints = get_type_hints(group, include_extras=True)
+    shown: list[Parameter] = []
+    for each in fields(group):
+        hint = hints[each.name]
+        one = Parameter(each.name, Parameter.KEYWORD_ONLY, default=_default(each), annotation=hint)
+        shown += _options_of(hint) if isinstance(hint, type) and is_dataclass(hint) else [one]
+    return shown
 
 
 def _default(option: "Field[Any]") -> Any:

@@ -2,14 +2,13 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from mrbokeh.commands._composite_options import ObjectOptions
+from mrbokeh.commands._composite_options import CompositeOptions
 from mrbokeh.commands._level_ground import pair_of
 from mrbokeh.compositing.plate import Inserted, Plate, shrunk
 from mrbokeh.images.color import srgb_codes
@@ -25,22 +24,16 @@ _GRID, _BOX, _INK, _PAPER, _GRID_SHARE = (255, 225, 40), (60, 230, 255), (255, 2
 _BAR_PX, _FONT, _FONT_SCALE = 24, cv2.FONT_HERSHEY_SIMPLEX, 0.5
 
 
-def smaller(plate: Plate, standing: ObjectOptions) -> tuple[Plate, ObjectOptions, float]:
+def smaller(plate: Plate, options: CompositeOptions) -> tuple[Plate, CompositeOptions, float]:
     """Return the plate with at most 1000 px along its longer side, the options in its pixels, and how many of them one pixel was."""
     height_px, width_px = plate.rgb.shape[:2]
     scale = min(1.0, _LONGEST_PX / max(height_px, width_px))
+    if options.standing.at_pixel is not None:
+        plate.require_pixel(*pair_of(options.standing.at_pixel))
     if scale == 1.0:
-        return plate, standing, 1.0
+        return plate, options, 1.0
     small_px = (max(1, round(scale * width_px)), max(1, round(scale * height_px)))
-    pixel = None
-    if standing.at_pixel is not None:
-        plate.require_pixel(*pair_of(standing.at_pixel))
-        x_px, y_px = np.multiply(pair_of(standing.at_pixel), small_px) / (width_px, height_px)
-        pixel = f"{x_px:.9g},{y_px:.9g}"
-    height = standing.height
-    if height is not None and height.endswith("px"):
-        height = f"{scale * float(height.removesuffix('px')):.9g}px"
-    return shrunk(plate, *small_px), replace(standing, at_pixel=pixel, height=height), scale
+    return shrunk(plate, *small_px), options.scaled((width_px, height_px), small_px), scale
 
 
 def write_preview_of(out: Path, inserted: Inserted, plate: Plate, objects: Layer, scale: float) -> str:

@@ -77,9 +77,8 @@ def composite(
 
     >>> picture = mrbokeh.composite("scene/desk", "cake.glb", slice_index=2, at_pixel=(600, 420), height="120px")
     """
-    from mrbokeh.commands._composite_options import ObjectOptions, RenderingOptions
-    from mrbokeh.commands._composite_parts import held_upright, layers_by, standing_on_pixel
-    from mrbokeh.commands._insertion_options import VirtualOptions
+    from mrbokeh.commands._composite_layers import held_upright, layers_by, standing_on_pixel
+    from mrbokeh.commands._composite_options import CompositeOptions, ObjectOptions
     from mrbokeh.compositing.choose import best_mode, insertion_of
     from mrbokeh.compositing.ground import with_ground_behind
     from mrbokeh.compositing.plate import open_plate, plate_of, with_depth
@@ -108,7 +107,7 @@ def composite(
     if len(given) == 1 and not isinstance(given[0], Layer) and Path(given[0]).suffix.lower() == ".glb":
         stands = None if at_pixel is None else f"{at_pixel[0]},{at_pixel[1]}"
         standing = ObjectOptions(object_=Path(given[0]), at_pixel=stands, height=None if height is None else str(height))
-        layers = layers_by(VirtualOptions(), standing, RenderingOptions(), held_upright(plate, standing), None)(plate)
+        layers = layers_by(CompositeOptions(Path(), standing=standing), held_upright(plate, standing))(plate)
     else:
         layers = [each if isinstance(each, Layer) else read_layer(each) for each in given]
         layers = layers if at_pixel is None else standing_on_pixel(layers, plate, *at_pixel)

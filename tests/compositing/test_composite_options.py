@@ -10,9 +10,9 @@ import pytest
 from typer.testing import CliRunner
 
 from mrbokeh import composite
-from mrbokeh.commands._composite_options import PlateOptions
-from mrbokeh.commands._composite_parts import placing_warning, plate_by
-from mrbokeh.commands._insertion_options import ColourOptions
+from mrbokeh.commands._composite_options import CompositeOptions, PlateOptions
+from mrbokeh.commands._composite_parts import plate_by
+from mrbokeh.commands._composited import placing_warning
 from mrbokeh.commands.composite import app
 from mrbokeh.compositing.choose import best_mode, insertion_of
 from mrbokeh.compositing.ground import ended_shadow, with_ground_behind
@@ -98,7 +98,7 @@ def test_a_sharp_picture_of_the_photograph_gives_what_stands_behind_the_near_edg
 
 def test_a_phones_photograph_brings_its_depth_and_its_sharp_original(shared_data: Path) -> None:
     path = shared_data / "rgbd" / "phone_lens_blur_gdepth.jpg"
-    phone, plate = read_phone_photo(path), plate_by(path, PlateOptions(), ColourOptions(), None, lens=None, focus_m=None, facts={})
+    phone, plate = read_phone_photo(path), plate_by(CompositeOptions(path), None, lens=None, focus_m=None)
     assert (
         phone is not None
         and phone.focus is not None
@@ -349,7 +349,7 @@ def test_metres_of_depth_without_a_unit_are_doubted(shared_data: Path, tmp_path:
     """Lens Blur's depth goes from 12.42 to 390.6 of no unit, in which a cake of 0.1 is a speck."""
     path = shared_data / "rgbd" / "phone_lens_blur_gdepth.jpg"
     assert open_plate(path).metres_guessed
-    told = plate_by(path, PlateOptions(disparity="0.5:4"), ColourOptions(), None, lens=None, focus_m=None, facts={})
+    told = plate_by(CompositeOptions(path, PlateOptions(disparity="0.5:4")), None, lens=None, focus_m=None)
     assert not told.metres_guessed
     words = ("--object", CAKE, "--at-pixel", "380,700", "--height", "0.1", "--out", tmp_path / "out.png")
     assert "--height 0.1 counts metres, but those of the photograph's depth are guessed" in mrbokeh("composite", path, *words).stderr

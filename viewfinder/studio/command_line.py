@@ -1,49 +1,17 @@
-"""Options of a state in the groups of `mrbokeh composite`, the command line that says the same, and the same for a smaller picture."""
+"""Options of a state in the groups of `mrbokeh composite`, and the command line that says the same."""
 
 import math
 import os
 import shlex
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
-from mrbokeh.commands._composite_options import LensOptions, ObjectOptions, PlateOptions, RenderingOptions, ResultOptions
-from mrbokeh.commands._insertion_options import ColourOptions, LensFacts, LookGroup, VirtualOptions
+from mrbokeh.commands._composite_options import CompositeOptions, LensOptions, ObjectOptions, PlateOptions
+from mrbokeh.commands._insertion_options import LensFacts, LookGroup, VirtualOptions
 from mrbokeh.system.errors import InputError
 from viewfinder.studio.state import StudioState
-
-Size = tuple[int, int]
-
-_INSIDE = 1e-3
-
-
-@dataclass(frozen=True)
-class CompositeOptions:
-    """Options of one run of `mrbokeh composite`, in its own groups."""
-
-    photo: Path
-    taken: PlateOptions = field(default_factory=PlateOptions)
-    virtual: VirtualOptions = field(default_factory=VirtualOptions)
-    standing: ObjectOptions = field(default_factory=ObjectOptions)
-    rendering: RenderingOptions = field(default_factory=RenderingOptions)
-    look: LookGroup = field(default_factory=LookGroup)
-    optics: LensOptions = field(default_factory=LensOptions)
-    facts: LensFacts = field(default_factory=LensFacts)
-    colour: ColourOptions = field(default_factory=ColourOptions)
-    result: ResultOptions = field(default_factory=ResultOptions)
-
-    def scaled(self, whole_px: Size, small_px: Size) -> "CompositeOptions":
-        """Return the options for the photograph made smaller, by its width and height before and after: all that counts pixels follows."""
-        if whole_px == small_px:
-            return self
-        height = self.standing.height
-        if height is not None and height.endswith("px"):
-            height = f"{small_px[1] / whole_px[1] * float(height.removesuffix('px')):.9g}px"
-        standing = replace(self.standing, at_pixel=_scaled(self.standing.at_pixel, whole_px, small_px), height=height)
-        focus_at = _scaled(self.optics.focus_at, whole_px, small_px)
-        focus_at = focus_at and ",".join(str(int(float(each))) for each in focus_at.split(","))
-        return replace(self, standing=standing, optics=replace(self.optics, focus_at=focus_at))
 
 
 def options_of(state: StudioState) -> CompositeOptions:
@@ -122,14 +90,6 @@ def _file(path: Path) -> str:
 
 def _numbers(values: tuple[float, ...]) -> str:
     return ",".join(f"{each:.9g}" for each in values)
-
-
-def _scaled(pair: str | None, whole_px: Size, small_px: Size) -> str | None:
-    """Return a pixel of the whole as that of the small picture, within it."""
-    if pair is None:
-        return None
-    places = zip(pair.split(","), whole_px, small_px, strict=True)
-    return _numbers(tuple(min(float(each) * small / whole, small - _INSIDE) for each, whole, small in places))
 
 
 def preview_scale(width_px: int, height_px: int, most_px: float) -> float:

@@ -7,16 +7,16 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.commands._composite_kept import KeptParts
-from mrbokeh.commands._composite_parts import layers_by
-from mrbokeh.commands._level_ground import focused_on_foot, on_level_ground, pair_of
-from mrbokeh.compositing.choose import best_mode, insertion_of
+from mrbokeh.commands._composite_options import CompositeOptions
+from mrbokeh.commands._composited import composited, placed
+from mrbokeh.commands._level_ground import pair_of
 from mrbokeh.compositing.plate import Plate, phone_photo
+from mrbokeh.compositing.plate_look.finishing import Finishing
 from mrbokeh.layering.pixel_box import Box, is_same_everywhere
 from mrbokeh.optics.camera import camera_of_lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.stacks.photograph import read_photograph
 from mrbokeh.system.channel import apart
-from viewfinder.studio.command_line import CompositeOptions
 from viewfinder.studio.photograph import OpenedPhotograph, whole_plate
 
 _MOST_MARGIN_PX, _SPARE_PX = 300, 8
@@ -84,8 +84,7 @@ def region_of(whole: WholePhotograph, options: CompositeOptions, kept: KeptParts
         camera=box.camera_of(plate.camera),
     )
     with apart():
-        layers = layers_by(options.virtual, options.standing, options.rendering, part, None, kept)(part)
-        light = insertion_of(best_mode(part)).insert(part, layers, renderer).rgb
+        light = composited(part, options, renderer, Finishing(), kept=kept).inserted.rgb
     wanted = seen.within((height_px, width_px))
     inner = light[wanted.top - box.top : wanted.bottom - box.top, wanted.left - box.left : wanted.right - box.left]
     shown[wanted.top - seen.top : wanted.bottom - seen.top, wanted.left - seen.left : wanted.right - seen.left] = inner
@@ -103,11 +102,9 @@ def _standing(whole: WholePhotograph, options: CompositeOptions) -> tuple[Plate,
         focus_known=small.focus_known,
         view_known=small.view_known,
     )
+    plate, options = placed(plate, options, known_height_m)
     standing = options.standing
-    if plate.depth_m is None:
-        plate, standing = on_level_ground(plate, standing, known_height_m)
-    else:
-        plate = plate if standing.plain else focused_on_foot(plate, standing)
+    if standing.at_pixel:
         place_m = plate.point_under_pixel_m(*pair_of(standing.at_pixel))
         standing = replace(standing, at=",".join(f"{each:.9g}" for each in place_m), at_pixel=None)
     return plate, renderer, replace(options, standing=standing)

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.commands._composite_parts import held_upright
+from mrbokeh.commands._composite_layers import held_upright
+from mrbokeh.commands._composite_options import CompositeOptions
 from mrbokeh.commands._insertion_options import focused_at_pixel, require_one_focus
 from mrbokeh.commands._level_ground import HIGH_SHARE, on_level_ground, pair_of, usual_tilt_rad, with_camera_of_file
 from mrbokeh.compositing.plate import HeldLens, LensWishes, Plate, held_lens, phone_photo, photograph_plate, shrunk, with_depth
@@ -24,7 +25,7 @@ from mrbokeh.solving.solve_camera import solve_camera
 from mrbokeh.solving.solved_camera import SolvedCamera
 from mrbokeh.stacks.photograph import Photograph, read_photograph
 from mrbokeh.system.errors import InputError
-from viewfinder.studio.command_line import CompositeOptions, options_of, preview_scale
+from viewfinder.studio.command_line import options_of, preview_scale
 from viewfinder.studio.state import StudioState
 
 MOST_PX = 1e6

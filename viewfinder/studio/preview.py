@@ -3,7 +3,7 @@
 import logging
 import time
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from threading import Condition, Thread
 from typing import Any
 
@@ -12,17 +12,15 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.commands._composite_kept import KeptParts
-from mrbokeh.commands._composite_parts import blur_told, held_upright, layers_by, nothing_seen, placing_warning
-from mrbokeh.commands._level_ground import focused_on_foot, on_level_ground, pair_of
-from mrbokeh.compositing.choose import best_mode, insertion_of
-from mrbokeh.compositing.ground import with_ground_behind
+from mrbokeh.commands._composite_options import CompositeOptions
+from mrbokeh.commands._composite_parts import blur_told
+from mrbokeh.commands._composited import composited, placed
 from mrbokeh.compositing.plate import Plate
-from mrbokeh.compositing.plate_look.finishing import Finishing, finished, finishing_of, matched_finishing
+from mrbokeh.compositing.plate_look.finishing import Finishing, finishing_of, matched_finishing
 from mrbokeh.images.color import srgb_codes
 from mrbokeh.images.layer import Layer
-from mrbokeh.system.channel import apart, guess, warn
+from mrbokeh.system.channel import apart
 from mrbokeh.system.errors import InputError
-from viewfinder.studio.command_line import CompositeOptions
 from viewfinder.studio.loupe import Region, WholePhotograph, region_of
 from viewfinder.studio.photograph import MOST_PX, OpenedPhotograph
 
@@ -51,27 +49,13 @@ def preview_of(photograph: OpenedPhotograph, options: CompositeOptions, kept: Ke
     with apart() as words:
         plate, renderer, known_height_m = photograph.upright(options, most_px)
         small = photograph.small(options, most_px)
-        standing = small.standing
-        standing.require_meant(photograph.path, small.taken.depth, small.rendering.catch)
-        if plate.depth_m is not None:
-            standing.require_no_depth()
-        guess(plate.depth_note)
-        if plate.depth_m is None and not standing.plain:
-            plate, standing = on_level_ground(plate, standing, known_height_m)
-        elif not standing.plain:
-            plate = focused_on_foot(plate, standing)
-        plate = held_upright(plate, standing)
-        layers_for = layers_by(small.virtual, standing, small.rendering, plate, None, kept)
-        mode = "over" if kept.draft and plate.depth_m is not None else best_mode(plate)
+        small.standing.require_meant(photograph.path, small.taken.depth, small.rendering.catch)
+        plate, small = placed(plate, small, known_height_m)
+        if kept.draft and plate.depth_m is not None:
+            small = replace(small, virtual=replace(small.virtual, mode="over"))
         finishing = Finishing() if kept.draft else _finishing(photograph, plate, small)
-        sharp = layers_for(plate)
-        if not any((layer.alpha > 0).any() for layer in sharp):
-            nothing_seen(options.standing, small.virtual)
-        if standing.at_pixel:
-            plate = with_ground_behind(plate, pair_of(standing.at_pixel), sharp)
-        if warning := placing_warning(sharp, plate, mode, options.standing.height):
-            warn(warning)
-        inserted = finished(insertion_of(mode).insert(plate, sharp, renderer), plate, finishing)
+        made = composited(plate, small, renderer, finishing, kept=kept, asked=options.standing)
+        plate, sharp = made.plate, made.sharp
         blur, _known, figures = blur_told(plate, sharp)
         told = {
             "box": _box(sharp[0]),
@@ -82,7 +66,7 @@ def preview_of(photograph: OpenedPhotograph, options: CompositeOptions, kept: Ke
             "guessed": list(words.guessed),
             "warnings": list(dict.fromkeys(words.warnings)),
         }
-    return Preview(inserted.rgb, told)
+    return Preview(made.inserted.rgb, told)
 
 
 def _finishing(photograph: OpenedPhotograph, plate: Plate, options: CompositeOptions) -> Finishing:

@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mrbokeh.commands._composite_options import CompositeOptions
 from mrbokeh.system.errors import InputError
-from viewfinder.studio.command_line import CompositeOptions, command_line, words_of
+from viewfinder.studio.command_line import command_line, words_of
 
 FORMATS = {"png": ".png", "jpeg": ".jpg", "tiff": ".tif", "exr": ".exr"}
 """Suffixes by the names of formats on the page: PNG and TIFF have 16 bits, EXR is linear and holds all layers."""

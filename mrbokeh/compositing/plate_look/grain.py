@@ -49,14 +49,14 @@ def grain_texture(correlation: Correlation, seed: int) -> Float32[np.ndarray, "s
     """Filter white noise by the root of the spectrum that belongs to the correlation (Wiener-Khinchin); mean 0, variance 1."""
     kernels = np.fft.irfft2(_root_of_spectrum(correlation), (_GRID_PX, _GRID_PX), axes=(0, 1))
     noise = np.random.default_rng(seed).standard_normal((SIDE_PX, SIDE_PX, 3), np.float32)
-    drawn = np.fft.rfft2(noise, axes=(0, 1))
-    mixed = np.zeros_like(drawn)
+    drawn = np.fft.rfft2(np.ascontiguousarray(noise.transpose(2, 0, 1)))
+    mixed, turns = np.zeros_like(drawn), _turns()
     for i, j in np.ndindex(3, 3):
-        mixed[..., i] += np.fft.rfft2(_placed(kernels[..., i, j])) * drawn[..., j]
-    texture = np.fft.irfft2(mixed, (SIDE_PX, SIDE_PX), axes=(0, 1))
-    texture -= texture.mean(axis=(0, 1))
-    deviation = texture.std(axis=(0, 1))
-    return (texture / np.where(deviation > 0.0, deviation, 1.0)).astype(np.float32)
+        mixed[i] += (turns @ kernels[..., i, j].astype(np.complex64) @ turns[: SIDE_PX // 2 + 1].T) * drawn[j]
+    texture = np.fft.irfft2(mixed, (SIDE_PX, SIDE_PX)).astype(np.float32)
+    texture -= texture.mean(axis=(1, 2), keepdims=True, dtype=np.float64).astype(np.float32)
+    deviation = texture.std(axis=(1, 2), keepdims=True, dtype=np.float64).astype(np.float32)
+    return np.ascontiguousarray((texture / np.where(deviation > 0.0, deviation, 1.0)).transpose(1, 2, 0))
 
 
 def _root_of_spectrum(correlation: Correlation) -> Complex128[np.ndarray, "rows columns 3 3"]:
@@ -70,13 +70,10 @@ def _root_of_spectrum(correlation: Correlation) -> Complex128[np.ndarray, "rows 
     return (vectors * np.sqrt(np.maximum(values, 0.0))[..., None, :]) @ vectors.conj().swapaxes(2, 3)
 
 
-def _placed(kernel: np.ndarray) -> np.ndarray:
-    """A kernel about pixel (0, 0), on the side of the texture."""
-    half = _GRID_PX // 2
-    places = np.arange(-half, half)
-    whole = np.zeros((SIDE_PX, SIDE_PX))
-    whole[np.ix_(places, places)] = kernel[np.ix_(places, places)]
-    return whole
+def _turns() -> np.ndarray:
+    """Return what brings a small kernel about pixel (0, 0) to the spectrum of a texture, along one side."""
+    places = np.arange(_GRID_PX) - _GRID_PX * (np.arange(_GRID_PX) >= _GRID_PX // 2)
+    return np.exp(-2j * np.pi / SIDE_PX * np.outer(np.arange(SIDE_PX), places)).astype(np.complex64)
 
 
 @dataclass(frozen=True)

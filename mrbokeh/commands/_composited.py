@@ -1,0 +1,129 @@
+"""One picture of `mrbokeh composite` from an opened plate: the camera held, the object placed, all put in and finished."""
+
+from collections.abc import Sequence
+from contextlib import nullcontext
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mrbokeh.commands._composite_layers import held_upright, layers_by
+from mrbokeh.commands._composite_options import CompositeOptions, ObjectOptions
+from mrbokeh.commands._insertion_options import VirtualOptions
+from mrbokeh.commands._level_ground import focused_on_foot, on_level_ground, pair_of
+from mrbokeh.compositing.choose import best_mode, insertion_of
+from mrbokeh.compositing.ground import with_ground_behind
+from mrbokeh.compositing.near_and_far import nearer_than
+from mrbokeh.compositing.plate import Inserted, Insertion, Plate
+from mrbokeh.compositing.plate_look.finishing import Finishing, finished
+from mrbokeh.images.layer import Layer
+from mrbokeh.renderers.base import Renderer
+from mrbokeh.stacks.capture_bundle import CaptureBundle
+from mrbokeh.system.channel import guess, warn
+from mrbokeh.system.console import working
+from mrbokeh.system.errors import InputError
+
+if TYPE_CHECKING:
+    from mrbokeh.commands._composite_kept import KeptParts
+
+_NEARER, _MUCH_HIDDEN = 0.03, 0.4
+
+
+@dataclass(frozen=True)
+class Composited:
+    """The picture, its plate, its sharp layers, front first, and the mode by which they went in."""
+
+    inserted: Inserted
+    plate: Plate
+    sharp: list[Layer]
+    mode: str
+
+
+def placed(plate: Plate, options: CompositeOptions, known_height_m: float | None = None) -> tuple[Plate, CompositeOptions]:
+    """Return the plate held as its camera was, with its focus, and the options with the object's place: told, solved or guessed.
+
+    known_height_m: of the camera above the ground. Raises InputError for a pixel that shows no ground.
+    """
+    standing = options.standing
+    if plate.depth_m is not None:
+        standing.require_no_depth()
+    guess(plate.depth_note)
+    if options.guesses_ground and plate.depth_m is None:
+        plate, standing = on_level_ground(plate, standing, known_height_m)
+    elif options.guesses_ground:
+        plate = focused_on_foot(plate, standing)
+    if standing.object_ is not None:
+        plate = held_upright(plate, standing)
+    return plate, replace(options, standing=standing)
+
+
+def composited(
+    plate: Plate,
+    options: CompositeOptions,
+    renderer: Renderer,
+    finishing: Finishing,
+    *,
+    bundle: CaptureBundle | None = None,
+    kept: "KeptParts | None" = None,
+    asked: ObjectOptions | None = None,
+) -> Composited:
+    """Put what the options name into a plate of `placed`. kept: parts of earlier pictures.
+
+    asked: how the object was to stand, for what is said where it cannot be seen or is of no likely size; None says nothing, as of a part
+    of a picture. Raises InputError if nothing is seen.
+    """
+    mode, insertion = insertion_by(options, plate)
+    sharp = layers_by(options, plate, bundle, kept)(plate)
+    if asked is not None and not any((layer.alpha > 0).any() for layer in sharp):
+        _nothing_seen(asked, options.virtual)
+    if options.standing.at_pixel:
+        plate = with_ground_behind(plate, pair_of(options.standing.at_pixel), sharp)
+    if asked is not None and asked.object_ is not None and (warning := placing_warning(sharp, plate, mode, asked.height)):
+        warn(warning)
+    with nullcontext() if kept else working("blurring"):
+        inserted = finished(insertion.insert(plate, sharp, renderer), plate, finishing)
+    return Composited(inserted, plate, sharp, mode)
+
+
+def insertion_by(options: CompositeOptions, plate: Plate) -> tuple[str, Insertion]:
+    """Return the mode of the options, or the best that what is known of the plate allows, and its insertion."""
+    mode = options.virtual.mode or best_mode(plate)
+    return mode, insertion_of(mode, options.taken.near_distance, exact_depth=options.taken.exact_depth)
+
+
+def _nothing_seen(standing: ObjectOptions, virtual: VirtualOptions) -> None:
+    """Raise InputError if what was rendered is not in the picture; an empty layer of another program is only warned of."""
+    if standing.object_ is not None:
+        where = f"--at-pixel {standing.at_pixel}" if standing.at_pixel else f"--at {standing.at}"
+        raise InputError(
+            f"nothing of {standing.object_} is in the picture: by {where} it stands beside the frame or is too small to be seen; choose "
+            f"another place with --at X,Y,Z (metres right, down, forward of the lens) or --at-pixel X,Y, or another --height"
+        )
+    if virtual.scene is not None:
+        raise InputError(f"nothing of {virtual.scene} is in the picture: its objects are beside the frame or behind the --camera")
+    warn("nothing of the layers is in the picture: their alpha is 0 everywhere")
+
+
+def placing_warning(sharp: Sequence[Layer], plate: Plate, mode: str, height: str | None) -> str | None:
+    """Return a warning if an object is smaller than a pixel, reaches across the whole picture, or is mostly hidden; None else.
+
+    height: the option --height as typed, which mends the first two.
+    """
+    alpha = np.maximum.reduce([layer.alpha for layer in sharp])
+    rows, columns = np.nonzero(alpha > 0.5)
+    unit = "its file may count in another unit: say --height METRES, or such as --height 200px"
+    mend = f"--height {height} may be wrong" if height else unit
+    if not alpha.any():
+        return None
+    if max(float(layer.alpha.sum()) for layer in sharp) < 1.0:
+        return f"what is put in is smaller than a pixel; {mend}"
+    whole = len(rows) and (np.ptp(rows) + 1, np.ptp(columns) + 1) == alpha.shape
+    if whole:
+        return f"what is put in reaches across the whole picture; {mend}"
+    if plate.depth_m is None or mode == "front":
+        return None
+    depth_m = np.minimum.reduce([np.where(layer.alpha > 0.5, layer.depth_m, np.inf) for layer in sharp])
+    hidden = float(nearer_than(plate.depth_m, depth_m, _NEARER).sum() / max(1, np.isfinite(depth_m).sum()))
+    if hidden < _MUCH_HIDDEN:
+        return None
+    return f"{hidden:.0%} of it lies behind what the depth says is nearer; --mode front ignores depth"
