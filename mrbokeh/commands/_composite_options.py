@@ -100,6 +100,14 @@ class ObjectOptions:
             "such as -60,40.",
         ),
     ] = None
+    sun_by: Annotated[
+        str | None,
+        typer.Option(
+            metavar="TOP:FOOT:TIP",
+            help="The same by a shadow on level ground: pixels X,Y of the top and the foot of something upright, and of the tip of its "
+            "shadow, such as 410,120:405,520:630,560.",
+        ),
+    ] = None
     exposure: Annotated[float, typer.Option(min=0.0, help="Factor on the object's light.")] = 1.0
     shadow: Annotated[
         float | None, typer.Option(min=0.0, max=1.0, help="Darkness of the object's shadow; 1, the default, is what its light gives.")
@@ -117,17 +125,21 @@ class ObjectOptions:
             raise InputError("--at and --at-pixel both say where the object stands: give one of them")
         if self.object_ is not None and not self.at and not self.at_pixel:
             raise InputError("where does the object stand? Give --at X,Y,Z in metres, or --at-pixel X,Y")
-        for given, typed in ((self.at, typed_place_m), (self.at_pixel, typed_pixel), (self.sun, typed_sun), (self.height, typed_height)):
+        of_place = ((self.at, typed_place_m), (self.at_pixel, typed_pixel), (self.height, typed_height))
+        for given, typed in (*of_place, (self.sun, typed_sun), (self.sun_by, typed_shadow)):
             if given is not None:
                 typed(given)
-        if self.sun and self.environment:
+        if self.sun and self.sun_by:
+            raise InputError("--sun and --sun-by both say where the main light comes from: give one of them")
+        told = f"--sun {self.sun}" if self.sun else f"--sun-by {self.sun_by}" if self.sun_by else ""
+        if told and self.environment:
             raise InputError(
-                f"--sun {self.sun} is a light beside what the photograph tells, which --environment replaces: a panorama has its own sun, "
-                f"so leave one of them out"
+                f"{told} is a light beside what the photograph tells, which --environment replaces: a panorama has its own sun, so leave "
+                f"one of them out"
             )
-        if self.sun and self.plain:
-            raise InputError(f"--sun {self.sun} needs the light that --plain leaves out: leave one of them out")
-        if self.object_ is not None and catch == "shadow" and not (self.plain or self.sun or self.environment):
+        if told and self.plain:
+            raise InputError(f"{told} needs the light that --plain leaves out: leave one of them out")
+        if self.object_ is not None and catch == "shadow" and not (self.plain or told or self.environment):
             raise InputError(
                 "--catch shadow shows shadows of lights, and the photograph tells of none: say where one is with --sun RIGHT,ABOVE"
             )
@@ -169,6 +181,15 @@ def typed_sun(text: str) -> tuple[float, float]:
     if not 0.0 < above_deg <= 90.0 or abs(right_deg) > 360.0:
         raise InputError(f"--sun: expected a light within a turn, above 0 and up to 90 degrees over the horizon, got {text!r}")
     return right_deg, above_deg
+
+
+def typed_shadow(text: str) -> tuple[tuple[float, float], ...]:
+    """Return three pixels of --sun-by: top, foot, and tip of the shadow."""
+    words = "--sun-by expects three pixels X,Y with colons between, such as 410,120:405,520:630,560"
+    pixels = [numbers_in(each, words, (2,)) for each in text.split(":")]
+    if len(pixels) != 3:
+        raise InputError(f"{words}, got {text!r}")
+    return tuple((x_px, y_px) for x_px, y_px in pixels)
 
 
 def typed_height(text: str) -> tuple[float, bool]:
@@ -302,7 +323,9 @@ class CompositeOptions:
         height = self.standing.height
         if height is not None and height.endswith("px"):
             height = f"{small_px[1] / whole_px[1] * typed_height(height)[0]:.9g}px"
-        standing = replace(self.standing, at_pixel=_scaled(self.standing.at_pixel, whole_px, small_px), height=height)
+        at_pixel, sun_by = _scaled(self.standing.at_pixel, whole_px, small_px), self.standing.sun_by
+        sun_by = sun_by and ":".join(str(_scaled(each, whole_px, small_px)) for each in sun_by.split(":"))
+        standing = replace(self.standing, at_pixel=at_pixel, height=height, sun_by=sun_by)
         focus_at = _scaled(self.optics.focus_at, whole_px, small_px)
         focus_at = focus_at and ",".join(str(int(float(each))) for each in focus_at.split(","))
         return replace(self, standing=standing, optics=replace(self.optics, focus_at=focus_at))

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mrbokeh.commands._composite_layers import held_upright, layers_by
-from mrbokeh.commands._composite_options import CompositeOptions, ObjectOptions
+from mrbokeh.commands._composite_options import CompositeOptions, ObjectOptions, typed_shadow
 from mrbokeh.commands._insertion_options import VirtualOptions
-from mrbokeh.commands._level_ground import focused_on_foot, on_level_ground, pair_of
+from mrbokeh.commands._level_ground import focused_on_foot, on_level_ground, pair_of, sun_by_shadow
 from mrbokeh.compositing.choose import best_mode, insertion_of
 from mrbokeh.compositing.ground import with_ground_behind
 from mrbokeh.compositing.near_and_far import nearer_than
@@ -54,6 +54,8 @@ def placed(plate: Plate, options: CompositeOptions, known_height_m: float | None
         plate = focused_on_foot(plate, standing)
     if standing.object_ is not None:
         plate = held_upright(plate, standing)
+    if standing.sun_by is not None:
+        standing = replace(standing, sun=sun_by_shadow(plate, *typed_shadow(standing.sun_by)), sun_by=None)
     return plate, replace(options, standing=standing)
 
 

@@ -20,6 +20,9 @@ _EYES_M, _LOWEST_M, _HIGHEST_M, _FARTHEST_M = 1.5, 0.15, 5.0, 100.0
 """Height of a camera in the hand; heights that are believed where the focus distance is taken for that of the ground; and its farthest."""
 _BELOW_DEG, _BELOW_SHARE, _BELOW_M = 10.0, 0.5, 1.2
 _SAME_SHAPE = 0.01
+_POINTED_PX, _SURE_DEG, _LEAST_FALL, _LOWEST_SUN = 4.0, 20.0, 1e-4, 0.01
+
+Pixel = tuple[float, float]
 
 
 def pair_of(at_pixel: str | None) -> tuple[float, float]:
@@ -99,14 +102,57 @@ def usual_tilt_rad(plate: Plate, ray: Float[np.ndarray, "3"]) -> float:
     return max(0.0, below_rad - math.atan(float(ray[1])))
 
 
+def sun_by_shadow(plate: Plate, top_px: Pixel, foot_px: Pixel, tip_px: Pixel) -> str:
+    """Return --sun RIGHT,ABOVE by a shadow on level ground: pixels of top and foot of something upright, and of its shadow's tip.
+
+    Printed with how far four pixels of error in any of them would turn it. Raises InputError for pixels that cannot be that.
+    """
+    for pixel in (top_px, foot_px, tip_px):
+        plate.require_pixel(*pixel)
+    pixels = np.array([top_px, foot_px, tip_px], np.float64)
+    towards = _sunwards(plate, pixels)
+    shifts = _POINTED_PX * np.eye(6).reshape(6, 3, 2)
+    moved = [_sunwards(plate, pixels + sign * shift, strict=False) for shift in shifts for sign in (-1.0, 1.0)]
+    off_deg = math.degrees(math.acos(min(1.0, min(float(towards @ each) for each in moved))))
+    right_deg = math.degrees(math.atan2(towards[0], towards[2]))
+    above_deg = math.degrees(math.asin(-towards[1]))
+    say(f"by the shadow the sun is {right_deg:.0f} degrees to the right of the view and {above_deg:.0f} above the horizon")
+    if off_deg > _SURE_DEG:
+        warn(
+            f"{_POINTED_PX:g} px beside one of the three pixels would turn the sun by {off_deg:.0f} degrees: take a longer shadow, or --sun"
+        )
+    return f"{right_deg:.9g},{above_deg:.9g}"
+
+
+def _sunwards(plate: Plate, pixels: Float[np.ndarray, "3 2"], *, strict: bool = True) -> Float[np.ndarray, "3"]:
+    """Return the direction (3,) to the sun in a world with y down, for the camera 1 above the ground. strict: refuse what cannot be."""
+    upright = np.eye(3) if plate.world_from_camera is None else plate.world_from_camera
+    top, foot, tip = plate.camera.unproject(pixels, np.ones(3)) @ upright.T
+    if strict and min(foot[1], tip[1]) <= 0.0:
+        name = "foot" if foot[1] <= tip[1] else "shadow's tip"
+        raise InputError(
+            f"--sun-by: the {name} lies above the horizon of a camera that looks down by {_down_deg(upright):.0f} degrees: expected pixels "
+            f"on level ground (--pitch DEGREES says how far the camera looks down)"
+        )
+    foot, tip = foot / max(foot[1], _LEAST_FALL), tip / max(tip[1], _LEAST_FALL)
+    level = [0, 2]
+    # The top stands over the foot: where its ray is nearest to the vertical there.
+    top = top * float(top[level] @ foot[level]) / max(float(top[level] @ top[level]), _LEAST_FALL)
+    towards = top - tip
+    towards /= np.linalg.norm(towards)
+    if strict and towards[1] >= -_LOWEST_SUN:
+        raise InputError("--sun-by: the top is not above the ground by these pixels: expected TOP:FOOT:TIP, each as X,Y")
+    return towards
+
+
 def _ground_m(plate: Plate, ray: Float[np.ndarray, "3"], standing: ObjectOptions) -> float:
     """Return how far the ground is along a ray of length 1 along the axis, for a camera 1 m above it."""
     assert plate.world_from_camera is not None
-    falls = float(plate.world_from_camera[1] @ ray)
+    falls, down_deg = float(plate.world_from_camera[1] @ ray), _down_deg(plate.world_from_camera)
     if falls <= 0.0:
         raise InputError(
-            f"--at-pixel {standing.at_pixel} lies above the horizon of a camera that looks down by {_down_deg(plate):.0f} degrees: choose "
-            f"a lower pixel, say how far the camera looks down with --pitch DEGREES, or give --depth"
+            f"--at-pixel {standing.at_pixel} lies above the horizon of a camera that looks down by {down_deg:.0f} degrees: choose a "
+            f"lower pixel, say how far the camera looks down with --pitch DEGREES, or give --depth"
         )
     return 1.0 / falls
 
@@ -167,6 +213,5 @@ def _seen_by(plate: Plate, solved: SolvedCamera) -> Plate:
     return replace(plate, lens=lens, camera=replace(plate.camera, focal_px=focal_px), view_known=True)
 
 
-def _down_deg(plate: Plate) -> float:
-    assert plate.world_from_camera is not None
-    return math.degrees(math.asin(float(np.clip(plate.world_from_camera[1, 2], -1.0, 1.0)))) + 0.0
+def _down_deg(world_from_camera: Float[np.ndarray, "3 3"]) -> float:
+    return math.degrees(math.asin(float(np.clip(world_from_camera[1, 2], -1.0, 1.0)))) + 0.0
