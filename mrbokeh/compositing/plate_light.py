@@ -177,9 +177,9 @@ def _panorama_of(
     rays = camera.unproject(camera.pixel_centres_px(), np.ones(small.shape[:2])).reshape(-1, 3) @ world_from_camera.T
     rays /= np.linalg.norm(rays, axis=1, keepdims=True)
     towards = directions(*_PANORAMA_PX).reshape(-1, 3)
-    cosines = towards @ rays.T
+    cosines = towards.astype(np.float32) @ rays.astype(np.float32).T
     nearest = cosines.max(axis=1, keepdims=True)
-    width = np.maximum(1.0 - nearest, 1.0 - math.cos(math.pi / _PANORAMA_PX[0]))
+    width = np.maximum(1.0 - nearest, np.float32(1.0 - math.cos(math.pi / _PANORAMA_PX[0])))
     weights = np.exp((cosines - nearest) / width)
     mean = weights @ small.reshape(-1, 3) / weights.sum(axis=1, keepdims=True)
     grey = luminance(mean.astype(np.float32))[:, None] * pale

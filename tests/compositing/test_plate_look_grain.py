@@ -8,6 +8,7 @@ import pytest
 from scipy.ndimage import gaussian_filter
 from scipy.stats import ks_2samp
 
+from mrbokeh.compositing.plate_look import noise_measurement
 from mrbokeh.compositing.plate_look.grain import Grain, measured_grain, measured_grain_of_pair, read_grain, write_grain
 from mrbokeh.compositing.plate_look.noise_measurement import REACH_PX, NoiseLevel, fit_noise_level, noise_blocks, white
 from mrbokeh.images.image_io import read_image
@@ -210,3 +211,16 @@ def test_grain_of_a_real_photograph(shared_data: Path) -> None:
     assert 0.4 < whole.correlation[REACH_PX, REACH_PX + 1, 1, 1] < 0.85
     left = measured_grain(np.ascontiguousarray(picture[:, :2136]))
     assert 0.7 < standard_deviation(left, 0.1) / standard_deviation(whole, 0.1) < 1.4
+
+
+def test_what_residuals_say_of_a_correlation_is_that_of_whole_matrices() -> None:
+    """The plain twin: each lag as a matrix of all pairs of pixels of a block, between two projections off smooth surfaces."""
+    y, x = (each.ravel() for each in np.mgrid[: noise_measurement.BLOCK_PX, : noise_measurement.BLOCK_PX])
+    off_smooth = np.eye(len(y)) - noise_measurement.smooth_basis() @ noise_measurement.smooth_basis().T
+    reach = noise_measurement.REACH_PX
+    lags = [(dy, dx) for dy in range(-reach, reach + 1) for dx in range(-reach, reach + 1)]
+    masks = [((y - y[:, None] == dy) & (x - x[:, None] == dx)).astype(float) for dy, dx in lags]
+    table = noise_measurement._residual_from_true()
+    for column in (0, 7, 40, 66):
+        seen = off_smooth @ masks[column] @ off_smooth
+        np.testing.assert_allclose(table[:, column], [seen[mask > 0].mean() for mask in masks], atol=1e-12)

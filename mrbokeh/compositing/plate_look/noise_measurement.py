@@ -235,21 +235,25 @@ def _mean_products(blocks: NoiseBlocks, level: NoiseLevel) -> Correlation:
 
 @cache
 def _residual_from_true() -> Float64[np.ndarray, "lags2 lags2"]:
-    """Return the mean products of residuals at each lag (row) for a covariance of 1 at one lag (column)."""
-    masks = np.stack([_pairs_of_lag(dy, dx) for dy in range(-REACH_PX, REACH_PX + 1) for dx in range(-REACH_PX, REACH_PX + 1)])
-    counts = masks.sum(axis=(1, 2))
-    seen = np.stack([_without_smooth(mask).ravel() for mask in masks])
-    return (masks.reshape(len(masks), -1) @ seen.T) / counts[:, None]
+    """Return the mean products of residuals at each lag (row) for a covariance of 1 at one lag (column).
 
-
-def _without_smooth(covariance: Float64[np.ndarray, "pixels pixels"]) -> Float64[np.ndarray, "pixels pixels"]:
-    """Return (1 - P) C (1 - P), by way of the few columns of the basis."""
+    With A for the pairs of pixels of a lag and P = B B' these are tr(A' (1 - P) C (1 - P)) over the number of pairs: products of A B,
+    A' B and B' A B, which are the basis moved by the lag.
+    """
     basis = smooth_basis()
-    left, right = basis.T @ covariance, covariance @ basis
-    return covariance - basis @ left - right @ basis.T + basis @ (left @ basis) @ basis.T
+    lags = [(dy, dx) for dy in range(-REACH_PX, REACH_PX + 1) for dx in range(-REACH_PX, REACH_PX + 1)]
+    moved = np.stack([_moved(basis, dy, dx) for dy, dx in lags])
+    within = (basis.T @ moved).reshape(len(lags), -1)
+    moved = moved.reshape(len(lags), -1)
+    # The lags are in an order in which the last is the opposite of the first.
+    products = within @ within.T - moved @ moved.T - moved[::-1] @ moved[::-1].T
+    counts = np.array([(BLOCK_PX - abs(dy)) * (BLOCK_PX - abs(dx)) for dy, dx in lags])
+    return np.eye(len(lags)) + products / counts[:, None]
 
 
-def _pairs_of_lag(dy: int, dx: int) -> Float64[np.ndarray, "pixels pixels"]:
-    """Return 1 for pairs of pixels whose second lies (dy, dx) from the first."""
-    y, x = (each.ravel() for each in np.mgrid[:BLOCK_PX, :BLOCK_PX])
-    return ((y[None] - y[:, None] == dy) & (x[None] - x[:, None] == dx)).astype(np.float64)
+def _moved(basis: Float64[np.ndarray, "pixels terms"], dy: int, dx: int) -> Float64[np.ndarray, "pixels terms"]:
+    """Return for each pixel of a block what the basis has (dy, dx) from it, 0 beyond the block."""
+    images = basis.reshape(BLOCK_PX, BLOCK_PX, -1)
+    wide = np.pad(images, ((REACH_PX, REACH_PX), (REACH_PX, REACH_PX), (0, 0)))
+    top, left = REACH_PX + dy, REACH_PX + dx
+    return wide[top : top + BLOCK_PX, left : left + BLOCK_PX].reshape(basis.shape)
