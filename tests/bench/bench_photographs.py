@@ -28,7 +28,7 @@ from mrbokeh.scene.staging.staged_scene import Assets
 from mrbokeh.scene.virtual_scene import world_from_scene_placing
 from tests.bench.machine import tell
 
-WIDTH_PX, HEIGHT_PX, SAMPLES = 600, 400, 192
+WIDTH_PX, HEIGHT_PX, SAMPLES = 600, 400, 96
 KINDS, LENSES_MM = ("room", "table", "street", "sunny street"), (24.0, 35.0, 50.0)
 ALIEN, OBJECT = Path("mrbokeh/demo_data/objects/alien.glb"), "object.glb"
 _SHOT, _READ, _GREY = 2e-4, 2e-6, 0.2
@@ -92,7 +92,7 @@ class Place:
 
         move = mi.ScalarTransform4f().translate((base_m - [0.0, half_m[1], 0.0]).tolist())
         turned = move @ mi.ScalarTransform4f().rotate([0, 1, 0], turn_deg) @ mi.ScalarTransform4f().scale(half_m.tolist())
-        self.add({"type": "cube", "to_world": turned, "bsdf": self.painted(0.1, 0.6)})
+        self.add({"type": "cube", "to_world": turned, "bsdf": self.painted(0.05, 1.0)})
 
     def boxes(self, count: int, nearest_m: float, farthest_m: float, size_m: float) -> None:
         for _ in range(count):
@@ -169,7 +169,7 @@ class Place:
             "to_world": look,
             "film": {"type": "hdrfilm", "width": WIDTH_PX, "height": HEIGHT_PX, "rfilter": {"type": "box"}},
         }
-        scene = {"type": "scene", "integrator": {"type": "path", "max_depth": 7}, "sensor": lens, **self.shapes, **objects}
+        scene = {"type": "scene", "integrator": {"type": "path", "max_depth": 6}, "sensor": lens, **self.shapes, **objects}
         return np.asarray(mi.render(mi.load_dict(scene), spp=SAMPLES))[..., :3]
 
     @property
