@@ -71,25 +71,31 @@ def read_photograph(path: Path) -> Photograph:
 def _picture(path: Path) -> DecodedPhoto:
     if path.suffix.lower() in ENCODED_SUFFIXES:
         return _encoded(path)
-    rgb = read_image(path)
+    rgb, remarks = _finite(read_image(path))
     height, width = rgb.shape[:2]
-    finite = np.isfinite(rgb)
-    remarks: tuple[str, ...] = ()
-    if not finite.all():
-        remarks = (f"{np.count_nonzero(~finite.all(axis=-1))} pixels were not finite: NaN became 0, infinity {_LARGEST_HALF:g}",)
-        rgb = np.nan_to_num(rgb, nan=0.0, posinf=_LARGEST_HALF, neginf=0.0)
     return DecodedPhoto(rgb, None, np.zeros((height, width), np.float32), Photosites(width, height), saturation_level=None, remarks=remarks)
+
+
+def _finite(rgb: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the light with numbers alone, and a remark where some were none."""
+    finite = np.isfinite(rgb)
+    if finite.all():
+        return rgb, ()
+    remark = f"{np.count_nonzero(~finite.all(axis=-1))} pixels were not finite: NaN became 0, infinity {_LARGEST_HALF:g}"
+    return np.nan_to_num(rgb, nan=0.0, posinf=_LARGEST_HALF, neginf=0.0), (remark,)
 
 
 def _encoded(path: Path) -> DecodedPhoto:
     """Decode a picture whose codes are display-encoded; full is the largest code in any channel (TIFF of floats: 1)."""
     codes = stored_rgb(path)[..., :3]
-    is_float = codes.dtype.kind == "f"
+    is_float, remarks = codes.dtype.kind == "f", ()
+    if is_float:
+        codes, remarks = _finite(codes)
     rgb = codes.astype(np.float32) if is_float else linear_from_codes(codes, "srgb", path)
     red, green, blue = cv2.split(np.ascontiguousarray(codes))
     full = cv2.max(cv2.max(red, green), blue) >= (_FULL if is_float else np.iinfo(codes.dtype).max)
-    photosites = Photosites(full.shape[1], full.shape[0], int(np.count_nonzero(full)))
-    return DecodedPhoto(rgb, None, dilated(full).astype(np.float32), photosites, half_suffices=codes.dtype == np.uint8)
+    photosites, saturated = Photosites(full.shape[1], full.shape[0], int(np.count_nonzero(full))), dilated(full).astype(np.float32)
+    return DecodedPhoto(rgb, None, saturated, photosites, half_suffices=codes.dtype == np.uint8, remarks=remarks)
 
 
 def _no_wider(decoded: DecodedPhoto, width: int) -> DecodedPhoto:

@@ -6,7 +6,6 @@ tables (printers, some scanners) are not: the picture is taken for sRGB then, an
 
 import logging
 import struct
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64
 
 from mrbokeh.images.color import linear_to_srgb, srgb_to_linear
-from mrbokeh.images.exif import TIFF_SUFFIXES, tiff_tags
+from mrbokeh.images.exif import TIFF_SUFFIXES, header_of, tiff_tags
 from mrbokeh.images.exr_io import BT2020, P3_D65, REC709, rec709_from_chromaticities, rec709_from_matrix
 from mrbokeh.images.heif import is_heif, open_heif
 
@@ -99,13 +98,13 @@ def _by_pillow(path: Path) -> tuple[bytes, bool]:
     from PIL import Image
 
     try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:
+        with header_of(path) as picture:
             if data := picture.info.get("icc_profile"):
                 return bytes(data), False
             # Not picture.getexif(), which decodes the whole of a PNG to look for the tag behind its pixels.
             index = Image.Image.getexif(picture).get_ifd(_INTEROP_IFD).get(_INTEROP_INDEX) if picture.format in ("JPEG", "MPO") else None
             return b"", isinstance(index, str) and index.strip("\0 ") == _OPTION_FILE
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError):
+    except (OSError, SyntaxError, ValueError):
         return b"", False
 
 

@@ -2,7 +2,8 @@
 
 import struct
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -45,6 +46,19 @@ _UPRIGHT = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (1, Tru
 Picture = TypeVar("Picture", bound=np.ndarray)
 
 
+@contextmanager
+def header_of(path: Path) -> "Iterator[Image.Image]":
+    """Open a picture with Pillow for what its header tells. It may be of any size: Pillow's limit is for what is decoded."""
+    from PIL import Image
+
+    most_px, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+    try:
+        with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:
+            yield picture
+    finally:
+        Image.MAX_IMAGE_PIXELS = most_px
+
+
 def stored_orientation(path: Path) -> int:
     """Return EXIF's orientation, 1 to 8; AS_STORED if the file has none, or is HEIC, which is decoded upright."""
     from PIL import Image, UnidentifiedImageError
@@ -55,7 +69,7 @@ def stored_orientation(path: Path) -> int:
     if suffix not in _TELLING:
         return AS_STORED
     try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:
+        with header_of(path) as picture:
             # Not picture.getexif(), which decodes the whole of a PNG to look for the tag behind its pixels.
             return known_orientation(Image.Image.getexif(picture).get(_TAG))
     except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
@@ -68,7 +82,7 @@ def exif_and_size(path: Path) -> "tuple[Image.Exif, SizePx] | None":
 
     try:
         if not is_heif(path):
-            with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:
+            with header_of(path) as picture:
                 return picture.getexif(), picture.size
         exif = Image.Exif()
         exif.load(heif_exif(path))

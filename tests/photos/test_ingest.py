@@ -7,7 +7,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tifffile
 from jaxtyping import Float64
+from PIL import Image
 from scipy.ndimage import gaussian_filter, uniform_filter
 
 from capture.cli import app
@@ -23,6 +25,7 @@ from datasets_scripts.made_sets.simulated_camera import SensorModel
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import write_image
 from mrbokeh.stacks.focal_stack import read_focal_stack
+from mrbokeh.stacks.photograph import read_photograph
 from mrbokeh.system.errors import InputError
 from tests.support.command_line import printed_by
 from tests.support.made_photographs import (
@@ -354,3 +357,21 @@ def test_names_that_do_not_follow_the_time_are_remarked_where_focus_is_unknown(t
     (shoot / "IMG_8.dng").rename(shoot / "IMG_99.dng")
     report = ingest([shoot], tmp_path / "scene")
     assert any("not that in which they were taken" in remark for remark in report.stacks[0].remarks)
+
+
+def test_what_is_no_number_in_a_tiff_of_floats_becomes_light_and_is_told(tmp_path: Path) -> None:
+    rgb = np.full((6, 8, 3), 0.25, np.float32)
+    rgb[1, 2], rgb[3, 4, 0] = np.nan, np.inf
+    tifffile.imwrite(tmp_path / "float.tif", rgb, photometric="rgb")
+    read = read_photograph(tmp_path / "float.tif")
+    assert np.isfinite(read.rgb).all() and (read.rgb[1, 2] == 0.0).all() and read.rgb[3, 4, 0] > 1e4
+    assert read.rgb[0, 0, 0] == np.float32(0.25)
+
+
+def test_pictures_larger_than_pillow_would_decode_keep_their_orientation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.new("RGB", (12, 8), (90, 90, 90)).save(tmp_path / "large.jpg", exif=exif)
+    monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", 4)
+    assert read_photograph(tmp_path / "large.jpg").rgb.shape == (12, 8, 3)
+    assert Image.MAX_IMAGE_PIXELS == 4

@@ -1,7 +1,6 @@
 """Compression of a JPEG photograph on what is put into it: the same blocks, tables and halved colour."""
 
 import io
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import numpy as np
 
 from mrbokeh.compositing.plate import Inserted
 from mrbokeh.images.color import srgb_codes, srgb_to_linear
-from mrbokeh.images.exif import oriented_as_stored, stored_orientation
+from mrbokeh.images.exif import header_of, oriented_as_stored, stored_orientation
 
 _BLOCK_PX = 16
 """Sides of the blocks whose colour is halved in both directions; all others fit into them."""
@@ -26,15 +25,15 @@ class JpegCompression:
     @classmethod
     def of(cls, photo: Path) -> "JpegCompression | None":
         """Return how a file was compressed; None if it is no JPEG in colours, or of a kind that Pillow does not write."""
-        from PIL import Image, JpegImagePlugin, UnidentifiedImageError
+        from PIL import JpegImagePlugin, UnidentifiedImageError
 
         try:
-            with warnings.catch_warnings(action="ignore"), Image.open(photo) as picture:
+            with header_of(photo) as picture:
                 if not isinstance(picture, JpegImagePlugin.JpegImageFile) or picture.mode != "RGB":
                     return None
                 subsampling = JpegImagePlugin.get_sampling(picture)
                 tables = {number: list(table) for number, table in picture.quantization.items()}
-        except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError):
+        except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
             return None
         return cls(tables, subsampling, stored_orientation(photo)) if subsampling in (0, 1, 2) else None
 
