@@ -103,8 +103,10 @@ class Page:
 
 
 @asynccontextmanager
-async def chromium_page(url: str, profile: Path, *flags: str, size_px: tuple[int, int] = (390, 844)) -> AsyncIterator[Page]:
-    """Yield a page of a browser with a profile of its own; it has touch and the size of a phone."""
+async def chromium_page(
+    url: str, profile: Path, *flags: str, size_px: tuple[int, int] = (390, 844), script: str = ""
+) -> AsyncIterator[Page]:
+    """Yield a page of a browser with a profile of its own; it has touch and the size of a phone. script: runs before the page's own."""
     command = [str(CHROMIUM), *_FLAGS, f"--user-data-dir={profile}", *flags, "about:blank"]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     try:
@@ -122,6 +124,7 @@ async def chromium_page(url: str, profile: Path, *flags: str, size_px: tuple[int
                     await page.send(f"{domain}.enable")
                 await page.send("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
                 await page.size(*size_px)
+                await page.send("Page.addScriptToEvaluateOnNewDocument", source=script)
                 await page.send("Page.navigate", url=url)
                 yield page
     finally:

@@ -65,8 +65,11 @@ class Segments:
 
     def straightened(self, bending: float) -> "Segments":
         """Return the segments without a lens's distortion: a point at m is seen at about m (1 + bending m.m)."""
-        start, end = (each * (1.0 - bending * (each**2).sum(axis=1, keepdims=True)) for each in (self.start, self.end))
-        return Segments(start, end)
+        return Segments(*(ends[0] for ends in self.straight(np.array([bending]))))
+
+    def straight(self, bending: Float64[np.ndarray, " tries"]) -> tuple[Float64[np.ndarray, "tries segments 2"], ...]:
+        """Return the starts and the ends of the segments without each of several distortions."""
+        return tuple(each * (1.0 - bending[:, None, None] * (each**2).sum(axis=1)[:, None]) for each in (self.start, self.end))
 
     def in_pixels(self, width_px: int, height_px: int) -> Float64[np.ndarray, "segments 4"]:
         """Return (N, 4): x and y of both ends in pixels of a picture of that size."""

@@ -1,5 +1,6 @@
 """The camera from one picture against pictures whose camera is known, and what is refused. The bars are those of the issue."""
 
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,20 @@ from mrbokeh.solving.solved_camera import SolvedCamera, read_solved_camera, writ
 from mrbokeh.system.errors import InputError
 from tests.support.command_line import mrbokeh
 from tests.support.projected_places import KINDS, LENSES_MM, Place, place
+
+
+@cache
+def room() -> tuple[Place, np.ndarray]:
+    """A room and its picture, which several tests take and none changes."""
+    made = place("room", 101, 24.0)
+    rgb = made.linear()
+    rgb.flags.writeable = False
+    return made, rgb
+
+
+@cache
+def camera_of_room() -> SolvedCamera:
+    return solve_camera(room()[1])
 
 
 def horizon_off_deg(camera: SolvedCamera, made: Place) -> float:
@@ -27,8 +42,8 @@ def in_pixels(made: Place, points_m: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(("kind", "seed"), [("room", 101), ("street", 102), ("table", 100)])
 def test_a_picture_tells_its_camera(kind: str, seed: int) -> None:
     """Focal length within 3 %, horizon within 0.5 degrees, and no farther off than 4 standard deviations."""
-    made = place(kind, seed, 24.0)
-    camera = solve_camera(made.linear())
+    made = room()[0] if kind == "room" else place(kind, seed, 24.0)
+    camera = camera_of_room() if kind == "room" else solve_camera(made.linear())
     off_px = abs(camera.focal_length_px - made.focal_px)
     assert camera.focal_length_source == "solved" and camera.confidence in ("high", "fair")
     assert off_px < 0.03 * made.focal_px and off_px < 4.0 * camera.focal_length_sd_px + 0.003 * made.focal_px
@@ -54,8 +69,7 @@ def test_nine_in_ten_of_forty_pictures() -> None:
 
 
 def test_a_known_focal_length_is_kept_and_compared() -> None:
-    made = place("room", 101, 24.0)
-    rgb = made.linear()
+    made, rgb = room()
     camera = solve_camera(rgb, made.focal_px)
     assert camera.focal_length_px == made.focal_px and not camera.disagreement()
     assert horizon_off_deg(camera, made) < 0.3
@@ -65,8 +79,8 @@ def test_a_known_focal_length_is_kept_and_compared() -> None:
 
 def test_distortion_of_a_lens_does_not_bend_the_camera_and_a_fisheye_is_refused() -> None:
     """2 % in the corners, as cheap lenses have; and a fisheye's angle proportional to the distance from the middle."""
-    made = place("room", 101, 24.0)
-    rgb, corner_px = made.linear(), 0.5 * np.hypot(made.width_px, made.height_px)
+    made, rgb = room()
+    corner_px = 0.5 * np.hypot(made.width_px, made.height_px)
     y, x = np.mgrid[: made.height_px, : made.width_px] + 0.5
     x, y = x - made.width_px / 2, y - made.height_px / 2
     radius = np.hypot(x, y)
@@ -104,7 +118,7 @@ def test_lines_by_hand_are_enough() -> None:
 
 def test_the_ground_lies_where_it_is() -> None:
     """Depth along the axis, against rays that are cut with the plane 1.6 m below; and its height from one length on it."""
-    made = place("room", 101, 24.0)
+    made, _ = room()
     rotation = made.camera_from_world
     camera = SolvedCamera(1500, 1000, made.focal_px, "known", rotation).standing(1.6)
     depth_m = camera.ground_depth(100, 150)
@@ -143,8 +157,7 @@ def test_leaves_are_no_camera() -> None:
 
 
 def test_a_file_brings_the_camera_back(tmp_path: Path) -> None:
-    made = place("room", 101, 24.0)
-    camera = solve_camera(made.linear()).standing(1.4).of_sensor(36.0)
+    camera = camera_of_room().standing(1.4).of_sensor(36.0)
     write_solved_camera(tmp_path / "camera.json", camera)
     back = read_solved_camera(tmp_path / "camera.json")
     assert back.camera_height_m == 1.4 and back.focal_length_mm == pytest.approx(camera.focal_length_mm)
@@ -156,8 +169,8 @@ def test_a_file_brings_the_camera_back(tmp_path: Path) -> None:
 
 
 def test_the_command_writes_a_camera_and_its_picture(tmp_path: Path) -> None:
-    made = place("room", 101, 24.0)
-    write_image(tmp_path / "room.jpg", made.linear())
+    made, rgb = room()
+    write_image(tmp_path / "room.jpg", rgb)
     out, grid = tmp_path / "camera.json", tmp_path / "grid.png"
     done = mrbokeh("capture", "solve", tmp_path / "room.jpg", "--out", out, "--picture", grid)
     assert done.returncode == 0, done.stderr

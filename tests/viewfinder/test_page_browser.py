@@ -30,6 +30,12 @@ pytestmark = [
 ]
 SHOWN = "window.viewfinder && viewfinder.counts.shown > 3"
 MESSAGE = "document.getElementById('message')?.textContent"
+# The page asks for the state every 2 s; here ten times as often.
+OFTEN = "{ const plain = setInterval; window.setInterval = (work, ms) => plain(work, ms === 2000 ? 200 : ms); }"
+# The page takes a video for ended that shows nothing for 5 s; here after a second.
+HURRIED = """(() => { const plain = performance.now;
+  performance.now = () => plain.call(performance) + 4000;
+  setTimeout(() => (performance.now = plain), 1700); })()"""
 
 
 @pytest.fixture(autouse=True)
@@ -41,7 +47,7 @@ def new_loop(monkeypatch: pytest.MonkeyPatch) -> None:
 @asynccontextmanager
 async def opened(made: Made, profile: Path) -> AsyncIterator[Page]:
     """The page, once it shows pictures and nothing is wrong."""
-    async with chromium_page(made.url, profile) as page:
+    async with chromium_page(made.url, profile, script=OFTEN) as page:
         await page.comes_true(SHOWN)
         assert await page.value(MESSAGE) == ""
         yield page
@@ -409,6 +415,7 @@ async def test_video_comes_first_with_its_age_and_what_is_known_of_each_picture_
                 # A stream that ends is opened again.
                 for viewer in list(whep._viewers.values()):
                     await viewer.close()
+                await page.value(HURRIED)
                 await new_pictures(page, 20)
                 assert whep.viewers == 1
                 await page.send("Page.navigate", url="about:blank")
