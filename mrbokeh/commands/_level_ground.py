@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.commands._composite_options import ObjectOptions, typed_pixel
+from mrbokeh.commands._composite_options import ObjectOptions
 from mrbokeh.compositing.plate import Plate
 from mrbokeh.scene.staging.scene_description import looking_down
 from mrbokeh.solving.solved_camera import GUESSED, KNOWN, LOW, SolvedCamera, read_solved_camera
@@ -20,13 +20,6 @@ _EYES_M, _LOWEST_M, _HIGHEST_M, _FARTHEST_M = 1.5, 0.15, 5.0, 100.0
 """Height of a camera in the hand; heights that are believed where the focus distance is taken for that of the ground; and its farthest."""
 _BELOW_DEG, _BELOW_SHARE, _BELOW_M = 10.0, 0.5, 1.2
 _SAME_SHAPE = 0.01
-
-
-def pair_of(at_pixel: str | None) -> tuple[float, float]:
-    """Return X and Y of --at-pixel. Raises InputError."""
-    if at_pixel is None:
-        raise InputError("where does the object stand? Give --at X,Y,Z in metres, or --at-pixel X,Y")
-    return typed_pixel(at_pixel)
 
 
 def with_camera_of_file(plate: Plate, path: Path) -> tuple[Plate, float | None]:
@@ -43,27 +36,28 @@ def with_camera_of_file(plate: Plate, path: Path) -> tuple[Plate, float | None]:
 
 
 def on_level_ground(plate: Plate, standing: ObjectOptions, known_height_m: float | None = None) -> tuple[Plate, ObjectOptions]:
-    """Return the plate, upright and focused on the foot where nothing tells its focus, and the options with the foot's place on the ground.
+    """Return the plate, upright and focused on the first foot where nothing tells its focus, and the options with the feet's places.
 
-    known_height_m: of a solved camera; --camera-height comes before it. Raises InputError for a pixel that shows no ground.
+    All feet are on one level ground, whose depth below the camera the first one tells. known_height_m: of a solved camera;
+    --camera-height comes before it. Raises InputError for a pixel that shows no ground.
     """
-    x_px, y_px = pair_of(standing.at_pixel)
-    plate.require_pixel(x_px, y_px)
+    for foot_px in standing.pixels:
+        plate.require_pixel(*foot_px)
     taken = []
     if standing.pitch is not None:
         plate = replace(plate, world_from_camera=looking_down(math.radians(standing.pitch)))
     elif plate.world_from_camera is None:
         plate = _by_lines(plate)
-    ray = plate.camera.unproject(np.array([x_px, y_px]), np.array(1.0))
+    rays = [plate.camera.unproject(np.array(foot_px), np.array(1.0)) for foot_px in standing.pixels]
     if plate.world_from_camera is None:
-        down_rad = usual_tilt_rad(plate, ray)
+        down_rad = usual_tilt_rad(plate, rays[0])
         down_rad = down_rad if math.degrees(down_rad) >= 1.0 else 0.0
         plate = replace(plate, world_from_camera=looking_down(down_rad))
         held = f"to look down by {math.degrees(down_rad):.0f} degrees" if down_rad else "to be level"
         taken.append(f"the camera {held} (--pitch DEGREES)")
-    nearest_m = _ground_m(plate, ray, standing)
-    height_m, told = _camera_height_m(plate, standing.camera_height or known_height_m, nearest_m)
-    distance_m = height_m * nearest_m
+    nearest_m = [_ground_m(plate, *each) for each in zip(rays, standing.at_pixel or (), strict=True)]
+    height_m, told = _camera_height_m(plate, standing.camera_height or known_height_m, nearest_m[0])
+    distance_m = height_m * nearest_m[0]
     taken += [told] if told else []
     if plate.rough_focus_m is not None and plate.rough_focus_m[0] <= distance_m <= plate.rough_focus_m[1]:
         plate = replace(plate, lens=plate.lens.focused_at(distance_m))
@@ -72,16 +66,16 @@ def on_level_ground(plate: Plate, standing: ObjectOptions, known_height_m: float
         plate = replace(plate, lens=plate.lens.focused_at(distance_m))
     guess(f"there is no depth: mrbokeh takes {', '.join(taken)}" if taken else "")
     height = standing.height
-    if height is None:
-        height = f"{max(1.0, HIGH_SHARE * plate.rgb.shape[0]):.0f}px"
-        guess(f"the object is made {height} high, a quarter of the picture (--height METRES or such as 300px)")
-    place = ",".join(f"{each:.9g}" for each in distance_m * ray)
-    return plate, replace(standing, at=place, at_pixel=None, height=height)
+    if not height:
+        height = [f"{max(1.0, HIGH_SHARE * plate.rgb.shape[0]):.0f}px"]
+        guess(f"the object is made {height[0]} high, a quarter of the picture (--height METRES or such as 300px)")
+    places = [",".join(f"{each:.9g}" for each in height_m * along_m * ray) for along_m, ray in zip(nearest_m, rays, strict=True)]
+    return plate, replace(standing, at=places, at_pixel=None, height=height)
 
 
 def focused_on_foot(plate: Plate, standing: ObjectOptions) -> Plate:
-    """Return a plate with depth focused on the foot of an object, where nothing tells its focus."""
-    foot_m = plate.depth_at_m(*pair_of(standing.at_pixel))
+    """Return a plate with depth focused on the foot of the first object, where nothing tells its focus."""
+    foot_m = plate.depth_at_m(*standing.first_px)
     if plate.focus_known or not 0.0 < foot_m < math.inf:
         return plate
     guess(f"nothing tells the focus: it is taken to be on the object, {foot_m:.3g} m away (--focus METRES, --focus-at X,Y)")
@@ -99,13 +93,13 @@ def usual_tilt_rad(plate: Plate, ray: Float[np.ndarray, "3"]) -> float:
     return max(0.0, below_rad - math.atan(float(ray[1])))
 
 
-def _ground_m(plate: Plate, ray: Float[np.ndarray, "3"], standing: ObjectOptions) -> float:
+def _ground_m(plate: Plate, ray: Float[np.ndarray, "3"], at_pixel: str) -> float:
     """Return how far the ground is along a ray of length 1 along the axis, for a camera 1 m above it."""
     assert plate.world_from_camera is not None
     falls = float(plate.world_from_camera[1] @ ray)
     if falls <= 0.0:
         raise InputError(
-            f"--at-pixel {standing.at_pixel} lies above the horizon of a camera that looks down by {_down_deg(plate):.0f} degrees: choose "
+            f"--at-pixel {at_pixel} lies above the horizon of a camera that looks down by {_down_deg(plate):.0f} degrees: choose "
             f"a lower pixel, say how far the camera looks down with --pitch DEGREES, or give --depth"
         )
     return 1.0 / falls
