@@ -141,9 +141,8 @@ class ObjectOptions:
         """How each object stands, in their order."""
         glbs = self.object_ or []
         columns = (_for_each(given, len(glbs)) for given in (self.at, self.at_pixel, self.height, self.turn))
-        return tuple(
-            Standing(glb, at, at_pixel, height, turn or 0.0) for glb, at, at_pixel, height, turn in zip(glbs, *columns, strict=True)
-        )
+        rows = zip(glbs, *columns, strict=True)
+        return tuple(Standing(glb, at, at_pixel, height, turn or 0.0) for glb, at, at_pixel, height, turn in rows)
 
     @property
     def pixels(self) -> list[tuple[float, float]]:
@@ -189,15 +188,11 @@ class ObjectOptions:
         if self.object_ and not self.at and not self.at_pixel:
             raise InputError("where does the object stand? Give --at X,Y,Z in metres, or --at-pixel X,Y")
         count = max(1, len(self.object_ or ()))
-        for name, given, for_all in (
-            ("at", self.at, 1),
-            ("at-pixel", self.at_pixel, 1),
-            ("height", self.height, 0),
-            ("turn", self.turn, 0),
-        ):
-            if given and len(given) != count and (for_all or len(given) != 1):
-                expected = f"{count}, one for each --object" + ("" if for_all or count == 1 else ", or one for all")
-                raise InputError(f"--{name}: expected {expected}, got {len(given)}")
+        for name, given in (("at", self.at), ("at-pixel", self.at_pixel), ("height", self.height), ("turn", self.turn)):
+            or_one = name in ("height", "turn")
+            if given and len(given) != count and not (or_one and len(given) == 1):
+                expected = f"{count}, one for each --object" if count > 1 else "one"
+                raise InputError(f"--{name}: expected {expected}{', or one for all' * (or_one and count > 1)}, got {len(given)}")
 
     def require_no_depth(self) -> None:
         """Raise InputError where an option is given that only a photograph without depth needs."""

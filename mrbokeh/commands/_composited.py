@@ -96,8 +96,9 @@ def _nothing_seen(standing: ObjectOptions, virtual: VirtualOptions) -> None:
     if standing.object_:
         where = " ".join([f"--at-pixel {each}" for each in standing.at_pixel or ()] + [f"--at {each}" for each in standing.at or ()])
         raise InputError(
-            f"nothing of {', '.join(map(str, standing.object_))} is in the picture: by {where} it stands beside the frame or is too small to be seen; choose "
-            f"another place with --at X,Y,Z (metres right, down, forward of the lens) or --at-pixel X,Y, or another --height"
+            f"nothing of {', '.join(map(str, standing.object_))} is in the picture: by {where} it stands beside the frame or is too small "
+            f"to be seen; choose another place with --at X,Y,Z (metres right, down, forward of the lens) or --at-pixel X,Y, or another "
+            f"--height"
         )
     if virtual.scene is not None:
         raise InputError(f"nothing of {virtual.scene} is in the picture: its objects are beside the frame or behind the --camera")

@@ -31,7 +31,7 @@ def composite(options: CompositeOptions, out: OutOption) -> None:
 
     Example: mrbokeh composite STACK --slice 3 --object cake.glb --at-pixel 300,250 --height 120px --out out.png
 
-    Example: mrbokeh composite photo.jpg --object cake.glb --at-pixel 800,900 --object alien.glb --at-pixel 1200,880 --height 0.2 --out out.png
+    Example: mrbokeh composite photo.jpg --object cake.glb --at-pixel 800,900 --object alien.glb --at-pixel 1200,880 --out out.png
 
     Example: mrbokeh composite captures/20261122-101500 --out captured.png
     """
