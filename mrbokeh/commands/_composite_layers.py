@@ -1,4 +1,4 @@
-"""Layers of `mrbokeh composite` by its options: of files, of one object and its light, and of a scene."""
+"""Layers of `mrbokeh composite` by its options: of files, of objects in their light, and of a scene."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -8,8 +8,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mrbokeh.commands._composite_options import CompositeOptions, ObjectOptions, RenderingOptions, typed_height, typed_place_m, typed_sun
-from mrbokeh.commands._level_ground import HIGH_SHARE, pair_of
+from mrbokeh.commands._composite_options import (
+    CompositeOptions,
+    ObjectOptions,
+    RenderingOptions,
+    typed_height,
+    typed_pixel,
+    typed_place_m,
+    typed_sun,
+)
+from mrbokeh.commands._level_ground import HIGH_SHARE
 from mrbokeh.compositing.ground import ended_shadow, ground_under
 from mrbokeh.compositing.plate import Plate
 from mrbokeh.images.layer import Layer, flatten
@@ -22,11 +30,13 @@ from mrbokeh.system.errors import InputError
 if TYPE_CHECKING:
     from mrbokeh.commands._composite_kept import KeptParts
     from mrbokeh.scene.staging.filming import Filming
-    from mrbokeh.scene.staging.scene_description import Lighting
+    from mrbokeh.scene.staging.scene_description import Lighting, OneObject
     from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples
 
 _COVERED = 0.5
 _HIGHEST = 20.0
+_SAME_LEVEL, _ROUNDING = 0.05, 1e-6
+"""Share by which depths of one level of ground may differ."""
 _DARK = 0.6
 """How dark the shadow of a light is, where nothing tells."""
 
@@ -35,7 +45,7 @@ LayersFor = Callable[[Plate], list[Layer]]
 
 
 def layers_by(options: CompositeOptions, first: Plate, bundle: CaptureBundle | None = None, kept: "KeptParts | None" = None) -> LayersFor:
-    """Return the layers of the options. first: the plate on whose pixel the object stands. kept: from earlier pictures of the photograph.
+    """Return the layers of the options. first: the plate on whose pixels the objects stand. kept: from earlier pictures of the photograph.
 
     Raises InputError if there is nothing to insert.
     """
@@ -43,17 +53,16 @@ def layers_by(options: CompositeOptions, first: Plate, bundle: CaptureBundle | N
     files = _FileLayers.of(virtual.layer or (), virtual.object_names)
     still = [*files.flat, *(bundle.layers if bundle else ())]
     rendered = []
-    if standing.object_ is not None:
-        rendered.append(_object_layers(standing.object_, standing, rendering, first, kept))
+    if standing.object_:
+        rendered.append(_object_layers(standing, rendering, first, kept))
     if virtual.scene is not None:
         rendered.append(_scene_layers(virtual.scene, virtual.camera, rendering))
     if not still and not rendered and not files.deep:
         raise InputError("nothing to put into the photograph: give --object OBJ.glb, --scene SCENE.toml or --layer RGBAZ.exr")
     if standing.at_pixel and not rendered:
-        x_px, y_px = pair_of(standing.at_pixel)
-        standing_there = standing_on_pixel(files.among(still), first, x_px, y_px)
+        standing_there = standing_on_pixel(files.among(still), first, *standing.first_px)
         return lambda _: standing_there
-    if standing.at_pixel and standing.object_ is None:
+    if standing.at_pixel and not standing.object_:
         raise InputError("--at-pixel places an --object or the --layers; a scene file says itself where its objects stand: leave it out")
     return lambda plate: files.among([*still, *(layer for make in rendered for layer in make(plate))])
 
@@ -98,36 +107,79 @@ class _FileLayers:
         return interleaved(self.deep, layers)
 
 
-def _object_layers(
-    glb: Path, options: ObjectOptions, rendering: RenderingOptions, first: Plate, kept: "KeptParts | None" = None
-) -> LayersFor:
-    from mrbokeh.scene.staging.scene_description import OneObject
-
-    stands_at_m = typed_place_m(options.at) if options.at else first.point_under_pixel_m(*pair_of(options.at_pixel))
-    foot_px = pair_of(options.at_pixel) if options.at_pixel else _pixel_of(first.camera, stands_at_m)
-    world_from_camera = np.eye(3) if first.world_from_camera is None else first.world_from_camera
+def _object_layers(options: ObjectOptions, rendering: RenderingOptions, first: Plate, kept: "KeptParts | None") -> LayersFor:
+    """Return the objects in one layer, and behind it what the ground under them catches: a layer for each level of ground."""
     catches = rendering.catch or ("shadow" if options.plain else "light")
     usual = 0.0 if options.plain else _DARK if catches == "shadow" else 1.0
     shadow = usual if options.shadow is None else options.shadow
-    one = OneObject(
-        glb=glb,
-        stands_at_m=stands_at_m,
-        height_m=_height_m(options.height, first, stands_at_m[2]),
-        turn_rad=math.radians(options.turn),
-        world_from_camera=world_from_camera,
-        light=_light(options, first, foot_px, world_from_camera, kept),
-        shadow=shadow,
-    )
     filming = replace(rendering.of_photograph.filming(), catches=catches, caught_share=shadow)
-    filmed = _filmed(one.described(), filming, rendering.time, lambda plate: one.seen_by(plate.camera), kept)
-    if not options.at_pixel:
-        return filmed
+    grounds = _grounds(objects_of(options, first, shadow))
+    light = _light(options, first, options.first_px if options.at_pixel else _pixel_of(first.camera, grounds[0][0].stands_at_m), kept)
+    grounds = [[replace(each, light=light) for each in ground] for ground in grounds]
 
-    def on_the_ground(plate: Plate) -> list[Layer]:
-        objects, *caught = filmed(plate)
-        return [objects, *(ended_shadow(plate, foot_px, objects, each) for each in caught)]
+    def filmed(*objects: "OneObject") -> LayersFor:
+        head, *beside = objects
+        return _filmed(head.described(*beside), filming, rendering.time, lambda plate: head.seen_by(plate.camera), kept)
 
-    return on_the_ground
+    on_grounds = [filmed(*ground) for ground in grounds]
+    together = filmed(*(replace(each, shadow=0.0) for ground in grounds for each in ground)) if len(grounds) > 1 else None
+
+    def layers(plate: Plate) -> list[Layer]:
+        parts = [make(plate) for make in on_grounds]
+        caught = [layer for _objects, *some in parts for layer in some]
+        objects = parts[0][0] if together is None else together(plate)[0]
+        return [objects, *(ended_shadow(plate, options.pixels, objects, each) if options.at_pixel else each for each in caught)]
+
+    return layers
+
+
+def objects_of(options: ObjectOptions, plate: Plate, shadow: float = 0.0) -> "list[OneObject]":
+    """Return the objects at their places, not lit yet.
+
+    Depth of one table is not exact: objects on pixels whose levels differ by less than a share stand on that of the first of them, where
+    the same line of sight meets it.
+    """
+    from mrbokeh.scene.staging.scene_description import OneObject
+
+    placed: list[OneObject] = []
+    for each in options.each:
+        stands_at_m = typed_place_m(each.at) if each.at else plate.point_under_pixel_m(*typed_pixel(each.at_pixel or ""))
+        one = OneObject(
+            glb=each.glb,
+            stands_at_m=stands_at_m,
+            height_m=_height_m(each.height, plate, stands_at_m[2]),
+            turn_rad=math.radians(each.turn),
+            world_from_camera=np.eye(3) if plate.world_from_camera is None else plate.world_from_camera,
+            shadow=shadow,
+        )
+        levels = [other.foot_m[1] / one.foot_m[1] for other in placed] if one.foot_m[1] and options.at_pixel else []
+        nearer = next((level for level in levels if abs(level - 1.0) < _SAME_LEVEL), 1.0)
+        x_m, y_m, z_m = stands_at_m
+        placed.append(one if nearer == 1.0 else replace(one, stands_at_m=(nearer * x_m, nearer * y_m, nearer * z_m)))
+    return placed
+
+
+def _grounds(objects: "Sequence[OneObject]") -> "list[list[OneObject]]":
+    """Return the objects by the level of ground on which they stand."""
+    grounds: list[list[OneObject]] = []
+    for each in objects:
+        same = (ground for ground in grounds if math.isclose(ground[0].foot_m[1], each.foot_m[1], rel_tol=_ROUNDING, abs_tol=_ROUNDING))
+        if (ground := next(same, None)) is None:
+            grounds.append([each])
+        else:
+            ground.append(each)
+    return grounds
+
+
+def objects_apart(options: CompositeOptions, plate: Plate, sharp: Sequence[Layer], kept: "KeptParts | None" = None) -> list[Layer]:
+    """Return each object alone, as if no other hid it. sharp: layers of all together."""
+    if len(options.standing.each) == 1:
+        return [sharp[0]]
+    filming, time_s = options.rendering.of_photograph.filming(), options.rendering.time
+    return [
+        _filmed(one.described(), filming, time_s, lambda seen, one=one: one.seen_by(seen.camera), kept)(plate)[0]  # type: ignore[misc]
+        for one in objects_of(options.standing, plate)
+    ]
 
 
 def _pixel_of(camera: Camera, place_m: tuple[float, float, float]) -> tuple[float, float]:
@@ -143,7 +195,7 @@ def held_upright(plate: Plate, options: ObjectOptions) -> Plate:
         return replace(plate, world_from_camera=looking_down(math.radians(options.pitch)))
     if plate.world_from_camera is not None or options.plain or not options.at_pixel:
         return plate
-    foot_px = pair_of(options.at_pixel)
+    foot_px = options.first_px
     plate.require_pixel(*foot_px)
     found = ground_under(plate, foot_px)
     if found is None:
@@ -154,16 +206,15 @@ def held_upright(plate: Plate, options: ObjectOptions) -> Plate:
     return replace(plate, world_from_camera=found)
 
 
-def _light(
-    options: ObjectOptions, plate: Plate, foot_px: tuple[float, float], world_from_camera: np.ndarray, kept: "KeptParts | None"
-) -> "Lighting":
-    """Return the light of an object: its panorama, even light, or what the photograph tells of it."""
+def _light(options: ObjectOptions, plate: Plate, foot_px: tuple[float, float], kept: "KeptParts | None") -> "Lighting":
+    """Return the light of objects: its panorama, even light, or what the photograph tells of it."""
     from mrbokeh.compositing.plate_light import is_sunlit, picture_light
     from mrbokeh.scene.staging.scene_description import Lighting
 
     if options.environment or options.plain:
         return Lighting(options.environment, exposure=options.exposure)
     lit = picture_light if kept is None else kept.light
+    world_from_camera = np.eye(3) if plate.world_from_camera is None else plate.world_from_camera
     made = lit(plate, foot_px, world_from_camera, None if options.sun is None else typed_sun(options.sun))
     if options.sun is None and is_sunlit(plate, foot_px):
         guess("by the exposure the sun shines: a soft light from behind the camera is taken (--sun RIGHT,ABOVE says where it is)")

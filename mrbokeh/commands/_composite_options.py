@@ -1,9 +1,10 @@
 """Options of `mrbokeh composite` alone, in groups."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -57,27 +58,51 @@ class PlateOptions(shared.NearOptions):
 
 
 @dataclass(frozen=True)
-class ObjectOptions:
-    """Options of how the --object stands: at or at_pixel, and its height, as typed; angles in degrees."""
+class Standing:
+    """How one object stands: at or at_pixel, and its height, as typed; turn in degrees."""
 
-    object_: Annotated[Path | None, typer.Option("--object", help="GLB file to render and put in.")] = None
-    at: Annotated[str | None, typer.Option(help="X,Y,Z in metres where the object stands: right, down, forward of the lens.")] = None
-    at_pixel: Annotated[
-        str | None,
+    glb: Path
+    at: str | None
+    at_pixel: str | None
+    height: str | None
+    turn: float
+
+
+@dataclass(frozen=True)
+class ObjectOptions:
+    """Options of how each --object stands: at or at_pixel, and its height, as typed; angles in degrees."""
+
+    object_: Annotated[
+        list[Path] | None,
         typer.Option(
-            help="X,Y of the pixel on which the object stands; without depth on level ground. Without --object the layers stand there: "
-            "their depth is scaled so that it is the photograph's at that pixel, which leaves them as they look."
+            "--object",
+            help="GLB file to render and put in; may be given several times, each with its place. Camera, level ground, guessed focus "
+            "and light are those of the first.",
+        ),
+    ] = None
+    at: Annotated[
+        list[str] | None,
+        typer.Option(help="X,Y,Z in metres where the object stands: right, down, forward of the lens. Once for each --object."),
+    ] = None
+    at_pixel: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="X,Y of the pixel on which the object stands; without depth on level ground. Once for each --object. Without --object "
+            "the layers stand there: their depth is scaled so that it is the photograph's at that pixel, which leaves them as they look."
         ),
     ] = None
     height: Annotated[
-        str | None,
+        list[str] | None,
         typer.Option(
             metavar="METRES|PIXELSpx",
-            help="Height of the object in metres, or such as 120px: as long as so many pixels are where it stands. Default: as in the "
-            "file, or a quarter of the picture where the metres of the stack are guessed.",
+            help="Height of the object in metres, or such as 120px: as long as so many pixels are where it stands. Once for all, or once "
+            "for each --object. Default: as in the file, or a quarter of the picture where the metres of the stack are guessed.",
         ),
     ] = None
-    turn: Annotated[float, typer.Option(help="Turn of the object about the vertical in degrees.")] = 0.0
+    turn: Annotated[
+        list[float] | None,
+        typer.Option(help="Turn of the object about the vertical in degrees. Once for all, or once for each --object. Default: 0."),
+    ] = None
     pitch: Annotated[
         float | None,
         typer.Option(help="How far the camera looks down, in degrees. Default: by the slope of the ground at --at-pixel, else 0."),
@@ -117,18 +142,38 @@ class ObjectOptions:
     @property
     def files(self) -> tuple[Path | None, ...]:
         """Input files of these options."""
-        return (self.object_, self.environment)
+        return (*(self.object_ or ()), self.environment)
+
+    @property
+    def each(self) -> tuple[Standing, ...]:
+        """How each object stands, in their order."""
+        glbs = self.object_ or []
+        columns = (_for_each(given, len(glbs)) for given in (self.at, self.at_pixel, self.height, self.turn))
+        rows = zip(glbs, *columns, strict=True)
+        return tuple(Standing(glb, at, at_pixel, height, turn or 0.0) for glb, at, at_pixel, height, turn in rows)
+
+    @property
+    def pixels(self) -> list[tuple[float, float]]:
+        """Pixels of --at-pixel."""
+        return [typed_pixel(each) for each in self.at_pixel or ()]
+
+    @property
+    def first_px(self) -> tuple[float, float]:
+        """Pixel on which the first object stands."""
+        return self.pixels[0]
 
     def require_meant(self, photo: Path, depth: Path | None, catch: str | None) -> None:
         """Raise InputError, before anything is opened, where options contradict one another or are no numbers of their kind."""
         if self.at and self.at_pixel:
             raise InputError("--at and --at-pixel both say where the object stands: give one of them")
-        if self.object_ is not None and not self.at and not self.at_pixel:
-            raise InputError("where does the object stand? Give --at X,Y,Z in metres, or --at-pixel X,Y")
+        self.require_places()
         of_place = ((self.at, typed_place_m), (self.at_pixel, typed_pixel), (self.height, typed_height))
-        for given, typed in (*of_place, (self.sun, typed_sun), (self.sun_by, typed_shadow)):
-            if given is not None:
-                typed(given)
+        for given, typed in of_place:
+            for text in given or ():
+                typed(text)
+        for light, typed_light in ((self.sun, typed_sun), (self.sun_by, typed_shadow)):
+            if light is not None:
+                typed_light(light)
         if self.sun and self.sun_by:
             raise InputError("--sun and --sun-by both say where the main light comes from: give one of them")
         told = f"--sun {self.sun}" if self.sun else f"--sun-by {self.sun_by}" if self.sun_by else ""
@@ -139,7 +184,7 @@ class ObjectOptions:
             )
         if told and self.plain:
             raise InputError(f"{told} needs the light that --plain leaves out: leave one of them out")
-        if self.object_ is not None and catch == "shadow" and not (self.plain or told or self.environment):
+        if self.object_ and catch == "shadow" and not (self.plain or told or self.environment):
             raise InputError(
                 "--catch shadow shows shadows of lights, and the photograph tells of none: say where one is with --sun RIGHT,ABOVE"
             )
@@ -150,6 +195,17 @@ class ObjectOptions:
         if self.camera_height is not None and (depth is not None or photo.is_dir() or not self.at_pixel or self.plain):
             raise InputError(_NO_USE_OF_HEIGHT.format(self.camera_height))
 
+    def require_places(self) -> None:
+        """Raise InputError unless there is a place for each object, and a height and a turn for each or one for all."""
+        if self.object_ and not self.at and not self.at_pixel:
+            raise InputError("where does the object stand? Give --at X,Y,Z in metres, or --at-pixel X,Y")
+        count = max(1, len(self.object_ or ()))
+        for name, given in (("at", self.at), ("at-pixel", self.at_pixel), ("height", self.height), ("turn", self.turn)):
+            or_one = name in ("height", "turn")
+            if given and len(given) != count and not (or_one and len(given) == 1):
+                expected = f"{count}, one for each --object" if count > 1 else "one"
+                raise InputError(f"--{name}: expected {expected}{', or one for all' * (or_one and count > 1)}, got {len(given)}")
+
     def require_no_depth(self) -> None:
         """Raise InputError where an option is given that only a photograph without depth needs."""
         if self.camera_height is not None:
@@ -159,6 +215,11 @@ class ObjectOptions:
 _NO_USE_OF_HEIGHT = (
     "--camera-height {:g} tells how far away --at-pixel is where there is no depth: leave it out with depth, a stack, --plain or --at"
 )
+
+
+def _for_each(given: Sequence[Any] | None, count: int) -> Sequence[Any]:
+    """Return a value for each of the objects: those given, the only one for all, or None."""
+    return [None] * count if not given else [*given] * count if len(given) == 1 else given
 
 
 def typed_place_m(text: str) -> tuple[float, float, float]:
@@ -237,7 +298,7 @@ class ResultOptions:
     preview: Annotated[
         bool,
         typer.Option(
-            "--preview", help="OUT is small, with the ground in metres, a box around the --object, its distance, size and blur: to try."
+            "--preview", help="OUT is small, with the ground in metres, a box around each --object, its distance, size and blur: to try."
         ),
     ] = False
     save_layer: Annotated[Path | None, typer.Option(help="Also write the blurred virtual layer (EXR with alpha).")] = None
@@ -284,7 +345,7 @@ class CompositeOptions:
     def guesses_ground(self) -> bool:
         """Whether an object stands on a pixel of a photograph in a file, and what is not told of that may be guessed."""
         standing = self.standing
-        return standing.object_ is not None and bool(standing.at_pixel) and not self.photo.is_dir() and not standing.plain
+        return bool(standing.object_) and bool(standing.at_pixel) and not self.photo.is_dir() and not standing.plain
 
     def require_meant(self, out: Path) -> None:
         """Raise InputError, before anything is opened, where options contradict one another, or a file that is needed is missing."""
@@ -293,10 +354,10 @@ class CompositeOptions:
             self._require_options_of_stacks()
         standing.require_meant(self.photo, taken.depth, self.rendering.catch)
         shared.require_one_focus(focus=self.optics.focus, focus_at=self.optics.focus_at)
-        if standing.object_ is not None:
-            require_file(standing.object_, "a GLB file")
-        self.result.require_meant(out, only_object=standing.object_ is not None and not virtual.layer, all_slices=taken.all_slices)
-        if virtual.camera is not None and virtual.scene is None and standing.object_ is None:
+        for glb in standing.object_ or ():
+            require_file(glb, "a GLB file")
+        self.result.require_meant(out, only_object=bool(standing.object_) and not virtual.layer, all_slices=taken.all_slices)
+        if virtual.camera is not None and virtual.scene is None and not standing.object_:
             raise InputError(f"--camera {virtual.camera} is for a --scene or an --object: give one, or leave it out")
 
     def _require_options_of_stacks(self) -> None:
@@ -320,13 +381,12 @@ class CompositeOptions:
         """Return the options for the photograph made smaller, by its width and height before and after: all that counts pixels follows."""
         if whole_px == small_px:
             return self
-        height = self.standing.height
-        if height is not None and height.endswith("px"):
-            height = f"{small_px[1] / whole_px[1] * typed_height(height)[0]:.9g}px"
-        at_pixel, sun_by = _scaled(self.standing.at_pixel, whole_px, small_px), self.standing.sun_by
-        sun_by = sun_by and ":".join(str(_scaled(each, whole_px, small_px)) for each in sun_by.split(":"))
+        factor, height, at_pixel = small_px[1] / whole_px[1], self.standing.height, self.standing.at_pixel
+        height = height and [f"{factor * typed_height(each)[0]:.9g}px" if each.endswith("px") else each for each in height]
+        at_pixel, sun_by = at_pixel and [_scaled(each, whole_px, small_px) for each in at_pixel], self.standing.sun_by
+        sun_by = sun_by and ":".join(_scaled(each, whole_px, small_px) for each in sun_by.split(":"))
         standing = replace(self.standing, at_pixel=at_pixel, height=height, sun_by=sun_by)
-        focus_at = _scaled(self.optics.focus_at, whole_px, small_px)
+        focus_at = self.optics.focus_at and _scaled(self.optics.focus_at, whole_px, small_px)
         focus_at = focus_at and ",".join(str(int(float(each))) for each in focus_at.split(","))
         return replace(self, standing=standing, optics=replace(self.optics, focus_at=focus_at))
 
@@ -334,9 +394,7 @@ class CompositeOptions:
 _INSIDE = 1e-3
 
 
-def _scaled(pair: str | None, whole_px: tuple[int, int], small_px: tuple[int, int]) -> str | None:
+def _scaled(pair: str, whole_px: tuple[int, int], small_px: tuple[int, int]) -> str:
     """Return a pixel of the whole as that of the small picture, within it."""
-    if pair is None:
-        return None
     places = zip(pair.split(","), whole_px, small_px, strict=False)
     return ",".join(f"{min(float(each) * small / whole, small - _INSIDE):.9g}" for each, whole, small in places)

@@ -10,7 +10,7 @@ import numpy as np
 from mrbokeh.commands._composite_layers import held_upright, layers_by
 from mrbokeh.commands._composite_options import CompositeOptions, ObjectOptions, typed_shadow
 from mrbokeh.commands._insertion_options import VirtualOptions
-from mrbokeh.commands._level_ground import focused_on_foot, on_level_ground, pair_of, sun_by_shadow
+from mrbokeh.commands._level_ground import focused_on_foot, on_level_ground, sun_by_shadow
 from mrbokeh.compositing.choose import best_mode, insertion_of
 from mrbokeh.compositing.ground import with_ground_behind
 from mrbokeh.compositing.near_and_far import nearer_than
@@ -40,7 +40,7 @@ class Composited:
 
 
 def placed(plate: Plate, options: CompositeOptions, known_height_m: float | None = None) -> tuple[Plate, CompositeOptions]:
-    """Return the plate held as its camera was, with its focus, and the options with the object's place: told, solved or guessed.
+    """Return the plate held as its camera was, with its focus, and the options with the objects' places: told, solved or guessed.
 
     known_height_m: of the camera above the ground. Raises InputError for a pixel that shows no ground.
     """
@@ -52,7 +52,7 @@ def placed(plate: Plate, options: CompositeOptions, known_height_m: float | None
         plate, standing = on_level_ground(plate, standing, known_height_m)
     elif options.guesses_ground:
         plate = focused_on_foot(plate, standing)
-    if standing.object_ is not None:
+    if standing.object_:
         plate = held_upright(plate, standing)
     if standing.sun_by is not None:
         standing = replace(standing, sun=sun_by_shadow(plate, *typed_shadow(standing.sun_by)), sun_by=None)
@@ -79,8 +79,8 @@ def composited(
     if asked is not None and not any((layer.alpha > 0).any() for layer in sharp):
         _nothing_seen(asked, options.virtual)
     if options.standing.at_pixel:
-        plate = with_ground_behind(plate, pair_of(options.standing.at_pixel), sharp)
-    if asked is not None and asked.object_ is not None and (warning := placing_warning(sharp, plate, mode, asked.height)):
+        plate = with_ground_behind(plate, options.standing.pixels, sharp)
+    if asked is not None and asked.object_ and (warning := placing_warning(sharp, plate, mode, " ".join(asked.height or ()))):
         warn(warning)
     with nullcontext() if kept else working("blurring"):
         inserted = finished(insertion.insert(plate, sharp, renderer), plate, finishing)
@@ -95,21 +95,22 @@ def insertion_by(options: CompositeOptions, plate: Plate) -> tuple[str, Insertio
 
 def _nothing_seen(standing: ObjectOptions, virtual: VirtualOptions) -> None:
     """Raise InputError if what was rendered is not in the picture; an empty layer of another program is only warned of."""
-    if standing.object_ is not None:
-        where = f"--at-pixel {standing.at_pixel}" if standing.at_pixel else f"--at {standing.at}"
+    if standing.object_:
+        where = " ".join([f"--at-pixel {each}" for each in standing.at_pixel or ()] + [f"--at {each}" for each in standing.at or ()])
         raise InputError(
-            f"nothing of {standing.object_} is in the picture: by {where} it stands beside the frame or is too small to be seen; choose "
-            f"another place with --at X,Y,Z (metres right, down, forward of the lens) or --at-pixel X,Y, or another --height"
+            f"nothing of {', '.join(map(str, standing.object_))} is in the picture: by {where} it stands beside the frame or is too small "
+            f"to be seen; choose another place with --at X,Y,Z (metres right, down, forward of the lens) or --at-pixel X,Y, or another "
+            f"--height"
         )
     if virtual.scene is not None:
         raise InputError(f"nothing of {virtual.scene} is in the picture: its objects are beside the frame or behind the --camera")
     warn("nothing of the layers is in the picture: their alpha is 0 everywhere")
 
 
-def placing_warning(sharp: Sequence[Layer], plate: Plate, mode: str, height: str | None) -> str | None:
+def placing_warning(sharp: Sequence[Layer], plate: Plate, mode: str, height: str) -> str | None:
     """Return a warning if an object is smaller than a pixel, reaches across the whole picture, or is mostly hidden; None else.
 
-    height: the option --height as typed, which mends the first two.
+    height: the option --height as typed, which mends the first two; "" without it.
     """
     alpha = np.maximum.reduce([layer.alpha for layer in sharp])
     rows, columns = np.nonzero(alpha > 0.5)

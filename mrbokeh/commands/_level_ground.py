@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.commands._composite_options import ObjectOptions, typed_pixel
+from mrbokeh.commands._composite_options import ObjectOptions
 from mrbokeh.compositing.plate import Plate
 from mrbokeh.scene.staging.scene_description import looking_down
 from mrbokeh.solving.solved_camera import GUESSED, KNOWN, LOW, SolvedCamera, read_solved_camera
@@ -25,13 +25,6 @@ _POINTED_PX, _SURE_DEG, _LEAST_FALL, _LOWEST_SUN = 4.0, 20.0, 1e-4, 0.01
 Pixel = tuple[float, float]
 
 
-def pair_of(at_pixel: str | None) -> tuple[float, float]:
-    """Return X and Y of --at-pixel. Raises InputError."""
-    if at_pixel is None:
-        raise InputError("where does the object stand? Give --at X,Y,Z in metres, or --at-pixel X,Y")
-    return typed_pixel(at_pixel)
-
-
 def with_camera_of_file(plate: Plate, path: Path) -> tuple[Plate, float | None]:
     """Return the plate as a camera of `mrbokeh capture solve` saw it, and the height of that camera in metres, if it is known."""
     solved = read_solved_camera(path)
@@ -46,27 +39,28 @@ def with_camera_of_file(plate: Plate, path: Path) -> tuple[Plate, float | None]:
 
 
 def on_level_ground(plate: Plate, standing: ObjectOptions, known_height_m: float | None = None) -> tuple[Plate, ObjectOptions]:
-    """Return the plate, upright and focused on the foot where nothing tells its focus, and the options with the foot's place on the ground.
+    """Return the plate, upright and focused on the first foot where nothing tells its focus, and the options with the feet's places.
 
-    known_height_m: of a solved camera; --camera-height comes before it. Raises InputError for a pixel that shows no ground.
+    All feet are on one level ground, whose depth below the camera the first one tells. known_height_m: of a solved camera;
+    --camera-height comes before it. Raises InputError for a pixel that shows no ground.
     """
-    x_px, y_px = pair_of(standing.at_pixel)
-    plate.require_pixel(x_px, y_px)
+    for foot_px in standing.pixels:
+        plate.require_pixel(*foot_px)
     taken = []
     if standing.pitch is not None:
         plate = replace(plate, world_from_camera=looking_down(math.radians(standing.pitch)))
     elif plate.world_from_camera is None:
         plate = _by_lines(plate)
-    ray = plate.camera.unproject(np.array([x_px, y_px]), np.array(1.0))
+    rays = [plate.camera.unproject(np.array(foot_px), np.array(1.0)) for foot_px in standing.pixels]
     if plate.world_from_camera is None:
-        down_rad = usual_tilt_rad(plate, ray)
+        down_rad = usual_tilt_rad(plate, rays[0])
         down_rad = down_rad if math.degrees(down_rad) >= 1.0 else 0.0
         plate = replace(plate, world_from_camera=looking_down(down_rad))
         held = f"to look down by {math.degrees(down_rad):.0f} degrees" if down_rad else "to be level"
         taken.append(f"the camera {held} (--pitch DEGREES)")
-    nearest_m = _ground_m(plate, ray, standing)
-    height_m, told = _camera_height_m(plate, standing.camera_height or known_height_m, nearest_m)
-    distance_m = height_m * nearest_m
+    nearest_m = [_ground_m(plate, *each) for each in zip(rays, standing.at_pixel or (), strict=True)]
+    height_m, told = _camera_height_m(plate, standing.camera_height or known_height_m, nearest_m[0])
+    distance_m = height_m * nearest_m[0]
     taken += [told] if told else []
     if plate.rough_focus_m is not None and plate.rough_focus_m[0] <= distance_m <= plate.rough_focus_m[1]:
         plate = replace(plate, lens=plate.lens.focused_at(distance_m))
@@ -75,16 +69,16 @@ def on_level_ground(plate: Plate, standing: ObjectOptions, known_height_m: float
         plate = replace(plate, lens=plate.lens.focused_at(distance_m))
     guess(f"there is no depth: mrbokeh takes {', '.join(taken)}" if taken else "")
     height = standing.height
-    if height is None:
-        height = f"{max(1.0, HIGH_SHARE * plate.rgb.shape[0]):.0f}px"
-        guess(f"the object is made {height} high, a quarter of the picture (--height METRES or such as 300px)")
-    place = ",".join(f"{each:.9g}" for each in distance_m * ray)
-    return plate, replace(standing, at=place, at_pixel=None, height=height)
+    if not height:
+        height = [f"{max(1.0, HIGH_SHARE * plate.rgb.shape[0]):.0f}px"]
+        guess(f"the object is made {height[0]} high, a quarter of the picture (--height METRES or such as 300px)")
+    places = [",".join(f"{each:.9g}" for each in height_m * along_m * ray) for along_m, ray in zip(nearest_m, rays, strict=True)]
+    return plate, replace(standing, at=places, at_pixel=None, height=height)
 
 
 def focused_on_foot(plate: Plate, standing: ObjectOptions) -> Plate:
-    """Return a plate with depth focused on the foot of an object, where nothing tells its focus."""
-    foot_m = plate.depth_at_m(*pair_of(standing.at_pixel))
+    """Return a plate with depth focused on the foot of the first object, where nothing tells its focus."""
+    foot_m = plate.depth_at_m(*standing.first_px)
     if plate.focus_known or not 0.0 < foot_m < math.inf:
         return plate
     guess(f"nothing tells the focus: it is taken to be on the object, {foot_m:.3g} m away (--focus METRES, --focus-at X,Y)")
@@ -145,13 +139,13 @@ def _sunwards(plate: Plate, pixels: Float[np.ndarray, "3 2"], *, strict: bool = 
     return towards
 
 
-def _ground_m(plate: Plate, ray: Float[np.ndarray, "3"], standing: ObjectOptions) -> float:
+def _ground_m(plate: Plate, ray: Float[np.ndarray, "3"], at_pixel: str) -> float:
     """Return how far the ground is along a ray of length 1 along the axis, for a camera 1 m above it."""
     assert plate.world_from_camera is not None
     falls, down_deg = float(plate.world_from_camera[1] @ ray), _down_deg(plate.world_from_camera)
     if falls <= 0.0:
         raise InputError(
-            f"--at-pixel {standing.at_pixel} lies above the horizon of a camera that looks down by {down_deg:.0f} degrees: choose a "
+            f"--at-pixel {at_pixel} lies above the horizon of a camera that looks down by {down_deg:.0f} degrees: choose a "
             f"lower pixel, say how far the camera looks down with --pitch DEGREES, or give --depth"
         )
     return 1.0 / falls

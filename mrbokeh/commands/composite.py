@@ -31,8 +31,11 @@ def composite(options: CompositeOptions, out: OutOption) -> None:
 
     Example: mrbokeh composite STACK --slice 3 --object cake.glb --at-pixel 300,250 --height 120px --out out.png
 
+    Example: mrbokeh composite photo.jpg --object cake.glb --at-pixel 800,900 --object alien.glb --at-pixel 1200,880 --out out.png
+
     Example: mrbokeh composite captures/20261122-101500 --out captured.png
     """
+    from mrbokeh.commands._composite_layers import objects_apart
     from mrbokeh.commands._composite_parts import alpha_lost, blur_told, check_outputs, write_results
     from mrbokeh.commands._composited import composited, placed
     from mrbokeh.commands._level_ground import with_camera_of_file
@@ -60,7 +63,8 @@ def composite(options: CompositeOptions, out: OutOption) -> None:
         plate, options, scale = smaller(plate, options)
     made = composited(plate, options, renderer, finishing, bundle=bundle, asked=asked)
     if options.result.preview:
-        tell(f"wrote the preview {out}: {write_preview_of(out, made.inserted, made.plate, made.sharp[0], scale)}")
+        objects = objects_apart(options, made.plate, made.sharp)
+        tell(f"wrote the preview {out}: {write_preview_of(out, made.inserted, made.plate, objects, scale)}")
         return
     write_results(out, made.inserted, made.plate, made.sharp, options.colour, options.result)
     if lost := alpha_lost(out, made.plate):
@@ -86,7 +90,7 @@ def _finishing(options: CompositeOptions, plate: "Plate", out: Path) -> "Finishi
     from mrbokeh.compositing.plate_look.finishing import finishing_of, matched_finishing
 
     photo, wanted, standing = options.photo, options.look.wanted, options.standing
-    if photo.is_dir() or standing.object_ is None or standing.plain or out.suffix.lower() == ".exr":
+    if photo.is_dir() or not standing.object_ or standing.plain or out.suffix.lower() == ".exr":
         return finishing_of(wanted, plate.rgb, None if photo.is_dir() else photo)
     uncompressed = options.result.preview or options.colour.of_plate is not None or options.colour.of_result is not None
     finishing, matched = matched_finishing(wanted, plate.rgb, photo, uncompressed=uncompressed)

@@ -60,18 +60,19 @@ def composite(
     all_in_focus: np.ndarray | File | None = None,
     slice_index: int | None = None,
     focus: float | tuple[float, float] | None = None,
-    at_pixel: tuple[float, float] | None = None,
-    height: float | str | None = None,
+    at_pixel: tuple[float, float] | Sequence[tuple[float, float]] | None = None,
+    height: float | str | Sequence[float | str] | None = None,
     mode: str | None = None,
     renderer: str | Renderer = DEFAULT,
 ) -> Rgb:
     """Put virtual objects into a photograph, blurred by its lens, before and behind what it shows; return linear Rec.709 (H, W, 3).
 
     photo: (H, W, 3) linear, a photograph's file, or the folder of a merged focal stack with the slice_index to put it into.
-    inserted: a GLB file, or sharp layers (Layer or EXR with R, G, B, A and Z in metres) of the photograph's size, front first.
+    inserted: GLB files, or sharp layers (Layer or EXR with R, G, B, A and Z in metres) of the photograph's size, front first.
     lens: a Lens or a lens file; None takes what the file or the stack tells. focus: metres, or a pixel (x, y); needs depth.
     depth_m: (H, W) metres, or any file that `mrbokeh composite --depth` takes. all_in_focus: the photograph without its blur, if known.
-    at_pixel: (x, y) on which a GLB stands, or to which the depth of layers is scaled. height: of a GLB in metres, or such as "120px".
+    at_pixel: (x, y) on which a GLB stands, one for each, or to which the depth of layers is scaled. height: of a GLB in metres, or such as
+    "120px"; one for each, or one for all.
     mode: front, over, matte, between or rerender; None takes the best that what is known allows.
     Raises InputError if something needed is unknown or of the wrong size.
 
@@ -104,15 +105,20 @@ def composite(
             raise InputError("to focus on a pixel the photograph needs depth: give depth_m, or focus in metres")
         plate = replace(plate, lens=_focused(plate.lens, focus, plate.depth_m))
     given = [inserted] if isinstance(inserted, (Layer, str, Path)) else list(inserted)
-    if len(given) == 1 and not isinstance(given[0], Layer) and Path(given[0]).suffix.lower() == ".glb":
-        stands = None if at_pixel is None else f"{at_pixel[0]},{at_pixel[1]}"
-        standing = ObjectOptions(object_=Path(given[0]), at_pixel=stands, height=None if height is None else str(height))
+    glbs = [Path(each) for each in given if not isinstance(each, Layer) and Path(each).suffix.lower() == ".glb"]
+    at_pixels = [f"{x_px},{y_px}" for x_px, y_px in np.reshape([] if at_pixel is None else at_pixel, (-1, 2)).tolist()]
+    heights = [] if height is None else [height] if isinstance(height, (float, int, str)) else height
+    standing = ObjectOptions(object_=glbs, at_pixel=at_pixels, height=[str(each) for each in heights])
+    standing.require_places()
+    if glbs and len(glbs) < len(given):
+        raise InputError("inserted: expected GLB files or layers, got some of both: put one into the picture of the other")
+    if glbs:
         layers = layers_by(CompositeOptions(Path(), standing=standing), held_upright(plate, standing))(plate)
     else:
         layers = [each if isinstance(each, Layer) else read_layer(each) for each in given]
-        layers = layers if at_pixel is None else standing_on_pixel(layers, plate, *at_pixel)
-    if at_pixel is not None:
-        plate = with_ground_behind(plate, at_pixel, layers)
+        layers = standing_on_pixel(layers, plate, *standing.first_px) if at_pixels else layers
+    if at_pixels:
+        plate = with_ground_behind(plate, standing.pixels, layers)
     return insertion_of(mode or best_mode(plate)).insert(plate, layers, _renderer(renderer)).rgb
 
 

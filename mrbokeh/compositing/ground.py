@@ -10,6 +10,8 @@ from mrbokeh.compositing.plate import Plate
 from mrbokeh.images.layer import Layer
 from mrbokeh.scene.staging.scene_description import looking_down
 
+Pixel = tuple[float, float]
+
 _SAME_SURFACE, _SURELY_SAME = 0.02, 0.01
 """Largest shares by which depth changes from pixel to pixel of one surface: along a table, and where no edge may be missed."""
 _FARTHER, _JUST_BEFORE = 0.05, np.float32(0.999)
@@ -20,7 +22,7 @@ _ROUNDS, _ROUGH, _EVEN = 10, 0.01, 0.02
 _STEEPEST_DEG, _ROLL_DEG = 60.0, 10.0
 
 
-def ground_under(plate: Plate, foot_px: tuple[float, float]) -> Float[np.ndarray, "3 3"] | None:
+def ground_under(plate: Plate, foot_px: Pixel) -> Float[np.ndarray, "3 3"] | None:
     """Return the rotation from camera axes to upright ones (x right, y down, z forward) by the ground's slope at a pixel, or None.
 
     The plane of the depth around the pixel is taken for level along the view; across it the camera is, as photographs are taken. None
@@ -60,32 +62,35 @@ def _plane_of(rays: Float[np.ndarray, "points 3"], near: Float[np.ndarray, " poi
     return -slope / np.linalg.norm(slope)
 
 
-def with_ground_behind(plate: Plate, foot_px: tuple[float, float], layers: Sequence[Layer]) -> Plate:
-    """Return the plate with the ground on which something stands no nearer than that, where it is seen above the foot.
+def with_ground_behind(plate: Plate, feet_px: Sequence[Pixel], layers: Sequence[Layer]) -> Plate:
+    """Return the plate with the ground on which things stand no nearer than those, where it is seen above their feet.
 
     A floor or a table is the farther the higher it is in the picture, so that it never hides what stands on it; depth that says otherwise
-    is wrong. The ground is what goes on from the foot without a jump of depth, but not below the foot, where near things stand.
+    is wrong. The ground is what goes on from a foot without a jump of depth, but not below the foot, where near things stand.
     """
     if plate.depth_m is None:
         return plate
     covered_m = np.minimum.reduce([np.where(layer.alpha > 0.0, layer.depth_m, np.inf) for layer in layers])
-    above = np.broadcast_to(np.arange(len(covered_m))[:, None] <= int(foot_px[1]), covered_m.shape)
-    ground = _same_surface(plate.depth_m, foot_px, above, _SAME_SURFACE) & np.isfinite(covered_m)
+    ground = np.zeros(covered_m.shape, bool)
+    for foot_px in feet_px:
+        above = np.broadcast_to(np.arange(len(covered_m))[:, None] <= int(foot_px[1]), covered_m.shape)
+        ground |= _same_surface(plate.depth_m, foot_px, above, _SAME_SURFACE) & np.isfinite(covered_m)
     return replace(plate, depth_m=np.where(ground, np.maximum(plate.depth_m, covered_m), plate.depth_m))
 
 
-def ended_shadow(plate: Plate, foot_px: tuple[float, float], objects: Layer, shadow: Layer) -> Layer:
-    """Return the shadow of objects as far as the ground goes on which they stand at a pixel.
+def ended_shadow(plate: Plate, feet_px: Sequence[Pixel], objects: Layer, shadow: Layer) -> Layer:
+    """Return the shadow of objects as far as the ground goes on which they stand at some pixels.
 
     It was drawn on a plane without end, and would hang sharp in the air over what lies blurred beyond a table's edge: past a jump of depth,
-    and clearly farther than the plane. A shadow apart from the foot, as of a thing in the air, stays. On the ground itself it lies as far
+    and clearly farther than the plane. A shadow apart from the feet, as of a thing in the air, stays. On the ground itself it lies as far
     away as that: a plane that is a little too far would be hidden by what it darkens.
     """
     covered = (objects.alpha > 0.0) | (shadow.alpha > 0.0)
     if plate.depth_m is None or not shadow.alpha.any():
         return shadow
-    beside = _same_surface(np.ones_like(plate.depth_m), foot_px, covered, _SURELY_SAME)
-    same = _same_surface(plate.depth_m, foot_px, covered, _SURELY_SAME)
+    even = np.ones_like(plate.depth_m)
+    beside = np.logical_or.reduce([_same_surface(even, foot_px, covered, _SURELY_SAME) for foot_px in feet_px])
+    same = np.logical_or.reduce([_same_surface(plate.depth_m, foot_px, covered, _SURELY_SAME) for foot_px in feet_px])
     beyond = beside & ~same & (plate.depth_m > shadow.depth_m * np.float32(1.0 + _FARTHER))
     return replace(
         shadow,
@@ -98,7 +103,7 @@ def ended_shadow(plate: Plate, foot_px: tuple[float, float], objects: Layer, sha
 
 
 def _same_surface(
-    depth_m: Float32[np.ndarray, "height width"], start_px: tuple[float, float], within: Bool[np.ndarray, "height width"], step: float
+    depth_m: Float32[np.ndarray, "height width"], start_px: Pixel, within: Bool[np.ndarray, "height width"], step: float
 ) -> Bool[np.ndarray, "height width"]:
     """Return the pixels (H, W) that are reached from one of them without a jump of depth by more than a share, and within a mask.
 

@@ -85,6 +85,7 @@ def _lost(
     """Return the radiance of white surfaces before objects came, and what these take of it."""
     lights, environment = scene.lighting
     objects = _Objects(scene.drawn_meshes)
+    apart = [_Objects(each.drawn_meshes) for each in scene.parts if each.drawn_meshes] if len(scene.parts) > 1 else [objects]
     total, taken = (np.zeros((len(surfaces.alpha), 3), np.float32) for _ in range(2))
     for light in lights:
         towards, distance_m, irradiance = light.arriving_at(surfaces.shadow_origin + centre_m)
@@ -96,7 +97,8 @@ def _lost(
         maps = lighting_maps(environment)
         table = reflected_share_table()
         add_environment(surfaces, maps.peaks, maps.irradiance, maps.reflections, table, maps.environment_from_world, total)
-        taken += _hidden_sky(objects, environment, surfaces, centre_m, samples)
+        for number, each in enumerate(apart):
+            taken += _hidden_sky(each, apart[:number], environment, surfaces, centre_m, samples)
     return total, taken
 
 
@@ -139,9 +141,14 @@ class _Objects:
 
 
 def _hidden_sky(
-    objects: _Objects, environment: Environment, surfaces: Surfaces, centre_m: Float64[np.ndarray, "3"], samples: int
+    objects: _Objects,
+    others: Sequence[_Objects],
+    environment: Environment,
+    surfaces: Surfaces,
+    centre_m: Float64[np.ndarray, "3"],
+    samples: int,
 ) -> Float32[np.ndarray, "points 3"]:
-    """Radiance that white surfaces lose as objects stand before the environment."""
+    """Radiance that white surfaces lose as objects, but no others, stand before the environment."""
     lost = np.zeros((len(surfaces.alpha), 3), np.float32)
     points_m = surfaces.shadow_origin + centre_m
     sine2 = (objects.radius_m / np.maximum(np.linalg.norm(objects.middle_m - points_m, axis=1), 1e-12)) ** 2
@@ -157,6 +164,8 @@ def _hidden_sky(
         weight *= np.maximum(np.einsum("psk,pk->ps", towards, normals), 0.0) / np.pi
         point, sample = np.nonzero(weight > 0)
         hidden = objects.hidden(points_m[some[point]], towards[point, sample], np.full(len(point), np.inf))
+        for each in others:
+            hidden *= 1.0 - each.hidden(points_m[some[point]], towards[point, sample], np.full(len(point), np.inf))
         met = np.flatnonzero(hidden)
         point, sample = point[met], sample[met]
         light = (weight[point, sample] * hidden[met])[:, None] * _radiance(environment, towards[point, sample])

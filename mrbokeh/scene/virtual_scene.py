@@ -23,12 +23,14 @@ The front of a glTF model (+z there) so faces a camera whose camera_from_world i
 class Scene:
     """Meshes and lights in world space (metres; up is -y where nobody says otherwise) and the light from all around.
 
-    With neither lights nor environment a scene is lit by `neutral_environment()`, so that a bare object is seen.
+    With neither lights nor environment a scene is lit by `neutral_environment()`, so that a bare object is seen. parts: the objects of
+    which it was made, where that is known: light beside things far apart is found the sooner for each of them.
     """
 
     meshes: tuple[Mesh, ...] = ()
     lights: tuple[Light, ...] = ()
     environment: Environment | None = None
+    parts: tuple["Scene", ...] = ()
 
     @property
     def lighting(self) -> tuple[tuple[Light, ...], Environment | None]:
@@ -50,6 +52,7 @@ class Scene:
             self,
             meshes=tuple(mesh.transformed(world_from_scene) for mesh in self.meshes),
             lights=tuple(light.transformed(world_from_scene) for light in self.lights),
+            parts=tuple(each.transformed(world_from_scene) for each in self.parts),
         )
 
     def with_lights(self, *lights: Light) -> "Scene":

@@ -124,7 +124,7 @@ def test_the_ground_never_hides_what_stands_on_it_and_a_post_before_it_does() ->
     card = Layer(np.repeat(alpha[..., None], 3, axis=2), alpha, np.where(alpha > 0, foot_m, np.inf).astype(np.float32))
     plate = plate_of(plate_rgb(), replace(LENS, focus_distance_m=foot_m), wrong_m)
     hidden, whole = (
-        insertion_of("over").insert(each, [card], ScatterReference()).rgb for each in (plate, with_ground_behind(plate, (72, 70), [card]))
+        insertion_of("over").insert(each, [card], ScatterReference()).rgb for each in (plate, with_ground_behind(plate, [(72, 70)], [card]))
     )
     assert hidden[40, 120].max() < 0.5 < 0.95 < whole[40, 120].min(), "where depth is wrong"
     assert whole[60, 30].max() < 0.5, "the post, whose own foot is nearer"
@@ -153,11 +153,11 @@ def test_a_shadow_ends_where_the_table_ends() -> None:
     plate = plate_of(plate_rgb(), replace(LENS, focus_distance_m=1.5), np.where(columns < 80, plane_m * noise, np.float32(8.0)))
     alpha = ((abs(rows - 60) < 10) & (abs(columns - 90) < 30)).astype(np.float32)
     shadow = Layer(np.zeros((HEIGHT, WIDTH, 3), np.float32), alpha, np.where(alpha > 0, plane_m, np.inf).astype(np.float32))
-    ended = ended_shadow(plate, (65, 60), shadow, shadow).alpha
+    ended = ended_shadow(plate, [(65, 60)], shadow, shadow).alpha
     # A pixel's depth is that of 5x5, so that the edge is found two pixels off at most.
     np.testing.assert_array_equal(ended[:, :78], alpha[:, :78])
     np.testing.assert_array_equal(ended[:, 82:], 0.0)
-    np.testing.assert_array_equal(ended_shadow(plate, (20, 60), shadow, shadow).alpha, alpha)
+    np.testing.assert_array_equal(ended_shadow(plate, [(20, 60)], shadow, shadow).alpha, alpha)
 
 
 @pytest.mark.parametrize(

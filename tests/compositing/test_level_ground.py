@@ -16,7 +16,7 @@ from mrbokeh.system.errors import InputError
 from tests.support.projected_places import place
 
 LENS = Lens(focal_length_mm=35.0, f_number=4.0, focus_distance_m=float("inf"), sensor_width_mm=36.0)
-FOOT = ObjectOptions(object_=Path("cake.glb"), at_pixel="500,450", height="50px")
+FOOT = ObjectOptions(object_=[Path("cake.glb")], at_pixel=["500,450"], height=["50px"])
 
 
 def photograph(focus_m: float = float("inf"), **known: bool) -> Plate:
@@ -24,9 +24,9 @@ def photograph(focus_m: float = float("inf"), **known: bool) -> Plate:
     return replace(plate_of(np.full((600, 800, 3), 0.2, np.float32), LENS.focused_at(focus_m)), **known)
 
 
-def place_m(standing: ObjectOptions) -> np.ndarray:
+def place_m(standing: ObjectOptions, number: int = 0) -> np.ndarray:
     assert standing.at is not None
-    return np.array([float(each) for each in standing.at.split(",")])
+    return np.array([float(each) for each in standing.at[number].split(",")])
 
 
 @pytest.mark.parametrize("pitch_deg", [0.0, 20.0])
@@ -69,7 +69,7 @@ def plate_focal_px() -> float:
 @pytest.mark.parametrize(("focus_m", "row", "below_deg"), [(float("inf"), 300, 10.0), (4.8, 300, 14.48), (1.0, 300, 30.0)])
 def test_where_nothing_tells_ground_lies_as_deep_as_it_usually_does(focus_m: float, row: int, below_deg: float) -> None:
     """In the middle of the picture, where no ground is seen by a level camera: 1.2 m at 4.8 m are 14.5 degrees, half of 1 m is 30."""
-    plate, standing = on_level_ground(photograph(focus_m, focus_known=focus_m < float("inf")), replace(FOOT, at_pixel=f"400,{row}"))
+    plate, standing = on_level_ground(photograph(focus_m, focus_known=focus_m < float("inf")), replace(FOOT, at_pixel=[f"400,{row}"]))
     assert plate.world_from_camera is not None
     foot_m = plate.world_from_camera @ place_m(standing)
     assert np.degrees(np.arctan2(foot_m[1], foot_m[2])) == pytest.approx(below_deg, abs=0.01)
@@ -81,7 +81,7 @@ def test_straight_lines_tell_how_the_camera_was_held_and_its_field_of_view() -> 
     made = place("room", 101, 24.0)
     rgb = made.linear()
     guessed = replace(plate_of(rgb, LENS), view_known=False, focus_known=False)
-    plate, standing = on_level_ground(guessed, replace(FOOT, at_pixel="700,900"))
+    plate, standing = on_level_ground(guessed, replace(FOOT, at_pixel=["700,900"]))
     assert plate.camera.focal_px[0] == pytest.approx(made.focal_px, rel=0.03)
     assert plate.lens.focal_length_mm == pytest.approx(24.0, rel=0.03)
     assert plate.world_from_camera is not None
@@ -106,8 +106,8 @@ def test_a_solved_camera_of_a_file_comes_first(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("change", "words"), [
-    ({"pitch": 0.0, "at_pixel": "500,250"}, "above the horizon of a camera that looks down by 0 degrees"),
-    ({"at_pixel": "900,250"}, "outside the photograph of 800x600 px"),
+    ({"pitch": 0.0, "at_pixel": ["500,250"]}, "above the horizon of a camera that looks down by 0 degrees"),
+    ({"at_pixel": ["900,250"]}, "outside the photograph of 800x600 px"),
 ])  # fmt: skip
 def test_a_pixel_without_ground_is_refused(change: dict[str, object], words: str) -> None:
     with pytest.raises(InputError, match=words):

@@ -78,6 +78,8 @@ def test_the_command_line_of_a_state_says_its_options(photo: Path, changes: dict
     wanted = {each.name: getattr(group, each.name) for group in groups for each in fields(group)}
 
     def plain(value: Any) -> Any:
+        if isinstance(value, list):
+            return [plain(each) for each in value] or None
         return value.absolute() if isinstance(value, Path) else value or None
 
     assert {name: plain(parsed[name]) for name in wanted} == {name: plain(value) for name, value in wanted.items()}
@@ -233,7 +235,7 @@ def test_of_each_page_only_the_newest_picture_is_made(photo: Path) -> None:
         assert answers[:-1] == [None, None] and answers[-1] is not None and first.result(1) is not None
         told, jpeg = other.result(60)  # type: ignore[misc]
         assert told["draft"] and jpeg[:2] == b"\xff\xd8"
-        bad = previewer.ask("one", Wish(opened, replace(options, standing=replace(options.standing, at_pixel="9,3")), 1e4, draft=True))
+        bad = previewer.ask("one", Wish(opened, replace(options, standing=replace(options.standing, at_pixel=["9,3"])), 1e4, draft=True))
         with pytest.raises(InputError, match="horizon"):
             bad.result(60)
     finally:

@@ -23,10 +23,10 @@ def options_of(state: StudioState) -> CompositeOptions:
     if state.at_px is None:
         raise InputError("the object has no place yet: click into the photograph where it is to stand")
     standing = ObjectOptions(
-        object_=state.object,
-        at_pixel=_numbers(state.at_px),
-        height=state.height,
-        turn=state.turn_deg,
+        object_=[state.object],
+        at_pixel=[_numbers(state.at_px)],
+        height=None if state.height is None else [state.height],
+        turn=[state.turn_deg] if state.turn_deg else None,
         pitch=state.pitch_deg,
         camera_height=None if state.plain or state.depth is not None else state.camera_height_m,
         sun=None if state.sun_deg is None else _numbers(state.sun_deg),

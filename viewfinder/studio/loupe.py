@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.commands._composite_kept import KeptParts
+from mrbokeh.commands._composite_layers import objects_of
 from mrbokeh.commands._composite_options import CompositeOptions
 from mrbokeh.commands._composited import composited, placed
-from mrbokeh.commands._level_ground import pair_of
 from mrbokeh.compositing.plate import Plate, phone_photo
 from mrbokeh.compositing.plate_look.finishing import Finishing
 from mrbokeh.layering.pixel_box import Box, is_same_everywhere
@@ -105,6 +105,6 @@ def _standing(whole: WholePhotograph, options: CompositeOptions) -> tuple[Plate,
     plate, options = placed(plate, options, known_height_m)
     standing = options.standing
     if standing.at_pixel:
-        place_m = plate.point_under_pixel_m(*pair_of(standing.at_pixel))
-        standing = replace(standing, at=",".join(f"{each:.9g}" for each in place_m), at_pixel=None)
+        places = [",".join(f"{each:.9g}" for each in one.stands_at_m) for one in objects_of(standing, plate)]
+        standing = replace(standing, at=places, at_pixel=None)
     return plate, renderer, replace(options, standing=standing)

@@ -10,7 +10,7 @@ from jaxtyping import Float32
 from mrbokeh.commands._composite_layers import held_upright
 from mrbokeh.commands._composite_options import CompositeOptions
 from mrbokeh.commands._insertion_options import focused_at_pixel, require_one_focus
-from mrbokeh.commands._level_ground import HIGH_SHARE, on_level_ground, pair_of, usual_tilt_rad, with_camera_of_file
+from mrbokeh.commands._level_ground import HIGH_SHARE, on_level_ground, usual_tilt_rad, with_camera_of_file
 from mrbokeh.compositing.plate import HeldLens, LensWishes, Plate, held_lens, phone_photo, photograph_plate, shrunk, with_depth
 from mrbokeh.compositing.plate_look.finishing import Finishing
 from mrbokeh.depth.depth_map import DepthSettings
@@ -95,7 +95,7 @@ class OpenedPhotograph:
         if standing.pitch is not None:
             plate = replace(plate, world_from_camera=looking_down(np.radians(standing.pitch)))
         elif plate.world_from_camera is None:
-            foot_px = pair_of(self.small(options, most_px).standing.at_pixel)
+            foot_px = self.small(options, most_px).standing.first_px
             down_rad = usual_tilt_rad(plate, plate.camera.unproject(np.array(foot_px), np.array(1.0)))
             plate = replace(plate, world_from_camera=looking_down(down_rad if down_rad >= np.radians(_LEAST_TILT_DEG) else 0.0))
         return plate, renderer, known_height_m
@@ -176,14 +176,14 @@ def placed(state: StudioState, opened: OpenedPhotograph) -> StudioState:
     if plate.depth_m is not None:
         if plate.metres_guessed:
             return replace(state, height=f"{HIGH_SHARE * opened.size_px[1]:.0f}px")
-        depth_m = plate.point_under_pixel_m(*pair_of(standing.at_pixel))[2]
+        depth_m = plate.point_under_pixel_m(*standing.first_px)[2]
         return replace(state, height=f"{plate.length_m(high_px, depth_m):.3g}")
     if not is_told:
         state = replace(state, pitch_deg=round(looks_down_deg(plate), 2))
         standing = replace(standing, pitch=state.pitch_deg)
     plate, on_ground = on_level_ground(plate, standing, known_height_m)
     assert on_ground.at is not None and plate.world_from_camera is not None
-    foot_m = np.array([float(each) for each in on_ground.at.split(",")])
+    foot_m = np.array([float(each) for each in on_ground.at[0].split(",")])
     eyes_m = float(plate.world_from_camera[1] @ foot_m)
     height = state.height or f"{plate.length_m(high_px, foot_m[2]):.3g}"
     return replace(state, camera_height_m=state.camera_height_m or float(f"{eyes_m:.4g}"), height=height)

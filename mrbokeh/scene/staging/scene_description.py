@@ -106,14 +106,27 @@ class OneObject:
     light: Lighting = field(default_factory=Lighting)
     shadow: float = 0.0
 
-    def described(self) -> SceneDescription:
-        """The scene in a world whose vertical is true and whose origin is the camera."""
-        foot_m = self.world_from_camera @ np.asarray(self.stands_at_m)
-        place = (float(foot_m[0]), float(foot_m[1]), float(foot_m[2]))
-        placed = PlacedObject(name=self.glb.stem, glb=self.glb, position_m=place, yaw_rad=self.turn_rad, height_m=self.height_m)
-        size_m = max(_SHADOW_SIZE_M, _SHADOW_HEIGHTS * (self.height_m or 0.0))
-        shadow = ShadowPlane(size_m, self.shadow, place) if self.shadow > 0 else None
-        return SceneDescription(path=self.glb, up="-y", objects=(placed,), light=self.light, shadow=shadow)
+    @property
+    def foot_m(self) -> Triple:
+        """Where it stands in a world whose vertical is true and whose origin is the camera."""
+        x_m, y_m, z_m = (self.world_from_camera @ np.asarray(self.stands_at_m)).tolist()
+        return x_m, y_m, z_m
+
+    def described(self, *beside: "OneObject") -> SceneDescription:
+        """Return the scene of the object, and of others beside it on its ground, in its light."""
+        together = (self, *beside)
+        placed = tuple(
+            PlacedObject(
+                name=f"{each.glb.stem} {number}", glb=each.glb, position_m=each.foot_m, yaw_rad=each.turn_rad, height_m=each.height_m
+            )
+            for number, each in enumerate(together, 1)
+        )
+        lowest, highest = np.min([each.foot_m for each in together], axis=0), np.max([each.foot_m for each in together], axis=0)
+        x_m, _, z_m = ((lowest + highest) / 2).tolist()
+        size_m = max(_SHADOW_SIZE_M, _SHADOW_HEIGHTS * max(each.height_m or 0.0 for each in together))
+        size_m += float((highest - lowest)[[0, 2]].max())
+        shadow = ShadowPlane(size_m, self.shadow, (x_m, self.foot_m[1], z_m)) if self.shadow > 0 else None
+        return SceneDescription(path=self.glb, up="-y", objects=placed, light=self.light, shadow=shadow)
 
     def seen_by(self, camera: Camera) -> Camera:
         """The camera in that world."""

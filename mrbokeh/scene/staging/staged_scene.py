@@ -217,7 +217,7 @@ class StagedScene:
         if made is None or made[0] != moment_s:
             parts = {each.placed.name: each.scene_at(moment_s) for each in self.objects if each.placed.visible}
             environment, lights = self._lighting
-            whole = Scene(tuple(mesh for part in parts.values() for mesh in part.meshes), lights, environment)
+            whole = Scene(tuple(mesh for part in parts.values() for mesh in part.meshes), lights, environment, tuple(parts.values()))
             made = self._made = moment_s, whole, parts
         return made[1], made[2]
 
