@@ -243,7 +243,7 @@ def open_depth(source: Path, photo_rgb: Rgb, settings: DepthSettings | None = No
     _require_same_aspect(source, depth, photo_rgb)
     filled = with_holes_filled(depth)
     refine = is_soft if settings.refined is None else settings.refined
-    return _at_size_of(filled, photo_rgb, refine)
+    return at_size_of(filled, photo_rgb, refine)
 
 
 def _read(source: Path, photo_rgb: Rgb, settings: DepthSettings) -> tuple[DepthMap, bool]:
@@ -268,7 +268,8 @@ def _require_same_aspect(source: Path, depth: DepthMap, photo_rgb: Rgb) -> None:
         )
 
 
-def _at_size_of(depth: DepthMap, photo_rgb: Rgb, refine: bool) -> DepthMap:
+def at_size_of(depth: DepthMap, photo_rgb: Rgb, refine: bool) -> DepthMap:
+    """Return the map at the size of its photograph. refine: along its edges, for a map whose own are soft or misplaced."""
     import cv2
 
     height, width = photo_rgb.shape[:2]
