@@ -4,7 +4,7 @@ Both are turned until the camera moves along their rows, in whatever direction i
 finds each pixel's shift, and drops what the two directions of matching do not agree on: what one picture hides, and what moved.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -12,7 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, UInt8
 
 from mrbokeh.depth.camera_movement import Movement, camera_movement
-from mrbokeh.depth.depth_map import DepthMap, with_holes_filled
+from mrbokeh.depth.depth_filters import interpolate
+from mrbokeh.depth.depth_map import DepthMap
 from mrbokeh.depth.open_depth import at_size_of
 from mrbokeh.images.color import luminance
 from mrbokeh.optics.camera import Camera
@@ -29,6 +30,7 @@ _BRIGHTEST = 1.2
 _QUANTILES = 65
 _WINDOW_PX, _STEP_COST, _JUMP_COST, _UNIQUE_PERCENT = 3, 8, 32, 15
 _SPECKLE_PX, _STEPS_PER_PX = 200, 16
+_SPILL_PX, _MEDIAN_PX, _FILL_PX, _CONTRAST = 6, 5, 40.0, 0.03
 _LEAST_MEASURED = 0.3
 
 
@@ -52,8 +54,8 @@ def stereo_depth(first_rgb: Rgb, second_rgb: Rgb, camera: Camera, baseline_m: fl
             f"{told} agree on only {100 * share:.0f} % of the picture: expected a still scene with structure, photographed from places "
             f"that are closer to one another"
         )
-    depth = DepthMap.of_dioptres(matched.nearness / np.float32(baseline_m), matched.known, f"stereo with {photos[1].name}")
-    return at_size_of(replace(with_holes_filled(depth), valid=matched.measured), first_rgb, refine=True)
+    dioptres = _filled(matched, first_rgb) / np.float32(baseline_m)
+    return at_size_of(DepthMap.of_dioptres(dioptres, matched.measured, f"stereo with {photos[1].name}"), first_rgb, refine=True)
 
 
 def _resized(camera: Camera, scale: float) -> Camera:
@@ -111,7 +113,9 @@ def _matched(first: Grey, second: Grey, camera: Camera, movement: Movement) -> "
     least = max(int(0.6 * farthest) - 4, -4)
     shifts = 16 * int(np.ceil((1.25 * nearest + 4 - least) / 16))
     rows = _rows(camera, movement, max(shifts + least, 0))
-    turned = [cv2.warpPerspective(each, by, rows.size_px, flags=cv2.INTER_CUBIC) for each, by in ((first, rows.first), (second, rows.second))]
+    turned = [
+        cv2.warpPerspective(each, by, rows.size_px, flags=cv2.INTER_CUBIC) for each, by in ((first, rows.first), (second, rows.second))
+    ]
     matcher = cv2.StereoSGBM.create(
         minDisparity=least,
         numDisparities=shifts,
@@ -128,7 +132,9 @@ def _matched(first: Grey, second: Grey, camera: Camera, movement: Movement) -> "
     shift_px = matcher.compute(*turned).astype(np.float32) / _STEPS_PER_PX
     seen = cv2.warpPerspective(np.ones_like(second), rows.second, rows.size_px, flags=cv2.INTER_NEAREST)
     across, down = np.meshgrid(np.arange(rows.size_px[0], dtype=np.float32), np.arange(rows.size_px[1], dtype=np.float32))
-    known = (shift_px >= least) & (cv2.remap(seen, across - shift_px, down, cv2.INTER_NEAREST) > 0)
+    known = shift_px >= least
+    for least_seen_px in (shift_px, np.full_like(shift_px, np.median(shift_px[known]) if known.any() else 0.0)):
+        known &= cv2.remap(seen, across - least_seen_px, down, cv2.INTER_NEAREST) > 0
     filled = _behind(np.where(known, shift_px, np.nan).astype(np.float32))
     plane = (camera.pixel_centres_px() - camera.principal_px) / focal_px
     per_px = ((plane @ rows.along[:2] + rows.along[2]) / focal_px).astype(np.float32)
@@ -148,9 +154,20 @@ class _Matched:
     measured: Bool[np.ndarray, "height width"]
 
 
-def _behind(values: Plane) -> Plane:
-    """Fill holes between two known pixels of a row by the lower of both: what one picture hides lies behind."""
-    columns, known = np.arange(values.shape[1]), np.isfinite(values)
+def _behind(shift_px: Plane) -> Plane:
+    """Fill holes of a row that are as wide as one picture hides, by the lower shift of both sides: what is hidden lies behind."""
+    columns, known = np.arange(shift_px.shape[1]), np.isfinite(shift_px)
     before = np.maximum.accumulate(np.where(known, columns, 0), axis=1)
     after = np.minimum.accumulate(np.where(known, columns, columns[-1])[:, ::-1], axis=1)[:, ::-1]
-    return np.minimum(*(np.take_along_axis(values, each, axis=1) for each in (before, after)))
+    left, right = (np.take_along_axis(shift_px, each, axis=1) for each in (before, after))
+    hidden = after - before <= np.abs(right - left) + _SPILL_PX
+    return np.where(known, shift_px, np.where(hidden, np.minimum(left, right), np.nan)).astype(np.float32)
+
+
+def _filled(matched: _Matched, first_rgb: Rgb) -> Plane:
+    """Return the nearness with holes filled from their surroundings, up to edges of the photograph."""
+    known = matched.known
+    steady = np.where(known, cv2.medianBlur(matched.nearness, _MEDIAN_PX), 0.0)
+    guide = np.sqrt(np.clip(cv2.resize(first_rgb, known.shape[::-1], interpolation=cv2.INTER_AREA), 0.0, 1.0))
+    around = interpolate(steady, known.astype(np.float32), guide, _FILL_PX**2, _CONTRAST)
+    return np.where(known, steady, around).astype(np.float32)
