@@ -312,14 +312,14 @@ def with_stereo(
     plate: Plate, second_rgb: Float32[np.ndarray, "height width 3"], baseline_m: float | None, photos: tuple[Path, Path]
 ) -> Plate:
     """Return the plate with depth from a second photograph beside it. baseline_m: how far the camera moved; None is guessed, and said."""
+    seen_rgb = plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb
+    depth = stereo_depth(seen_rgb, second_rgb, plate.camera, baseline_m or _HANDS_BREADTH_M, photos)
     guess(
         f"how far the camera moved from {photos[0]} to {photos[1]} is guessed, {_HANDS_BREADTH_M:g} m, and all metres with it (--baseline "
         f"METRES)"
         if baseline_m is None
         else ""
     )
-    seen_rgb = plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb
-    depth = stereo_depth(seen_rgb, second_rgb, plate.camera, baseline_m or _HANDS_BREADTH_M, photos)
     return replace(plate, depth_m=depth.depth_m, depth_note="", metres_guessed=baseline_m is None)
 
 

@@ -4,17 +4,18 @@ Points are found by SIFT (Lowe 2004), the movement by the five-point method (Nis
 the points' distances from their epipolar lines.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 
 Grey = UInt8[np.ndarray, "height width"]
 Points = Float[np.ndarray, "points 2"]
+Rays = Float[np.ndarray, "points 3"]
 Turn = Float[np.ndarray, "3 3"]
 Way = Float[np.ndarray, " 3"]
 
@@ -22,7 +23,8 @@ LEAST_NEARNESS = 0.01
 """Least movement as a share of the distance of the nearest things: below it a disparity off by a quarter of a pixel is 3 % of depth."""
 _MOST_FEATURES, _FAINTEST, _BEST_BY = 8000, 0.02, 0.8
 _LEAST_POINTS, _LEAST_SHARE = 40, 0.3
-_WITHIN_PX, _SOFT_PX = 1.0, 0.5
+_WITHIN_PX, _ROUNDS = 1.0, 2
+_SHIFTS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 1.0, 0.0), (1.0, -1.0, 0.0), (0.0, 0.0, 1.0))
 _LEAST_PARALLAX_PX = 2.0
 _MOST_AHEAD = 0.7
 _NEAREST_PERCENT = 95.0
@@ -46,22 +48,16 @@ def camera_movement(first: Grey, second: Grey, camera: Camera, told: str) -> Mov
 
     Raises InputError where they show too little that is common, or show no parallax, or where the camera went ahead or zoomed.
     """
-    here_px, there_px = _common_points(first, second)
     focal_px, middle_px = camera.focal_px[0], np.asarray(camera.principal_px)
-    matrix = np.array([[focal_px, 0.0, 0.0], [0.0, focal_px, 0.0], [0.0, 0.0, 1.0]])
-    here_px, there_px = here_px - middle_px, there_px - middle_px
-    found = np.zeros(len(here_px), bool)
-    if len(here_px) >= _LEAST_POINTS:
-        essential, mask = cv2.findEssentialMat(here_px, there_px, matrix, method=cv2.USAC_MAGSAC, prob=0.9999, threshold=_WITHIN_PX)
-        found = found if mask is None else mask.ravel() > 0
-    if found.sum() < max(_LEAST_POINTS, _LEAST_SHARE * len(found)):
+    here, there = (_rays((each - middle_px) / focal_px) for each in _common_points(first, second))
+    pair, good = _likeliest(here, there, _WITHIN_PX / focal_px)
+    if good.sum() < max(_LEAST_POINTS, _LEAST_SHARE * len(good)):
         raise InputError(
-            f"{told} have too little in common for depth, {found.sum()} points of at least {_LEAST_POINTS}: expected one still scene, "
+            f"{told} have too little in common for depth, {good.sum()} points of at least {_LEAST_POINTS}: expected one still scene, "
             f"photographed twice from places a hand's breadth apart"
         )
-    here, there = (_rays(each[found] / focal_px) for each in (here_px, there_px))
-    _, turn, shift, _ = cv2.recoverPose(essential[:3], here_px[found], there_px[found], matrix)
-    movement = _refined(turn, shift.ravel(), here, there, _SOFT_PX / focal_px)
+    here, there = here[good], there[good]
+    movement = Movement(pair.turn, -pair.turn.T @ pair.shift, pair.nearness(here, there))
     parallax_px = focal_px * np.percentile(np.linalg.norm(here @ _best_turn(here, there).T - there, axis=1), _NEAREST_PERCENT)
     if parallax_px < _LEAST_PARALLAX_PX or np.percentile(movement.nearness, _NEAREST_PERCENT) < LEAST_NEARNESS:
         raise InputError(
@@ -88,34 +84,75 @@ def _common_points(first: Grey, second: Grey) -> tuple[Points, Points]:
     return points_px[:, 0], points_px[:, 1]
 
 
-def _rays(plane: Points) -> Float[np.ndarray, "points 3"]:
+def _rays(plane: Points) -> Rays:
     return np.concatenate([plane, np.ones_like(plane[:, :1])], axis=1)
 
 
-def _refined(turn: Turn, shift: Way, here: np.ndarray, there: np.ndarray, soft: float) -> Movement:
-    """Return the movement near a first one that brings points closest to their epipolar lines."""
-    from scipy.optimize import least_squares
+@dataclass(frozen=True)
+class _Pair:
+    """Pose of the second camera: a point here lies there along turn here + nearness shift."""
 
-    across = np.linalg.svd(shift[None])[2][1:]
+    turn: Turn
+    shift: Way
 
-    def moved(by: np.ndarray) -> tuple[Turn, Way]:
-        shifted = shift + by[3:] @ across
-        return cv2.Rodrigues(by[:3])[0] @ turn, shifted / np.linalg.norm(shifted)
-
-    def apart(by: np.ndarray) -> np.ndarray:
-        turned, shifted = moved(by)
-        essential = np.cross(shifted, turned, axisb=0).T
+    def apart(self, here: Rays, there: Rays) -> Float[np.ndarray, " points"]:
+        """Return how far points are from their epipolar lines, as Sampson has it, on the plane of rays."""
+        essential = np.cross(self.shift, self.turn, axisb=0).T
         lines, back = here @ essential.T, there @ essential
         return (there * lines).sum(axis=1) / np.sqrt((lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1))
 
-    turned, shifted = moved(least_squares(apart, np.zeros(5), loss="soft_l1", f_scale=soft, x_scale="jac").x)
-    # There lies along turned here + nearness shifted.
-    off, along = np.cross(there, here @ turned.T), np.cross(there, shifted)
-    nearness = -(off * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-12)
-    return Movement(turned, -turned.T @ shifted, nearness)
+    def nearness(self, here: Rays, there: Rays) -> Float[np.ndarray, " points"]:
+        off, along = np.cross(there, here @ self.turn.T), np.cross(there, self.shift)
+        return -(off * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-12)
+
+    def explained(self, here: Rays, there: Rays, within: float) -> Bool[np.ndarray, " points"]:
+        """Mark points on their lines and in front of the cameras."""
+        return (np.abs(self.apart(here, there)) < within) & (self.nearness(here, there) > -within)
 
 
-def _best_turn(here: np.ndarray, there: np.ndarray) -> Turn:
+def _likeliest(here: Rays, there: Rays, within: float) -> tuple[_Pair, Bool[np.ndarray, " points"]]:
+    """Return the pose that explains most points, and which.
+
+    Where the movement is short, others than the true one bring points onto their lines nearly as well, but see many of them behind the
+    cameras; so votes are refined beside movements in plain directions.
+    """
+    best, good = _Pair(np.eye(3), np.array(_SHIFTS[0])), np.zeros(len(here), bool)
+    if len(here) < _LEAST_POINTS:
+        return best, good
+    here_2, there_2 = (np.ascontiguousarray(each[:, :2]) for each in (here, there))
+    essential, mask = cv2.findEssentialMat(here_2, there_2, np.eye(3), method=cv2.USAC_MAGSAC, prob=0.9999, threshold=within)
+    if mask is None:
+        return best, good
+    voted = mask.ravel() > 0
+    _, turn, shift, _ = cv2.recoverPose(essential[:3], here_2[voted], there_2[voted], np.eye(3))
+    turned = _best_turn(here[voted], there[voted])
+    for start in (_Pair(turn, shift.ravel()), *(_Pair(turned, np.array(each) / np.linalg.norm(each)) for each in _SHIFTS)):
+        pair, chosen = start, voted
+        for _ in range(_ROUNDS):
+            pair = _refined(pair, here[chosen], there[chosen], within)
+            chosen = pair.explained(here, there, within)
+            if chosen.sum() < _LEAST_POINTS:
+                break
+        if chosen.sum() > good.sum():
+            best, good = pair, chosen
+    return best, good
+
+
+def _refined(start: _Pair, here: Rays, there: Rays, soft: float) -> _Pair:
+    """Return the pose near a first one that brings points closest to their lines, with most of them in front."""
+    from scipy.optimize import least_squares
+
+    across = np.linalg.svd(start.shift[None])[2][1:]
+
+    def moved(by: np.ndarray) -> _Pair:
+        shift = start.shift + by[3:] @ across
+        return _Pair(cv2.Rodrigues(by[:3])[0] @ start.turn, shift / np.linalg.norm(shift))
+
+    pair = moved(least_squares(lambda by: moved(by).apart(here, there), np.zeros(5), loss="soft_l1", f_scale=soft, x_scale="jac").x)
+    return pair if np.median(pair.nearness(here, there)) >= 0.0 else replace(pair, shift=-pair.shift)
+
+
+def _best_turn(here: Rays, there: Rays) -> Turn:
     """Return the rotation that brings rays closest to others (Kabsch 1976)."""
     left, _, right = np.linalg.svd(there.T @ here)
     return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
