@@ -1,10 +1,10 @@
 """Movement of a hand-held camera between two photographs of one still scene, from what both show; its length stays unknown.
 
 Points are found by SIFT (Lowe 2004), the movement by the five-point method (Nister 2004) with robust votes, then by least squares of
-the points' distances from their epipolar lines.
+where points should be, in front of both cameras.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -95,26 +95,25 @@ class _Pair:
     turn: Turn
     shift: Way
 
-    def apart(self, here: Rays, there: Rays) -> Float[np.ndarray, " points"]:
-        """Return how far points are from their epipolar lines, as Sampson has it, on the plane of rays."""
-        essential = np.cross(self.shift, self.turn, axisb=0).T
-        lines, back = here @ essential.T, there @ essential
-        return (there * lines).sum(axis=1) / np.sqrt((lines[:, :2] ** 2).sum(axis=1) + (back[:, :2] ** 2).sum(axis=1))
-
     def nearness(self, here: Rays, there: Rays) -> Float[np.ndarray, " points"]:
         off, along = np.cross(there, here @ self.turn.T), np.cross(there, self.shift)
         return -(off * along).sum(axis=1) / np.maximum((along**2).sum(axis=1), 1e-12)
 
+    def apart(self, here: Rays, there: Rays) -> Points:
+        """Return how far points there are from where they should be at their best depth in front of the camera, on the plane of rays."""
+        expected = here @ self.turn.T + np.maximum(self.nearness(here, there), 0.0)[:, None] * self.shift
+        return expected[:, :2] / np.maximum(expected[:, 2:], 1e-6) - there[:, :2]
+
     def explained(self, here: Rays, there: Rays, within: float) -> Bool[np.ndarray, " points"]:
-        """Mark points on their lines and in front of the cameras."""
-        return (np.abs(self.apart(here, there)) < within) & (self.nearness(here, there) > -within)
+        """Mark points that are where they should be."""
+        return np.linalg.norm(self.apart(here, there), axis=1) < within
 
 
 def _likeliest(here: Rays, there: Rays, within: float) -> tuple[_Pair, Bool[np.ndarray, " points"]]:
     """Return the pose that explains most points, and which.
 
-    Where the movement is short, others than the true one bring points onto their lines nearly as well, but see many of them behind the
-    cameras; so votes are refined beside movements in plain directions.
+    Votes count points near their lines; where a plane fills the picture, another movement brings them there as well, but sees half of
+    them behind the cameras. So movements in plain directions are refined beside the elected one, by where points are in front.
     """
     best, good = _Pair(np.eye(3), np.array(_SHIFTS[0])), np.zeros(len(here), bool)
     if len(here) < _LEAST_POINTS:
@@ -126,10 +125,11 @@ def _likeliest(here: Rays, there: Rays, within: float) -> tuple[_Pair, Bool[np.n
     voted = mask.ravel() > 0
     _, turn, shift, _ = cv2.recoverPose(essential[:3], here_2[voted], there_2[voted], np.eye(3))
     turned = _best_turn(here[voted], there[voted])
-    for start in (_Pair(turn, shift.ravel()), *(_Pair(turned, np.array(each) / np.linalg.norm(each)) for each in _SHIFTS)):
+    plain = [side * np.array(each) / np.linalg.norm(each) for each in _SHIFTS for side in (1.0, -1.0)]
+    for start in (_Pair(turn, shift.ravel()), *(_Pair(turned, each) for each in plain)):
         pair, chosen = start, voted
         for _ in range(_ROUNDS):
-            pair = _refined(pair, here[chosen], there[chosen], within)
+            pair = _refined(pair, here[chosen], there[chosen], 0.5 * within)
             chosen = pair.explained(here, there, within)
             if chosen.sum() < _LEAST_POINTS:
                 break
@@ -139,7 +139,7 @@ def _likeliest(here: Rays, there: Rays, within: float) -> tuple[_Pair, Bool[np.n
 
 
 def _refined(start: _Pair, here: Rays, there: Rays, soft: float) -> _Pair:
-    """Return the pose near a first one that brings points closest to their lines, with most of them in front."""
+    """Return the pose near a first one that brings points closest to where they should be."""
     from scipy.optimize import least_squares
 
     across = np.linalg.svd(start.shift[None])[2][1:]
@@ -148,8 +148,10 @@ def _refined(start: _Pair, here: Rays, there: Rays, soft: float) -> _Pair:
         shift = start.shift + by[3:] @ across
         return _Pair(cv2.Rodrigues(by[:3])[0] @ start.turn, shift / np.linalg.norm(shift))
 
-    pair = moved(least_squares(lambda by: moved(by).apart(here, there), np.zeros(5), loss="soft_l1", f_scale=soft, x_scale="jac").x)
-    return pair if np.median(pair.nearness(here, there)) >= 0.0 else replace(pair, shift=-pair.shift)
+    def errors(by: np.ndarray) -> np.ndarray:
+        return moved(by).apart(here, there).ravel()
+
+    return moved(least_squares(errors, np.zeros(5), loss="soft_l1", f_scale=soft, x_scale="jac").x)
 
 
 def _best_turn(here: Rays, there: Rays) -> Turn:
