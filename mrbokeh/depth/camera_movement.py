@@ -21,7 +21,7 @@ Way = Float[np.ndarray, " 3"]
 
 LEAST_NEARNESS = 0.01
 """Least movement as a share of the distance of the nearest things: below it a disparity off by a quarter of a pixel is 3 % of depth."""
-_MOST_FEATURES, _FAINTEST, _BEST_BY = 8000, 0.02, 0.8
+_MOST_FEATURES, _FAINTEST, _BEST_BY = 5000, 0.02, 0.8
 _LEAST_POINTS, _LEAST_SHARE = 40, 0.3
 _WITHIN_PX, _ROUNDS = 1.0, 2
 _SHIFTS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 1.0, 0.0), (1.0, -1.0, 0.0), (0.0, 0.0, 1.0))
@@ -53,7 +53,7 @@ def camera_movement(first: Grey, second: Grey, camera: Camera, told: str) -> Mov
     pair, good = _likeliest(here, there, _WITHIN_PX / focal_px)
     if good.sum() < max(_LEAST_POINTS, _LEAST_SHARE * len(good)):
         raise InputError(
-            f"{told} have too little in common for depth, {good.sum()} points of at least {_LEAST_POINTS}: expected one still scene, "
+            f"{told} have too little in common for depth, {good.sum()} of {len(good)} points: expected one still scene, "
             f"photographed twice from places a hand's breadth apart"
         )
     here, there = here[good], there[good]
@@ -77,7 +77,7 @@ def _common_points(first: Grey, second: Grey) -> tuple[Points, Points]:
     (here, ours), (there, theirs) = (sift.detectAndCompute(each, None) for each in (first, second))
     if min(len(here), len(there)) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
-    pairs = cv2.FlannBasedMatcher().knnMatch(ours, theirs, k=2)
+    pairs = cv2.BFMatcher().knnMatch(ours, theirs, k=2)
     best = [pair[0] for pair in pairs if len(pair) == 2 and pair[0].distance < _BEST_BY * pair[1].distance]
     at = [(here[each.queryIdx].pt, there[each.trainIdx].pt) for each in best]
     points_px = np.array(at, np.float64).reshape(-1, 2, 2) + 0.5  # OpenCV counts from the centre of the first pixel
