@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
 from capture.dense.depth_priors import Consistency, DepthPriors, FocusVote, add_focus_votes, agreement, consistency
-from capture.dense.guided_depth import Penalties, interpolate, label_planes, near_steps, weighted_medians
+from capture.dense.guided_depth import Penalties, label_planes, near_steps, weighted_medians
 from capture.dense.plane_sweep import Costs, Matching, Refined, by_parallax, dioptre_planes, pixels_per_dioptre, plane_sweep, refine
 from capture.dense.sweep_view import BRIGHTEST, SweepView
+from mrbokeh.depth.depth_filters import interpolate
 
 Plane = Float32[np.ndarray, "height width"]
 

@@ -1,8 +1,7 @@
-"""Depth maps guided by the picture: semi-global labelling, weighted medians at edges, and the fast global smoother.
+"""Depth maps guided by the picture: semi-global labelling, and weighted medians at edges.
 
 The labelling (Hirschmueller 2008) turns costs of planes into one plane per pixel and lets depth jump where the picture does. Weighted
-medians (Ma et al. 2013) move edges of depth onto edges of the picture, since windows extend a near surface beyond its end. The
-smoother fills gaps and stops at the edges of a guide.
+medians (Ma et al. 2013) move edges of depth onto edges of the picture, since windows extend a near surface beyond its end.
 """
 
 from dataclasses import dataclass
@@ -21,8 +20,6 @@ _LEAST_BAND = 32
 Costs = UInt8[np.ndarray, "height width planes"]
 _PATHS = 8
 _RIVAL_APART = 2
-_ROUNDS = 3
-_FALL = 4.0
 
 
 def near_steps(values: Plane, radius_px: int, least: float) -> Mask:
@@ -78,32 +75,3 @@ def label_planes(costs: Costs, guide: Plane, penalties: Penalties | None = None)
     index, margin = (np.empty(guide.shape, np.float32) for _ in range(2))
     winners(total, _RIVAL_APART, index, margin)
     return Labels(index, margin / np.float32(_PATHS))
-
-
-def smooth(
-    values: Float32[np.ndarray, "height width channels"],
-    guide: Float32[np.ndarray, "height width colours"],
-    smoothness: float,
-    contrast: float,
-) -> Float32[np.ndarray, "height width channels"]:
-    """Smooth values (H, W, C) within what the guide shows as one surface; their mean over a closed region is preserved.
-
-    OpenCV's fast global smoother (Min et al. 2014) takes a guide of 8 bits and the smoothness of the first round.
-    smoothness: lambda of the paper; a single value in an even region reaches about sqrt(lambda) pixels.
-    contrast: a difference of the guide by this much lets 1/e through.
-    """
-    levels = 255.0 / max(float(guide.max()), 1e-6)
-    # Eq. 12 of the paper: rounds fall by 4, so that streaks of one direction are wiped out by the next.
-    first = 1.5 * _FALL ** (_ROUNDS - 1) / (_FALL**_ROUNDS - 1.0) * smoothness
-    codes = np.round(guide * levels).astype(np.uint8)
-    smoother = cv2.ximgproc.createFastGlobalSmootherFilter(codes, first, contrast * levels, 1.0 / _FALL, _ROUNDS)
-    return np.stack([smoother.filter(np.ascontiguousarray(each)) for each in np.moveaxis(values, 2, 0)], axis=2)
-
-
-def interpolate(
-    values: Plane, weights: Plane, guide: Float32[np.ndarray, "height width colours"], smoothness: float, contrast: float
-) -> Plane:
-    """Smooth values by their weights in [0, 1], filling pixels without weight from their surroundings (Min et al. 2014, section V-C)."""
-    known = np.where(weights > 0, values, 0.0) * weights
-    both = smooth(np.stack([known, weights], axis=-1).astype(np.float32), guide, smoothness, contrast)
-    return both[..., 0] / np.maximum(both[..., 1], 1e-12)

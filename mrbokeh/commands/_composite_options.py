@@ -39,6 +39,16 @@ class PlateOptions(shared.NearOptions):
             "Default: PHOTO's own."
         ),
     ] = None
+    stereo: Annotated[
+        Path | None,
+        typer.Option(
+            help="A second photograph of the same still scene, taken a hand's breadth beside PHOTO with the same camera: depth comes from "
+            "both."
+        ),
+    ] = None
+    baseline: Annotated[
+        float | None, typer.Option(help="How far the camera moved to --stereo. Default: a guess of 0.1, and so are all metres.")
+    ] = None
     rgb: Annotated[
         Path | None,
         typer.Option(
@@ -55,6 +65,25 @@ class PlateOptions(shared.NearOptions):
             "has an all-in-focus picture, to where the photograph shows them.",
         ),
     ] = False
+
+    def require_meant(self, photo: Path) -> None:
+        """Raise InputError where options of depth contradict one another, or go without a second photograph that they are of."""
+        if self.baseline is not None and self.stereo is None:
+            raise InputError(f"--baseline {self.baseline:g} says how far the camera moved to a second photograph: give that as --stereo")
+        if self.baseline is not None and not 0.0 < self.baseline < math.inf:
+            raise InputError(
+                f"--baseline: expected metres above 0, got {self.baseline:g}: photographs from one place show no depth, move by a hand's "
+                f"breadth"
+            )
+        if self.stereo is None:
+            return
+        other = {"--depth": self.depth, "--disparity": self.disparity, "--depth-scale": self.depth_scale}
+        given = [name for name, value in other.items() if value is not None]
+        if given:
+            raise InputError(f"--stereo takes depth from two photographs, and {given[0]} tells another: leave one of them out")
+        if photo.is_dir():
+            raise InputError(f"--stereo is the second of two photographs in files, but {photo} is a folder: leave it out")
+        require_file(self.stereo, "a second photograph")
 
 
 @dataclass(frozen=True)
@@ -338,7 +367,7 @@ class CompositeOptions:
     @property
     def read(self) -> tuple[Path | None, ...]:
         """Input files of these options."""
-        of_plate = (self.photo, self.taken.depth, self.taken.rgb, self.taken.matte)
+        of_plate = (self.photo, self.taken.depth, self.taken.stereo, self.taken.rgb, self.taken.matte)
         return (*of_plate, *self.virtual.files, *self.standing.files, self.rendering.distortion, self.optics.lens)
 
     @property
@@ -352,7 +381,8 @@ class CompositeOptions:
         taken, virtual, standing = self.taken, self.virtual, self.standing
         if taken.all_slices:
             self._require_options_of_stacks()
-        standing.require_meant(self.photo, taken.depth, self.rendering.catch)
+        taken.require_meant(self.photo)
+        standing.require_meant(self.photo, taken.depth or taken.stereo, self.rendering.catch)
         shared.require_one_focus(focus=self.optics.focus, focus_at=self.optics.focus_at)
         for glb in standing.object_ or ():
             require_file(glb, "a GLB file")
@@ -363,7 +393,7 @@ class CompositeOptions:
     def _require_options_of_stacks(self) -> None:
         """Raise InputError if an option is given that is of one picture, and that --all-slices would not follow."""
         one_picture = (
-            (self.taken, ("slice_", "depth", "rgb", "disparity", "depth_scale", "matte", "near_distance")),
+            (self.taken, ("slice_", "depth", "stereo", "baseline", "rgb", "disparity", "depth_scale", "matte", "near_distance")),
             (self.optics, ("focus", "focus_at")),
             (self.look, tuple(vars(self.look))),
             (self.colour, ("input_space", "output_space")),

@@ -6,10 +6,21 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32
 
 from mrbokeh.commands._composite_options import CompositeOptions, ResultOptions
 from mrbokeh.commands._insertion_options import ColourOptions, near_far_of
-from mrbokeh.compositing.plate import Inserted, Plate, bundle_plate, open_plate, with_blur_in_metres, with_depth, with_matte, with_own_alpha
+from mrbokeh.compositing.plate import (
+    Inserted,
+    Plate,
+    bundle_plate,
+    open_plate,
+    with_blur_in_metres,
+    with_depth,
+    with_matte,
+    with_own_alpha,
+    with_stereo,
+)
 from mrbokeh.depth.depth_map import DepthSettings, parse_near_far
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.alpha_io import HOLDING_ALPHA, alpha_with
@@ -45,8 +56,9 @@ def plate_by(whole: CompositeOptions, bundle: CaptureBundle | None, *, lens: Len
     own = photo if options.disparity and not photo.is_dir() and read_phone_photo(photo, parse_near_far(options.disparity)) else None
     near_far_m = near_far_of(options.disparity, options.depth or own)
     if options.rgb is not None:
-        sharp_rgb = read_photograph(options.rgb).rgb if colour.of_plate is None else colour.of_plate.to_rec709(read_numbers(options.rgb))
-        plate = replace(plate, sharp_rgb=sharp_rgb)
+        plate = replace(plate, sharp_rgb=_rgb_of(options.rgb, colour))
+    if options.stereo is not None:
+        plate = with_stereo(plate, _rgb_of(options.stereo, colour), options.baseline, (photo, options.stereo))
     source = options.depth or (photo if near_far_m or options.depth_scale else None)
     if source is not None:
         before_m, plate = plate.depth_m, with_depth(plate, source, DepthSettings(near_far_m, options.depth_scale))
@@ -54,6 +66,11 @@ def plate_by(whole: CompositeOptions, bundle: CaptureBundle | None, *, lens: Len
         if own is not None and plate.blur_from and before_m is not None:
             plate = with_blur_in_metres(plate, before_m, focus_m)
     return plate if options.matte is None else with_matte(plate, options.matte)
+
+
+def _rgb_of(path: Path, colour: ColourOptions) -> Float32[np.ndarray, "height width 3"]:
+    """Return another picture of the plate's view, in linear Rec.709."""
+    return read_photograph(path).rgb if colour.of_plate is None else colour.of_plate.to_rec709(read_numbers(path))
 
 
 def _from_space(plate: Plate, photo: Path, space: NamedSpace) -> Plate:

@@ -38,7 +38,7 @@ EVERYDAY = {
 
 PANELS = {
     "The plate": "all-slices behind depth-model-gives depth-scale disparity exact-depth first-number frames input-space matte "
-    "near-distance rate refine rgb srgb steady-depth stereo linear side light-distance sidecar",
+    "near-distance rate refine rgb srgb steady-depth stereo stereo-cameras baseline linear side light-distance sidecar",
     "What is put in": "camera catch layer mode objects paths pitch scene scene-begin scene-renderer time turn keyframes",
     "Its light": "environment exposure shadow",
     "Its look": "grain grey-value light-wrap match-black match-exposure match-grey match-white plate-exposure vignetting seed",
@@ -64,7 +64,7 @@ PANELS = {
 METAVARS = {
     "MM": "focal-length sensor-width sensor-height petzval-radius square marker",
     "N": "f-number",
-    "METRES": "near far near-distance light-distance depth-scale",
+    "METRES": "baseline near far near-distance light-distance depth-scale",
     "PX": "image-width max-width max-image-size residual diameter longest-motion tile-px overlap-px focal-px steadier",
     "DEGREES": "turn pitch rotation shutter",
     "SECONDS": "settle timeout time scene-begin readout segment seconds",
@@ -79,6 +79,7 @@ METAVARS = {
     "BOARD": "board",
     "SCENE.toml": "scene",
     "RGBAZ.exr": "layer behind",
+    "SECOND": "stereo",
     "PICTURE": "rgb",
     "SOURCE": "source phone",
     "RENDERER": "renderer",

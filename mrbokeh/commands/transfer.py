@@ -46,7 +46,9 @@ class DepthOptions:
     ] = None
     disparity: DisparityOption = None
     depth_scale: Annotated[float | None, typer.Option(help="--depth holds distance: metres for each step; 0 is unknown.")] = None
-    stereo: Annotated[str | None, typer.Option(metavar="FOCAL_PX,BASELINE_M,OFFSET_PX", help="Cameras of a disparity file.")] = None
+    stereo: Annotated[
+        str | None, typer.Option("--stereo-cameras", metavar="FOCAL_PX,BASELINE_M,OFFSET_PX", help="Cameras of a disparity file.")
+    ] = None
     depth_model_gives: Annotated[str, typer.Option(help="What a depth network gives: inverse (up to scale) or metric (metres).")] = (
         "inverse"
     )

@@ -23,6 +23,7 @@ from mrbokeh.depth.depth_map import DepthSettings
 from mrbokeh.depth.open_depth import open_depth
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.depth.phone_photo import PhoneFocus, PhonePhoto
+from mrbokeh.depth.stereo_depth import stereo_depth
 from mrbokeh.images.alpha_io import is_straight, read_alpha
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
@@ -305,6 +306,24 @@ def with_depth(plate: Plate, source: Path, settings: DepthSettings) -> Plate:
     """The plate with depth from a file, or from a network that looks at its sharpest picture."""
     depth = open_depth(source, plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb, settings)
     return replace(plate, depth_m=depth.depth_m)
+
+
+def with_stereo(
+    plate: Plate, second_rgb: Float32[np.ndarray, "height width 3"], baseline_m: float | None, photos: tuple[Path, Path]
+) -> Plate:
+    """Return the plate with depth from a second photograph beside it. baseline_m: how far the camera moved; None is guessed, and said."""
+    seen_rgb = plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb
+    depth = stereo_depth(seen_rgb, second_rgb, plate.camera, baseline_m or _HANDS_BREADTH_M, photos)
+    guess(
+        f"how far the camera moved from {photos[0]} to {photos[1]} is guessed, {_HANDS_BREADTH_M:g} m, and all metres with it (--baseline "
+        f"METRES)"
+        if baseline_m is None
+        else ""
+    )
+    return replace(plate, depth_m=depth.depth_m, depth_note="", metres_guessed=baseline_m is None)
+
+
+_HANDS_BREADTH_M = 0.1
 
 
 def with_matte(plate: Plate, path: Path) -> Plate:

@@ -1,4 +1,4 @@
-"""Depth maps refined: hard edges along the photograph, and films steadied over time.
+"""Depth maps refined: hard edges along the photograph, gaps filled along it, and films steadied over time.
 
 Depth maps of phones and networks are small and soft. Blurred as they are, the soft rim becomes a ghost surface between near and far. So
 each pixel beside an edge gets the depth of one of its two sides. Which side it is on, the photograph tells by a guided filter with a
@@ -57,6 +57,41 @@ def _box(picture: np.ndarray, radius_px: int) -> np.ndarray:
     channels = [picture] if picture.ndim == 2 else np.moveaxis(picture, 2, 0)
     blurred = [cv2.blur(np.ascontiguousarray(each), (width, width), borderType=cv2.BORDER_REFLECT) for each in channels]
     return blurred[0] if picture.ndim == 2 else np.stack(blurred, axis=2)
+
+
+_ROUNDS = 3
+_FALL = 4.0
+
+
+def smooth(
+    values: Float32[np.ndarray, "height width channels"],
+    guide: Float32[np.ndarray, "height width colours"],
+    smoothness: float,
+    contrast: float,
+) -> Float32[np.ndarray, "height width channels"]:
+    """Smooth values (H, W, C) within what the guide shows as one surface; their mean over a closed region is preserved.
+
+    OpenCV's fast global smoother (Min et al. 2014) takes a guide of 8 bits and the smoothness of the first round.
+    smoothness: lambda of the paper; a single value in an even region reaches about sqrt(lambda) pixels.
+    contrast: a difference of the guide by this much lets 1/e through.
+    """
+    import cv2
+
+    levels = 255.0 / max(float(guide.max()), 1e-6)
+    # Eq. 12 of the paper: rounds fall by 4, so that streaks of one direction are wiped out by the next.
+    first = 1.5 * _FALL ** (_ROUNDS - 1) / (_FALL**_ROUNDS - 1.0) * smoothness
+    codes = np.round(guide * levels).astype(np.uint8)
+    smoother = cv2.ximgproc.createFastGlobalSmootherFilter(codes, first, contrast * levels, 1.0 / _FALL, _ROUNDS)
+    return np.stack([smoother.filter(np.ascontiguousarray(each)) for each in np.moveaxis(values, 2, 0)], axis=2)
+
+
+def interpolate(
+    values: Plane, weights: Plane, guide: Float32[np.ndarray, "height width colours"], smoothness: float, contrast: float
+) -> Plane:
+    """Smooth values by their weights in [0, 1], filling pixels without weight from their surroundings (Min et al. 2014, section V-C)."""
+    known = np.where(weights > 0, values, 0.0) * weights
+    both = smooth(np.stack([known, weights], axis=-1).astype(np.float32), guide, smoothness, contrast)
+    return both[..., 0] / np.maximum(both[..., 1], 1e-12)
 
 
 Mask = Bool[np.ndarray, "height width"]

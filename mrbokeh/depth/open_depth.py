@@ -210,7 +210,7 @@ def depth_of_file(path: Path, near_far_m: tuple[float, float] | None = None) -> 
 def read_stereo(path: Path, settings: DepthSettings) -> DepthMap:
     """Read disparity in pixels (.npz, .npy: its first array), as in the Middlebury data sets; what is not finite is unknown."""
     if settings.stereo is None:
-        raise InputError(f"{path} holds disparity: state the cameras with --stereo FOCAL_PX,BASELINE_M,OFFSET_PX")
+        raise InputError(f"{path} holds disparity: state the cameras with --stereo-cameras FOCAL_PX,BASELINE_M,OFFSET_PX")
     try:
         loaded = np.load(path)
         disparity = np.asarray(loaded[loaded.files[0]] if hasattr(loaded, "files") else loaded, np.float32)
@@ -238,12 +238,12 @@ def open_depth(source: Path, photo_rgb: Rgb, settings: DepthSettings | None = No
     settings = settings or DepthSettings()
     require_file(source, "depth")
     if settings.stereo is not None and source.suffix.lower() not in _ARRAYS:
-        raise InputError(f"--stereo is for a file of disparity ({', '.join(_ARRAYS)}), got {source}: leave it out")
+        raise InputError(f"--stereo-cameras is for a file of disparity ({', '.join(_ARRAYS)}), got {source}: leave it out")
     depth, is_soft = _read(source, photo_rgb, settings)
     _require_same_aspect(source, depth, photo_rgb)
     filled = with_holes_filled(depth)
     refine = is_soft if settings.refined is None else settings.refined
-    return _at_size_of(filled, photo_rgb, refine)
+    return at_size_of(filled, photo_rgb, refine)
 
 
 def _read(source: Path, photo_rgb: Rgb, settings: DepthSettings) -> tuple[DepthMap, bool]:
@@ -268,7 +268,8 @@ def _require_same_aspect(source: Path, depth: DepthMap, photo_rgb: Rgb) -> None:
         )
 
 
-def _at_size_of(depth: DepthMap, photo_rgb: Rgb, refine: bool) -> DepthMap:
+def at_size_of(depth: DepthMap, photo_rgb: Rgb, refine: bool) -> DepthMap:
+    """Return the map at the size of its photograph. refine: along its edges, for a map whose own are soft or misplaced."""
     import cv2
 
     height, width = photo_rgb.shape[:2]

@@ -57,7 +57,7 @@ def test_sixteen_bit_depth_and_stereo_disparity(tmp_path: Path) -> None:
     np.savez(tmp_path / "d.npz", disparity)
     found = open_depth(tmp_path / "d.npz", GREY, DepthSettings(stereo=StereoCalibration(1000.0, 0.2, 20.0)))
     assert np.allclose(found.depth_m, 4.0) and found.valid.sum() == 24 * 32 - 1
-    refused("--stereo", open_depth, tmp_path / "d.npz", GREY)
+    refused("--stereo-cameras", open_depth, tmp_path / "d.npz", GREY)
 
 
 @pytest.mark.parametrize(("dtype", "full"), [(np.uint8, 255), (np.uint16, 65535)])

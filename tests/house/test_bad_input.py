@@ -62,8 +62,8 @@ def replaced(words: tuple[str, ...], option: str, value: str) -> tuple[str, ...]
         ((*COMPOSITE, "--ocio", "file"), "--ocio file has no use by itself"),
         ((*COMPOSITE[:-2], "--object", "cake.glb", "--at", "0,0,0"), "in front of the lens, with Z above 0 m"),
         (
-            ("transfer", "photo.png", "--lens", "lens.json", "--depth", "sharp.exr", "--stereo", "1,2", "--out", "out.exr"),
-            "--stereo is for",
+            ("transfer", "photo.png", "--lens", "lens.json", "--depth", "sharp.exr", "--stereo-cameras", "1,2", "--out", "out.exr"),
+            "--stereo-cameras is for",
         ),
         (
             ("lens", "new", "new.json", "--focal-length", "50", "--f-number", "2", "--focus", "1", "--blades", "100000000"),

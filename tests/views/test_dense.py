@@ -35,14 +35,13 @@ from capture.dense.depth_priors import (
 )
 from capture.dense.guided_depth import (
     Penalties,
-    interpolate,
     label_planes,
     near_steps,
-    smooth,
     weighted_medians,
 )
 from capture.dense.scene_depth import on_original_pixels, patch_match_obstacle, patch_match_prior
 from capture.dense.sweep_view import SweepView
+from mrbokeh.depth.depth_filters import interpolate, smooth
 from mrbokeh.optics.camera import Camera
 from tests.support.dense_references import aggregate_reference, weighted_medians_reference
 from tests.support.plane_sweep_scenes import FOCAL_PX, HEIGHT_PX, WIDTH_PX, TracedViews, card, grey_card, traced, wall
