@@ -88,9 +88,8 @@ def _finite(rgb: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
 def _encoded(path: Path) -> DecodedPhoto:
     """Decode a picture whose codes are display-encoded; full is the largest code in any channel (TIFF of floats: 1)."""
     codes = stored_rgb(path)[..., :3]
-    is_float, remarks = codes.dtype.kind == "f", ()
-    if is_float:
-        codes, remarks = _finite(codes)
+    is_float = codes.dtype.kind == "f"
+    codes, remarks = _finite(codes) if is_float else (codes, ())
     rgb = codes.astype(np.float32) if is_float else linear_from_codes(codes, "srgb", path)
     red, green, blue = cv2.split(np.ascontiguousarray(codes))
     full = cv2.max(cv2.max(red, green), blue) >= (_FULL if is_float else np.iinfo(codes.dtype).max)

@@ -291,7 +291,8 @@ def fit(segments: Segments, frame: Frame, focal: float | None, noise: tuple[floa
 
     def residuals(values: Float64[np.ndarray, "tries values"]) -> Float64[np.ndarray, "tries residuals"]:
         directions, length = turned(values)
-        off = _signed_sines(*chosen.straight(values[:, 3]), vanishing_points(directions, length)[:, axes]) / sigma
+        begin, end = chosen.straight(values[:, 3])
+        off = _signed_sines(begin, end, vanishing_points(directions, length)[:, axes]) / sigma
         # Weak priors keep what the segments do not tell at what is usual.
         held = [roll_rad(directions) / _ROLL_RAD, pitch_rad(directions) / _PITCH_RAD, values[:, 3] / _BENDING]
         held += [] if focal is not None else [np.log(length / USUAL_FOCAL) / _FOCAL_SPREAD]
