@@ -283,7 +283,7 @@ def test_options_of_the_command_are_checked_before_anything_listens(photo: Path,
         done = mrbokeh("studio", *words)
         assert done.returncode == 2 and why in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
     write_lens(tmp_path / "lens.json", Lens(35.0, 2.8, 1.0, 23.5))
-    project = project_of(StudioOptions(photo, CAKE, lenses=(tmp_path / "lens.json",), pictures=tmp_path))
+    project = project_of(StudioOptions(photo, (CAKE,), lenses=(tmp_path / "lens.json",), pictures=tmp_path))
     assert project.state == StudioState(photo=photo, object=CAKE) and project.lenses == [tmp_path / "lens.json"]
     assert project.path == tmp_path / "a floor.studio.json"
 
@@ -455,7 +455,7 @@ async def test_depth_of_a_file_hides_what_stands_behind(photo: Path, tmp_path: P
     floor_m = 1.2 * 187.0 / np.maximum(rows + 0.5 - HEIGHT / 2, 1.0)
     depth_m = np.where(np.arange(WIDTH) < WIDTH // 2, np.minimum(floor_m, 2.0), floor_m).astype(np.float32)
     write_layer(tmp_path / "depth.exr", Layer(np.zeros((HEIGHT, WIDTH, 3), np.float32), np.ones_like(depth_m), depth_m))
-    project = project_of(StudioOptions(photo, CAKE, tmp_path / "depth.exr", pictures=tmp_path))
+    project = project_of(StudioOptions(photo, (CAKE,), tmp_path / "depth.exr", pictures=tmp_path))
     project.add(replace(project.state, at_px=(122.0, 145.0), height="0.8"))
     project.write()
     assert read_project(project.path).state.depth == project.state.depth
