@@ -153,9 +153,10 @@ async def test_several_objects_are_added_chosen_by_hand_and_removed(tmp_path: Pa
         await page.comes_true(RESTS, 60.0)
         assert made.desk.state.object == ALIEN and made.desk.state.before[0].object == CAKE
         left, top, width, height = await page.box("#stage")
-        await dragged(page, (left + width / 2, top + 0.78 * height), (0.3 * width, 0.0), mouse=True)
+        await dragged(page, (left + 0.45 * width, top + 0.76 * height), (0.3 * width, 0.0), mouse=True)
         await page.comes_true("!studio.isChanging && studio.told.state.at_px[0] > 150")
         await page.comes_true(RESTS, 60.0)
+        await page.comes_true("studio.shown.boxes[1][0] > 0.6")
         cake = await page.value("studio.shown.boxes[0]")
         await page.tap("#stage", cake[0] + 0.02, (cake[1] + cake[3]) / 2)
         await page.comes_true(f"studio.told.state.object === '{CAKE}' && !studio.isChanging")
