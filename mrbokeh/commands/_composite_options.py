@@ -179,7 +179,7 @@ class ObjectOptions:
         glbs = self.object_ or []
         columns = (_for_each(given, len(glbs)) for given in (self.at, self.at_pixel, self.height, self.turn))
         rows = zip(glbs, *columns, strict=True)
-        return tuple(Standing(glb, at, at_pixel, height, turn or 0.0) for glb, at, at_pixel, height, turn in rows)
+        return tuple(Standing(glb=glb, at=at, at_pixel=px, height=height, turn=turn or 0.0) for glb, at, px, height, turn in rows)
 
     @property
     def pixels(self) -> list[tuple[float, float]]:

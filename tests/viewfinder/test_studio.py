@@ -64,6 +64,7 @@ def whole_state(photo: Path, **more: Any) -> StudioState:
 STATES: list[dict[str, Any]] = [
     {},
     {"turn_deg": -33.3, "sun_deg": [-60, 40], "shadow": 0.5, "exposure": 1.3},
+    {"before": [{"object": str(ALIEN), "at_px": [60, 150], "height": "0.3", "turn_deg": 20}], "turn_deg": 5},
     {"height": "60px", "f_number": 2.8, "focus_m": 6.25, "focal_length_mm": 35, "sensor_width_mm": 23.5, "matched": False},
 ]
 
@@ -102,16 +103,16 @@ def test_the_preview_of_a_small_photograph_is_the_picture_of_its_command_line(ph
     stored = cv2.imread(str(out), cv2.IMREAD_UNCHANGED)[..., ::-1]
     np.testing.assert_array_equal(srgb_codes(preview.rgb, np.uint16), stored)
     assert draft.rgb.shape == (87, 115, 3), "10000 px of 4:3"
-    left, top, right, bottom = preview.told["box"]
+    left, top, right, bottom = preview.told["boxes"][-1]
     assert left < AT_PX[0] / WIDTH < right and top < AT_PX[1] / HEIGHT < bottom
-    np.testing.assert_allclose(draft.told["box"], preview.told["box"], atol=0.03)
+    np.testing.assert_allclose(draft.told["boxes"][-1], preview.told["boxes"][-1], atol=0.03)
 
 
 def test_a_smaller_preview_shows_the_same_place_and_size(photo: Path) -> None:
     """All that counts pixels is made smaller with the photograph: a third of the width gives the same shares."""
     opened, _rgb = open_photograph(photo)
     options = options_of(whole_state(photo, height="60px"))
-    boxes = [preview_of(opened, options, KeptParts(), most_px).told["box"] for most_px in (MOST_PX, WIDTH * HEIGHT / 9)]
+    boxes = [preview_of(opened, options, KeptParts(), most_px).told["boxes"][-1] for most_px in (MOST_PX, WIDTH * HEIGHT / 9)]
     np.testing.assert_allclose(boxes[1], boxes[0], atol=1.5 / (WIDTH / 3))
 
 
@@ -143,7 +144,7 @@ def test_metres_follow_from_the_first_place_and_then_stay(photo: Path) -> None:
     assert first.camera_height_m == 1.5 and first.height is not None
     farther = replace(first, at_px=(120.0, 130.0))
     assert placed(farther, opened) == farther
-    tops = [preview_of(opened, options_of(each), KeptParts()).told["box"] for each in (first, farther)]
+    tops = [preview_of(opened, options_of(each), KeptParts()).told["boxes"][0] for each in (first, farther)]
     high = [(box[3] - box[1]) * HEIGHT for box in tops]
     # The box also holds the base's depth, which perspective shows.
     assert 0.8 * HEIGHT / 4 < high[0] < 1.7 * HEIGHT / 4 and high[1] == pytest.approx(high[0] / 2, rel=0.15)
@@ -282,7 +283,7 @@ def test_options_of_the_command_are_checked_before_anything_listens(photo: Path,
         done = mrbokeh("studio", *words)
         assert done.returncode == 2 and why in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
     write_lens(tmp_path / "lens.json", Lens(35.0, 2.8, 1.0, 23.5))
-    project = project_of(StudioOptions(photo, CAKE, lenses=(tmp_path / "lens.json",), pictures=tmp_path))
+    project = project_of(StudioOptions(photo, (CAKE,), lenses=(tmp_path / "lens.json",), pictures=tmp_path))
     assert project.state == StudioState(photo=photo, object=CAKE) and project.lenses == [tmp_path / "lens.json"]
     assert project.path == tmp_path / "a floor.studio.json"
 
@@ -454,7 +455,7 @@ async def test_depth_of_a_file_hides_what_stands_behind(photo: Path, tmp_path: P
     floor_m = 1.2 * 187.0 / np.maximum(rows + 0.5 - HEIGHT / 2, 1.0)
     depth_m = np.where(np.arange(WIDTH) < WIDTH // 2, np.minimum(floor_m, 2.0), floor_m).astype(np.float32)
     write_layer(tmp_path / "depth.exr", Layer(np.zeros((HEIGHT, WIDTH, 3), np.float32), np.ones_like(depth_m), depth_m))
-    project = project_of(StudioOptions(photo, CAKE, tmp_path / "depth.exr", pictures=tmp_path))
+    project = project_of(StudioOptions(photo, (CAKE,), tmp_path / "depth.exr", pictures=tmp_path))
     project.add(replace(project.state, at_px=(122.0, 145.0), height="0.8"))
     project.write()
     assert read_project(project.path).state.depth == project.state.depth
@@ -466,6 +467,44 @@ async def test_depth_of_a_file_hides_what_stands_behind(photo: Path, tmp_path: P
     stored = cv2.imread(str(tmp_path / "out.png"), cv2.IMREAD_UNCHANGED)[..., ::-1]
     np.testing.assert_array_equal(srgb_codes(preview.rgb, np.uint16), stored)
     changed = np.abs(preview.rgb - opened.plate.rgb).max(axis=2) > 0.05
-    left, top, right, bottom = preview.told["box"]
+    left, top, right, bottom = preview.told["boxes"][0]
     inside = changed[int(top * HEIGHT) : int(bottom * HEIGHT)]
     assert left < 0.5 < right and inside[:, WIDTH // 2 + 4 :].any() and not inside[:, : WIDTH // 2 - 4].any()
+
+
+async def test_objects_are_added_chosen_and_taken_away(photo: Path, tmp_path: Path) -> None:
+    """A dropped GLB is added beside the chosen one and as high; each has its own place, and all of it can be undone and kept."""
+    async with made_studio(tmp_path, whole_state(photo)) as made, aiohttp.ClientSession() as one:
+        await comes_true(lambda: made.desk.photograph is not None and made.desk.busy == "")
+        first = made.desk.state.objects[0]
+        async with one.post(made.url + "upload", params={"kind": "object", "name": "a.glb"}, data=io.BytesIO(ALIEN.read_bytes())) as answer:
+            assert answer.status == 200, await answer.text()
+        state = made.desk.state
+        assert state.before == (first,) and state.object == tmp_path / "studio_files" / "a.glb" and state.height == first.height
+        assert state.at_px is not None and abs(state.at_px[0] - first.at_px[0]) == pytest.approx(0.15 * WIDTH)
+        _, told = await asked(one, made.url + "add", {"object": str(CAKE)})
+        assert len(told["state"]["before"]) == 2 and told["command"].count("--object") == told["command"].count("--at-pixel") == 3
+        assert (await asked(one, made.url + "add", {"object": "/etc/passwd"}))[0] == 400
+        stranger = {"object": "/etc/passwd", "at_px": [1, 2]}
+        for bad, why in (([stranger], "may choose only"), ([{"at_px": [1, 2]}], "each of before"), ("cake", "list of at most")):
+            status, answered = await asked(one, made.url + "state", {"changes": {"before": bad}})
+            assert status == 400 and why in answered["error"], answered
+        await asked(one, made.url + "history", {"step": -1})
+        assert made.desk.state == state
+        kept = read_project(made.desk.project.path)
+        assert [each.object.name for each in kept.state.objects] == [CAKE.name, "a.glb"]
+        assert str(tmp_path) not in json.dumps(json.loads(made.desk.project.path.read_text())["states"][1]["object"]), (
+            "the folder can be moved"
+        )
+
+
+def test_each_object_has_its_box_and_one_without_height_gets_one(photo: Path) -> None:
+    """The box of the corners is that of the picture, to a pixel of its rim."""
+    opened, _rgb = open_photograph(photo)
+    alien = {"object": str(ALIEN), "at_px": [60, 150], "height": "0.3"}
+    state = placed(whole_state(photo, before=[alien], height=None, camera_height_m=None), opened)
+    assert state.height is not None and state.camera_height_m == 1.5 and state.before[0].height == "0.3"
+    both = preview_of(opened, options_of(state), KeptParts()).told["boxes"]
+    alone = [replace(state, before=()), state_of(whole_state(photo).document() | {**alien, "camera_height_m": 1.5})]
+    boxes = [preview_of(opened, options_of(each), KeptParts()).told["boxes"][0] for each in reversed(alone)]
+    np.testing.assert_allclose(both, boxes, atol=2 / HEIGHT)

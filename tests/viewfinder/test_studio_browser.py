@@ -149,6 +149,45 @@ async def save(page: Page, made: MadeStudio, waits: bool) -> None:
     assert (made.folder / "floor_mrbokeh.jpg").is_file()
 
 
+async def test_several_objects_are_added_chosen_by_hand_and_removed(tmp_path: Path) -> None:
+    async with opened(tmp_path, DESK) as (page, made):
+        await placed(page, made, 0.3)
+        await page.choose("#add", str(ALIEN))
+        await page.comes_true("studio.objects.length === 2 && !studio.isChanging && studio.shown?.boxes.length === 2")
+        await page.comes_true(RESTS, 60.0)
+        assert made.desk.state.object == ALIEN and made.desk.state.before[0].object == CAKE
+        left, top, width, height = await page.box("#stage")
+        await dragged(page, (left + 0.45 * width, top + 0.76 * height), (0.3 * width, 0.0), mouse=True)
+        await page.comes_true("!studio.isChanging && studio.told.state.at_px[0] > 150")
+        await page.comes_true(RESTS, 60.0)
+        await page.comes_true("studio.shown.boxes[1][0] > 0.6")
+        cake = await page.value("studio.shown.boxes[0]")
+        await page.tap("#stage", cake[0] + 0.02, (cake[1] + cake[3]) / 2)
+        await page.comes_true(f"studio.told.state.object === '{CAKE}' && !studio.isChanging")
+        assert made.desk.state.before == () and made.desk.state.after[0].object == ALIEN, "chosen, and where it was"
+        assert made.desk.state.at_px == pytest.approx((0.3 * WIDTH, 0.8 * HEIGHT), abs=WIDTH / 100)
+        await page.comes_true(RESTS, 60.0)
+        alien = await page.value("studio.shown.boxes[1]")
+        start = (left + width * (alien[0] + alien[2]) / 2, top + height * (alien[1] + alien[3]) / 2)
+        await dragged(page, start, (0.1 * width, 0.0), mouse=True)
+        await page.comes_true(f"studio.told.state.object === '{ALIEN}' && !studio.isChanging")
+        assert made.desk.state.at_px == pytest.approx((0.85 * WIDTH, 0.8 * HEIGHT), abs=WIDTH / 50)
+        assert made.desk.state.before[0].at_px == pytest.approx((0.3 * WIDTH, 0.8 * HEIGHT), abs=WIDTH / 100)
+        await page.choose("#chosen", "0")
+        await page.comes_true(f"studio.told.state.object === '{CAKE}' && !studio.isChanging")
+        assert (await page.value("document.getElementById('command').textContent")).count("--at-pixel") == 2
+        await page.value("document.getElementById('stage').focus()")
+        await pressed(page, "Delete")
+        await page.comes_true(f"studio.told.state.object === '{ALIEN}' && studio.objects.length === 1 && !studio.isChanging")
+        await page.tap("#undo")
+        await page.comes_true("studio.objects.length === 2")
+        await page.value("document.getElementById('remove').click()")
+        await page.comes_true("studio.objects.length === 1")
+        await page.value("document.getElementById('remove').click()")
+        await page.comes_true("studio.objects.length === 0 && studio.told.state.at_px === null")
+        assert made.desk.state.object is None and page.errors == []
+
+
 async def test_two_fingers_scale_and_turn_and_the_wheel_too(tmp_path: Path) -> None:
     async with opened(tmp_path, UPRIGHT) as (page, made):
         await placed(page, made)

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 2a92817596fc4eff75bee0e67ce1f95286036e53fe27230a96d18f75acd144a2
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 3973766f9b4926c1304add1c97042f2b9911126fee0ac0fdad606587cca9f44b
 "use strict";
 (() => {
   // src/model.ts
@@ -83,6 +83,13 @@
     get state() {
       return this.told && { ...this.told.state, ...this.sending, ...this.local };
     }
+    /** All objects that have a place, in their order. */
+    get objects() {
+      const state = this.state;
+      if (!state) return [];
+      const { object, at_px, height, turn_deg } = state;
+      return [...state.before, ...object && at_px ? [{ object, at_px, height, turn_deg }] : [], ...state.after];
+    }
     get isComplete() {
       const state = this.state;
       return Boolean(this.told?.photo && state?.photo && state.object && state.at_px);
@@ -102,6 +109,24 @@
       Object.assign(this.local, changes);
       this.dispatchEvent(new Event("state"));
       this.draw();
+    }
+    /** The changes by which one of all objects is chosen. */
+    choosing(number, objects = this.objects) {
+      const chosen = objects[number];
+      if (!chosen) return { object: null, at_px: null, height: null, turn_deg: 0, before: [], after: [] };
+      return { ...chosen, before: objects.slice(0, number), after: objects.slice(number + 1) };
+    }
+    /** Take the chosen object away; the one before it is chosen. */
+    remove() {
+      const number = this.state?.before.length ?? 0;
+      const rest = this.objects.filter((_, each) => each !== number);
+      if (this.state?.object) void this.commit(this.choosing(Math.max(0, number - 1), rest));
+    }
+    /** Add an object beside the chosen one. */
+    async add(object) {
+      await this.commit();
+      const told = await this.post("/add", { object });
+      if (told) this.take(told);
     }
     /** Keep what was changed: one step of the history. */
     commit(changes = {}) {
@@ -170,7 +195,8 @@
       try {
         const answer = await fetch(`/upload?kind=${kind}&name=${encodeURIComponent(file.name)}`, { method: "POST", body: file });
         if (!answer.ok) return this.say(await sentenceOf(answer));
-        this.say(kind === "object" && !this.state?.at_px ? "click into the photograph where the object is to stand" : "");
+        const said = this.isComplete ? "the object is added beside the chosen one: drag it to its place" : "click into the photograph where the object is to stand";
+        this.say(kind === "object" ? said : "");
         this.take(await answer.json());
       } catch {
         this.say(`${file.name} did not arrive: the studio does not answer`);
@@ -282,6 +308,13 @@
       react("f_number_auto", () => ({ f_number: null }));
       react("camera_found", () => ({ camera: studio.told?.camera?.file ?? null, pitch_deg: null }));
       byId("object").addEventListener("change", (event) => void studio.commit({ object: event.target.value || null, height: null }));
+      byId("chosen").addEventListener("change", (event) => void studio.commit(studio.choosing(Number(event.target.value))));
+      byId("add").addEventListener("change", (event) => {
+        const select = event.target;
+        if (select.value) void studio.add(select.value);
+        select.value = "";
+      });
+      byId("remove").addEventListener("click", () => studio.remove());
       for (const [id, by] of [["undo", -1], ["redo", 1]]) byId(id).addEventListener("click", () => void studio.step(by));
       studio.addEventListener("told", () => this.told());
       studio.addEventListener("state", () => this.state());
@@ -373,12 +406,8 @@
     }
     choices() {
       const told = studio.told;
-      const select = byId("object");
-      const wanted = ["", ...told.objects.map((each) => each.path)];
-      if (wanted.join("\n") !== [...select.options].map((each) => each.value).join("\n")) {
-        const names = ["choose one", ...told.objects.map((each) => each.name)];
-        select.replaceChildren(...wanted.map((path, i) => new Option(names[i], path)));
-      }
+      offer("object", [["", "choose one"], ...told.objects.map((each) => [each.path, each.name])]);
+      offer("add", [["", "choose one"], ...told.objects.map((each) => [each.path, each.name])]);
       const lenses = byId("lenses");
       if (lenses.dataset.shown !== JSON.stringify(told.lenses)) {
         lenses.dataset.shown = JSON.stringify(told.lenses);
@@ -417,6 +446,11 @@
       for (const { id, name } of NUMBERS) this.fill(id, state[name] === null ? "" : String(state[name]));
       this.fill("height", state.height ?? "");
       byId("object").value = state.object ?? "";
+      const objects = studio.objects;
+      offer("chosen", objects.map((each, number) => [String(number), `${number + 1}: ${nameOf(each.object)}`]));
+      byId("chosen").value = String(state.before.length);
+      byId("chosen_row").hidden = objects.length < 2;
+      byId("add_row").hidden = !objects.length;
       byId("sun_auto").checked = state.sun_deg === null;
       byId("matched").checked = state.matched;
       byId("plain").checked = state.plain;
@@ -444,6 +478,13 @@
       if (studio.state) byId("focus_told").textContent = focusTold(studio.state);
     }
   };
+  var nameOf = (path) => path.replace(/^.*[\\/]/, "").replace(/\.\w+$/, "");
+  function offer(id, choices) {
+    const select = byId(id);
+    if (select.dataset.shown === JSON.stringify(choices)) return;
+    select.dataset.shown = JSON.stringify(choices);
+    select.replaceChildren(...choices.map(([value, name]) => new Option(name, value)));
+  }
   function focusTold(state) {
     const shown = studio.shown;
     if (!shown || !studio.isComplete) return "Click Focus here, then what is to be in focus.";
@@ -746,12 +787,14 @@
       if (photo && ground && state && wanted) {
         this.path("", ground.grid());
         this.path("horizon", `M0 ${ground.horizon_px(0)}L${photo.width_px} ${ground.horizon_px(photo.width_px)}`);
-        if (state.at_px) this.path("foot", ground.circle(state.at_px, ground.cell_m / 2));
+        studio.objects.forEach((each, number) => {
+          this.path(number === state.before.length ? "foot" : "foot other", ground.circle(each.at_px, ground.cell_m / 2));
+        });
         this.words(`one square: ${ground.cell_m} m`, photo.width_px * 0.015, photo.height_px * 0.985, photo.width_px / this.stage.clientWidth);
       }
       if (photo && !studio.isComplete && this.before.complete && this.before.naturalWidth) this.showPhotograph();
       const box = byId2("box");
-      const sides = studio.isComplete ? studio.shown?.box : null;
+      const sides = studio.isComplete ? this.boxOf(state.before.length) : null;
       box.hidden = !sides;
       if (sides) {
         const [left, top, right2, bottom] = sides.map((each) => 100 * each);
@@ -787,11 +830,32 @@
       const within = (value, most) => Math.round(100 * Math.min(most - 1, Math.max(0, value))) / 100;
       return [within(x, photo.width_px), within(y, photo.height_px)];
     }
+    /** The box of an object in the newest picture, if that shows all objects. */
+    boxOf(number) {
+      const boxes = studio.shown?.boxes ?? [];
+      return boxes.length === studio.objects.length ? boxes[number] ?? null : null;
+    }
+    /** Choose the object under a point of the window, the nearest if several are, unless the chosen one is there. Whether it did. */
+    chose(x, y) {
+      const [photo, state] = [studio.told?.photo, studio.state];
+      if (!photo || !state) return false;
+      const [x_px, y_px] = this.pixel(x, y);
+      const [u, v] = [x_px / photo.width_px, y_px / photo.height_px];
+      const under = studio.objects.flatMap((each, number) => {
+        const box = this.boxOf(number);
+        return box && u >= box[0] && u <= box[2] && v >= box[1] && v <= box[3] ? [{ number, foot: each.at_px[1] }] : [];
+      });
+      const nearest = under.sort((one, other) => other.foot - one.foot)[0];
+      if (!nearest || under.some((each) => each.number === state.before.length)) return false;
+      studio.change(studio.choosing(nearest.number));
+      return true;
+    }
     gestures() {
       listen(this.stage, {
         tap: (x, y) => this.tapped(x, y),
         twice: (x, y) => this.tapped(x, y),
         dragStart: (x, y) => {
+          if (this.loupe.hidden) this.chose(x, y);
           this.from = studio.state?.at_px ?? this.inside(this.pixel(x, y));
           this.moved = [0, 0];
           this.stage.classList.add("dragging");
@@ -814,6 +878,7 @@
       this.stage.focus();
       if (!studio.told?.photo) return;
       if (this.stage.classList.contains("focusing")) return this.focusAt(x, y);
+      if (this.chose(x, y)) return void studio.commit();
       if (!studio.state?.object) return studio.say("choose an object first: in the list at the right, or drop a GLB file");
       const ground = groundOf(studio.told.photo, studio.state);
       if (!ground || ground.isInSight) return void studio.commit({ at_px: this.inside(this.pixel(x, y)) });
@@ -841,7 +906,7 @@
       if (photo.has_depth) return void studio.commit({ focus_at_px: at_px, focus_m: null });
       const ground = groundOf(photo, studio.state);
       if (!ground) return studio.say("the plain ground has no distance to focus on: turn Plain off, or type the metres");
-      const box = studio.shown?.box;
+      const box = this.boxOf(studio.state.before.length);
       const [u, v] = [at_px[0] / photo.width_px, at_px[1] / photo.height_px];
       const onObject = box && u >= box[0] && u <= box[2] && v >= box[1] && v <= box[3];
       const metres = ground.distance_m(onObject && studio.state?.at_px ? studio.state.at_px : at_px);
@@ -861,6 +926,7 @@
           studio.change({ at_px: this.inside([x + step * move[0], y + step * move[1]]) });
           this.commitLater();
         } else if (shape) this.shape(...shape);
+        else if (event.key === "Delete" || event.key === "Backspace") studio.remove();
         else return;
         event.preventDefault();
       });

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 2a92817596fc4eff75bee0e67ce1f95286036e53fe27230a96d18f75acd144a2
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 3973766f9b4926c1304add1c97042f2b9911126fee0ac0fdad606587cca9f44b
 "use strict";
 (() => {
   // src/model.ts

@@ -1,1 +1,1 @@
-"""Studio: one object placed in one photograph on a page, with the command line that makes the same picture."""
+"""Studio: objects placed in one photograph on a page, with the command line that makes the same picture."""

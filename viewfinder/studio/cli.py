@@ -1,4 +1,4 @@
-"""`mrbokeh studio`: one object placed in one photograph, in a browser."""
+"""`mrbokeh studio`: objects placed in one photograph, in a browser."""
 
 from pathlib import Path
 from typing import Annotated
@@ -18,7 +18,9 @@ def studio(
         Path | None,
         typer.Argument(metavar="PHOTO", help="A photograph (RAW, JPEG, HEIC, TIFF, PNG), or the .json project of an earlier time."),
     ] = None,
-    object_: Annotated[Path | None, typer.Option("--object", help="GLB file to render and put in.")] = None,
+    object_: Annotated[
+        list[Path] | None, typer.Option("--object", help="GLB file to render and put in (repeat: the page offers them).")
+    ] = None,
     depth: Annotated[
         Path | None,
         typer.Option(
@@ -40,7 +42,7 @@ def studio(
     tls_key: TlsKeyOption = None,
     qr: QrOption = True,
 ) -> None:
-    """Place an object in a photograph with the mouse or a finger, see it with the lens's blur, and save it; Ctrl-C ends it.
+    """Place objects in a photograph with the mouse or a finger, see them with the lens's blur, and save that; Ctrl-C ends it.
 
     Every state shows the `mrbokeh composite` command that makes the same picture. Without PHOTO the page asks for one.
 
@@ -52,4 +54,4 @@ def studio(
     from viewfinder.studio.running import StudioOptions, serve
 
     listening = ListeningOptions(port=port, lan=lan, interface=interface, tls=tls, tls_key=tls_key, qr=qr)
-    serve(StudioOptions(photo, object_, depth, tuple(lens or ()), project=project, pictures=pictures, listening=listening))
+    serve(StudioOptions(photo, tuple(object_ or ()), depth, tuple(lens or ()), project=project, pictures=pictures, listening=listening))

@@ -22,11 +22,15 @@ def options_of(state: StudioState) -> CompositeOptions:
         raise InputError("there is no object yet: drop a GLB file on the page, choose a shipped one, or give --object")
     if state.at_px is None:
         raise InputError("the object has no place yet: click into the photograph where it is to stand")
+    objects = state.objects
+    # What has no height yet gets one with the metres of its place; until then any serves.
+    known = [each.height for each in objects if each.height is not None]
+    turns = [each.turn_deg for each in objects]
     standing = ObjectOptions(
-        object_=[state.object],
-        at_pixel=[_numbers(state.at_px)],
-        height=None if state.height is None else [state.height],
-        turn=[state.turn_deg] if state.turn_deg else None,
+        object_=[each.object for each in objects],
+        at_pixel=[_numbers(each.at_px) for each in objects],
+        height=[each.height or known[0] for each in objects] if known else None,
+        turn=turns if any(turns) else None,
         pitch=state.pitch_deg,
         camera_height=None if state.plain or state.depth is not None else state.camera_height_m,
         sun=None if state.sun_deg is None else _numbers(state.sun_deg),

@@ -24,6 +24,8 @@ LARGEST = {"photo": 300 << 20, "object": 200 << 20}
 """Bytes of what is dropped on the page."""
 _OBJECTS = (".glb",)
 _KEPT_PHOTOGRAPHS = 2
+_BESIDE = 0.15
+"""How far beside another an object is added, in widths of the photograph."""
 
 
 class Desk:
@@ -85,8 +87,10 @@ class Desk:
             raise InputError(f"expected the changes of the state as names and values, got {type(changes).__name__}")
         document = self.state.document() | {str(name): value for name, value in changes.items()}
         state = state_of(document)
-        for name, known in self._known_files().items():
-            if (path := getattr(state, name)) is not None and path not in known:
+        known = self._known_files()
+        named = [(name, getattr(state, name)) for name in known]
+        for name, path in (*named, *(("object", each.object) for each in state.objects)):
+            if path is not None and path not in known[name]:
                 raise InputError(f"the page may choose only what it was offered, but {name} is {str(path)[:60]!r}: drop the file on it")
         return state
 
@@ -104,6 +108,18 @@ class Desk:
     async def change(self, changes: Any) -> None:
         """Take changes of a page over, complete what follows from them, and keep the project."""
         self.project.add(self.changed_state(changes))
+        self._keep()
+        await self._complete()
+
+    async def add_object(self, path: Any) -> None:
+        """Add an object that the page was offered, beside the chosen one. Raises InputError."""
+        if path not in map(str, self.project.objects):
+            raise InputError(f"the page may choose only what it was offered, but object is {str(path)[:60]!r}: drop the file on it")
+        opened, state = self.photograph, self.state
+        beside_px = 0.0
+        if opened is not None and state.at_px is not None:
+            beside_px = _BESIDE * opened.size_px[0] * (1.0 if state.at_px[0] < (1.0 - 2.0 * _BESIDE) * opened.size_px[0] else -1.0)
+        self.project.add(state.with_object(Path(path), beside_px))
         self._keep()
         await self._complete()
 
@@ -132,9 +148,7 @@ class Desk:
             raise
         if kind == "object":
             self.project.offer(path)
-            self.project.add(replace(self.state, object=path, height=None))
-            self._keep()
-            await self._complete()
+            await self.add_object(str(path))
         else:
             self.project.add(StudioState(photo=path, object=self.state.object, lens=self.state.lens))
             self._keep()

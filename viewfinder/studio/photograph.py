@@ -176,14 +176,14 @@ def placed(state: StudioState, opened: OpenedPhotograph) -> StudioState:
     if plate.depth_m is not None:
         if plate.metres_guessed:
             return replace(state, height=f"{HIGH_SHARE * opened.size_px[1]:.0f}px")
-        depth_m = plate.point_under_pixel_m(*standing.first_px)[2]
+        depth_m = plate.point_under_pixel_m(*standing.pixels[len(state.before)])[2]
         return replace(state, height=f"{plate.length_m(high_px, depth_m):.3g}")
     if not is_told:
         state = replace(state, pitch_deg=round(looks_down_deg(plate), 2))
         standing = replace(standing, pitch=state.pitch_deg)
     plate, on_ground = on_level_ground(plate, standing, known_height_m)
     assert on_ground.at is not None and plate.world_from_camera is not None
-    foot_m = np.array([float(each) for each in on_ground.at[0].split(",")])
+    foot_m = np.array([float(each) for each in on_ground.at[len(state.before)].split(",")])
     eyes_m = float(plate.world_from_camera[1] @ foot_m)
     height = state.height or f"{plate.length_m(high_px, foot_m[2]):.3g}"
     return replace(state, camera_height_m=state.camera_height_m or float(f"{eyes_m:.4g}"), height=height)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.commands._composite_kept import KeptParts
+from mrbokeh.commands._composite_layers import objects_of
 from mrbokeh.commands._composite_options import CompositeOptions
 from mrbokeh.commands._composite_parts import blur_told
 from mrbokeh.commands._composited import composited, placed
@@ -19,6 +20,7 @@ from mrbokeh.compositing.plate import Plate
 from mrbokeh.compositing.plate_look.finishing import Finishing, finishing_of, matched_finishing
 from mrbokeh.images.color import srgb_codes
 from mrbokeh.images.layer import Layer
+from mrbokeh.scene.staging.staged_scene import StagedObject
 from mrbokeh.system.channel import apart
 from mrbokeh.system.errors import InputError
 from viewfinder.studio.loupe import Region, WholePhotograph, region_of
@@ -35,7 +37,7 @@ _MOST_FINISHINGS = 3
 
 @dataclass(frozen=True)
 class Preview:
-    """Picture of a state. told: box of the object in shares of the picture, its blur in words, what was guessed, warnings, and time."""
+    """Picture of a state. told: boxes of the objects in shares of the picture, its blur in words, what was guessed, warnings, and time."""
 
     rgb: Float32[np.ndarray, "height width 3"]
     told: dict[str, Any]
@@ -58,7 +60,7 @@ def preview_of(photograph: OpenedPhotograph, options: CompositeOptions, kept: Ke
         plate, sharp = made.plate, made.sharp
         blur, _known, figures = blur_told(plate, sharp)
         told = {
-            "box": _box(sharp[0]),
+            "boxes": [_box(sharp[0])] if len(small.standing.each) == 1 else _boxes(small, plate, kept),
             "blur": blur,
             "focus_m": plate.lens.focus_distance_m if np.isfinite(plate.lens.focus_distance_m) else None,
             "f_number": plate.lens.f_number,
@@ -95,6 +97,18 @@ def _box(layer: Layer) -> list[float] | None:
     height, width = layer.alpha.shape
     sides = (columns.min() / width, rows.min() / height, (columns.max() + 1) / width, (rows.max() + 1) / height)
     return [float(each) for each in sides]
+
+
+def _boxes(options: CompositeOptions, plate: Plate, kept: KeptParts) -> list[list[float] | None]:
+    """Return such a box for each object, by the corners of its surface, whether something hides it or not."""
+    size_px, boxes = np.array([plate.camera.width_px, plate.camera.height_px]), []
+    for one in objects_of(options.standing, plate):
+        staged = StagedObject(one.described().objects[0], kept.assets.glb(one.glb), "-y").scene_at(options.rendering.time)
+        xy_px, depth_m = one.seen_by(plate.camera).project(np.concatenate([mesh.positions_m for mesh in staged.drawn_meshes]))
+        shares = xy_px[depth_m > 0.0] / size_px
+        low, high = (np.clip(bound, 0.0, 1.0).tolist() for bound in (shares.min(0), shares.max(0))) if len(shares) else ([0, 0], [0, 0])
+        boxes.append([*low, *high] if low[0] < high[0] and low[1] < high[1] else None)
+    return boxes
 
 
 def jpeg_of(rgb: Float32[np.ndarray, "height width 3"], quality: int = _QUALITY) -> bytes:

@@ -87,14 +87,16 @@ def read_project(path: Path) -> Project:
     project = Project(path, history, place, **there)
     if project.state.camera is not None and not project.state.camera.is_file():
         project.amend(lambda state: replace(state, camera=None))
-    for name in _PATHS:
-        if (file := getattr(project.state, name)) is not None and not file.is_file():
+    named = [(name, getattr(project.state, name)) for name in _PATHS]
+    for name, file in (*named, *(("object", each.object) for each in project.state.objects)):
+        if file is not None and not file.is_file():
             raise InputError(f"{path} has the {name} {file}, which is not there any more: put it back, or begin anew without the project")
     return project
 
 
 def _by_paths(state: StudioState, change: Callable[[Path], Path]) -> StudioState:
     named: dict[str, Any] = {name: change(path) for name in _PATHS if (path := getattr(state, name)) is not None}
+    named |= {name: tuple(replace(each, object=change(each.object)) for each in getattr(state, name)) for name in ("before", "after")}
     return replace(state, **named)
 
 

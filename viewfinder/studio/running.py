@@ -26,7 +26,7 @@ class StudioOptions:
     """Options of `mrbokeh studio`. photo: may be a project file; None lets the page ask."""
 
     photo: Path | None = None
-    object: Path | None = None
+    objects: tuple[Path, ...] = ()
     depth: Path | None = None
     lenses: tuple[Path, ...] = ()
     project: Path | None = None
@@ -55,16 +55,17 @@ def project_of(options: StudioOptions) -> Project:
 
 def _offer(project: Project, options: StudioOptions) -> None:
     """Offer the objects and lenses of the options, and the shipped objects."""
-    given = [] if options.object is None else [_there(options.object, "a GLB file")]
-    if given and given[0].suffix.lower() not in (".glb", ".gltf"):
-        raise InputError(f"expected --object to be a .glb file, got {given[0]}: export the object as glTF binary")
+    given = [_there(each, "a GLB file") for each in options.objects]
+    for path in given:
+        if path.suffix.lower() not in (".glb", ".gltf"):
+            raise InputError(f"expected --object to be a .glb file, got {path}: export the object as glTF binary")
     for path in (*given, *sorted(SHIPPED.glob("*.glb"))):
         project.offer(path)
     for path in options.lenses:
         if path.suffix.lower() != ".onnx":
             read_lens(path)
         project.offer(_there(path, "a lens file"))
-    if given and project.state.object != given[0]:
+    if given and given[0] not in (project.state.object, *(each.object for each in project.state.objects)):
         project.add(replace(project.state, object=given[0], height=None))
 
 

@@ -54,7 +54,7 @@ class StudioSite:
         app = web.Application(middlewares=[self.access.middleware])
         app.add_routes(page_routes(PAGE))
         get = {"/state": self._state, "/photo": self._photo, "/lens/{number}": self._lens, "/saved/{number}": self._saved}
-        post = {"/state": self._change, "/history": self._history, "/preview": self._preview, "/upload": self._upload}
+        post = {"/state": self._change, "/add": self._add, "/history": self._history, "/preview": self._preview, "/upload": self._upload}
         post |= {"/save": self._save, "/cancel": self._cancel}
         app.add_routes([web.post("/enter", self.access.enter)])
         app.add_routes([web.get(path, _refusing(handler)) for path, handler in get.items()])
@@ -130,6 +130,11 @@ class StudioSite:
     async def _change(self, request: web.Request) -> web.Response:
         """Handle POST /state: {"changes": {name: value}}."""
         await self.desk.change((await _message(request)).get("changes"))
+        return web.json_response(self._told())
+
+    async def _add(self, request: web.Request) -> web.Response:
+        """Handle POST /add: {"object": one that is offered}."""
+        await self.desk.add_object((await _message(request)).get("object"))
         return web.json_response(self._told())
 
     async def _history(self, request: web.Request) -> web.Response:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +15,28 @@ _DIGITS = 6
 
 
 @dataclass(frozen=True)
+class Placed:
+    """An object that stands in the photograph: its file, place, height and turn, as of StudioState."""
+
+    object: Path
+    at_px: Pair
+    height: str | None = None
+    turn_deg: float = 0.0
+
+    def document(self) -> dict[str, Any]:
+        """Return what JSON keeps."""
+        return {"object": str(self.object), "at_px": list(self.at_px), "height": self.height, "turn_deg": self.turn_deg}
+
+
+@dataclass(frozen=True)
 class StudioState:
     """State of the studio; None leaves a thing to the command's own default.
 
-    at_px: where the object stands, in pixels of the whole photograph. height: metres such as "0.3", or pixels such as "120px".
-    focus_at_px: the pixel that is in focus, where the photograph has depth; focus_m otherwise. sun_deg: where the main light comes from,
-    degrees to the right of the view and above the horizon. camera: file of `mrbokeh capture solve`; pitch_deg comes before it. matched:
-    black and grain of the object are those of the photograph. plain: guess neither light nor ground.
+    object, at_px, height, turn_deg: of the chosen object; before, after: those that come before and after it in the command line.
+    at_px: where it stands, in pixels of the whole photograph. height: metres such as "0.3", or pixels such as "120px". focus_at_px: the
+    pixel that is in focus, where the photograph has depth; focus_m otherwise. sun_deg: where the main light comes from, degrees to the
+    right of the view and above the horizon. camera: file of `mrbokeh capture solve`; pitch_deg comes before it. matched: black and grain
+    of the objects are those of the photograph. plain: guess neither light nor ground.
     """
 
     photo: Path | None = None
@@ -32,6 +47,8 @@ class StudioState:
     at_px: Pair | None = None
     height: str | None = None
     turn_deg: float = 0.0
+    before: tuple[Placed, ...] = ()
+    after: tuple[Placed, ...] = ()
     pitch_deg: float | None = None
     camera_height_m: float | None = None
     focal_length_mm: float | None = None
@@ -50,13 +67,34 @@ class StudioState:
         """Whether there is a photograph, an object, and a place for it."""
         return self.photo is not None and self.object is not None and self.at_px is not None
 
+    @property
+    def objects(self) -> tuple[Placed, ...]:
+        """All objects that have a place, in the order of the command line."""
+        chosen = () if self.object is None or self.at_px is None else (Placed(self.object, self.at_px, self.height, self.turn_deg),)
+        return (*self.before, *chosen, *self.after)
+
+    def with_object(self, path: Path, beside_px: float) -> "StudioState":
+        """Return the state with one more object, which is chosen: so far to the right of the chosen one, and as high.
+
+        While no object has a place it takes the place of the only one.
+        """
+        if self.object is None or self.at_px is None:
+            return replace(self, object=path, height=None)
+        before = self.objects[: len(self.before) + 1]
+        x_px, y_px = self.at_px
+        return replace(self, object=path, at_px=(_rounded(x_px + beside_px), y_px), turn_deg=0.0, before=before)
+
     def document(self) -> dict[str, Any]:
         """Return what JSON keeps: every value by its name."""
         values = {each.name: getattr(self, each.name) for each in fields(self)}
         return {
-            name: list(value) if isinstance(value, tuple) else str(value) if isinstance(value, Path) else value
+            name: _kept(list(value)) if isinstance(value, tuple) else str(value) if isinstance(value, Path) else value
             for name, value in values.items()
         }
+
+
+def _kept(values: list[Any]) -> list[Any]:
+    return [each.document() if isinstance(each, Placed) else each for each in values]
 
 
 def state_of(document: Any) -> StudioState:
@@ -103,6 +141,19 @@ def _pair(first: tuple[float, float], second: tuple[float, float]) -> Callable[[
     return checked
 
 
+def _placed(name: str, value: Any) -> tuple[Placed, ...]:
+    """Return objects that have a place, of their documents."""
+    if not isinstance(value, list | tuple) or len(value) > _MOST_OBJECTS:
+        raise InputError(f"expected {name} to be a list of at most {_MOST_OBJECTS} objects, got {_shown(value)}")
+    known = [each.name for each in fields(Placed)]
+    placed = []
+    for each in value:
+        if not isinstance(each, Mapping) or not {"object", "at_px"} <= set(each) <= set(known):
+            raise InputError(f"expected each of {name} to have object, at_px, height and turn_deg, got {_shown(each)}")
+        placed.append(Placed(**{key: _CHECKS[key](f"{name}.{key}", one) for key, one in each.items() if one is not None}))
+    return tuple(placed)
+
+
 def _flag(name: str, value: Any) -> bool:
     if not isinstance(value, bool):
         raise InputError(f"expected {name} to be true or false, got {_shown(value)}")
@@ -130,7 +181,7 @@ def _shown(value: Any) -> str:
     return repr(value)[:60]
 
 
-_PIXELS = (0.0, 200_000.0)
+_PIXELS, _MOST_OBJECTS = (0.0, 200_000.0), 50
 _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "photo": _path,
     "depth": _path,
@@ -140,6 +191,8 @@ _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "at_px": _pair(_PIXELS, _PIXELS),
     "height": _height,
     "turn_deg": _number(-100_000.0, 100_000.0),
+    "before": _placed,
+    "after": _placed,
     "pitch_deg": _number(-89.0, 89.0),
     "camera_height_m": _number(0.001, 10_000.0),
     "focal_length_mm": _number(0.1, 10_000.0),

@@ -108,7 +108,7 @@ class OneObject:
 
     @property
     def foot_m(self) -> Triple:
-        """Where it stands in a world whose vertical is true and whose origin is the camera."""
+        """Place where it stands in a world whose vertical is true and whose origin is the camera."""
         x_m, y_m, z_m = (self.world_from_camera @ np.asarray(self.stands_at_m)).tolist()
         return x_m, y_m, z_m
 

@@ -4,7 +4,15 @@ import { sentenceOf } from "./server";
 
 export type Pair = [number, number];
 
-/** The state as the server keeps it; null leaves a thing to the command's own default. */
+/** An object that stands in the photograph. */
+export interface Placed {
+  object: string;
+  at_px: Pair;
+  height: string | null;
+  turn_deg: number;
+}
+
+/** The state as the server keeps it; null leaves a thing to the command's own default. Object, place, height and turn are the chosen one's. */
 export interface State {
   photo: string | null;
   object: string | null;
@@ -13,6 +21,8 @@ export interface State {
   at_px: Pair | null;
   height: string | null;
   turn_deg: number;
+  before: Placed[];
+  after: Placed[];
   pitch_deg: number | null;
   camera_height_m: number | null;
   focal_length_mm: number | null;
@@ -70,9 +80,11 @@ export interface Told {
   photo: Photo | null;
 }
 
-/** What comes with a picture. box: left, top, right, bottom of the object in shares of the picture. */
+export type Box = [number, number, number, number];
+
+/** What comes with a picture. boxes: left, top, right, bottom of each object in shares of the picture. */
 export interface Shown {
-  box: [number, number, number, number] | null;
+  boxes: (Box | null)[];
   blur: string;
   focus_m: number | null;
   f_number: number;
@@ -109,6 +121,14 @@ export class Studio extends EventTarget {
     return this.told && { ...this.told.state, ...this.sending, ...this.local };
   }
 
+  /** All objects that have a place, in their order. */
+  get objects(): Placed[] {
+    const state = this.state;
+    if (!state) return [];
+    const { object, at_px, height, turn_deg } = state;
+    return [...state.before, ...(object && at_px ? [{ object, at_px, height, turn_deg }] : []), ...state.after];
+  }
+
   get isComplete(): boolean {
     const state = this.state;
     return Boolean(this.told?.photo && state?.photo && state.object && state.at_px);
@@ -131,6 +151,27 @@ export class Studio extends EventTarget {
     Object.assign(this.local, changes);
     this.dispatchEvent(new Event("state"));
     this.draw();
+  }
+
+  /** The changes by which one of all objects is chosen. */
+  choosing(number: number, objects: Placed[] = this.objects): Partial<State> {
+    const chosen = objects[number];
+    if (!chosen) return { object: null, at_px: null, height: null, turn_deg: 0, before: [], after: [] };
+    return { ...chosen, before: objects.slice(0, number), after: objects.slice(number + 1) };
+  }
+
+  /** Take the chosen object away; the one before it is chosen. */
+  remove(): void {
+    const number = this.state?.before.length ?? 0;
+    const rest = this.objects.filter((_, each) => each !== number);
+    if (this.state?.object) void this.commit(this.choosing(Math.max(0, number - 1), rest));
+  }
+
+  /** Add an object beside the chosen one. */
+  async add(object: string): Promise<void> {
+    await this.commit();
+    const told = await this.post("/add", { object });
+    if (told) this.take(told);
   }
 
   /** Keep what was changed: one step of the history. */
@@ -206,7 +247,8 @@ export class Studio extends EventTarget {
     try {
       const answer = await fetch(`/upload?kind=${kind}&name=${encodeURIComponent(file.name)}`, { method: "POST", body: file });
       if (!answer.ok) return this.say(await sentenceOf(answer));
-      this.say(kind === "object" && !this.state?.at_px ? "click into the photograph where the object is to stand" : "");
+      const said = this.isComplete ? "the object is added beside the chosen one: drag it to its place" : "click into the photograph where the object is to stand";
+      this.say(kind === "object" ? said : "");
       this.take((await answer.json()) as Told);
     } catch {
       this.say(`${file.name} did not arrive: the studio does not answer`);

@@ -65,6 +65,13 @@ export class Panel {
     react("f_number_auto", () => ({ f_number: null }));
     react("camera_found", () => ({ camera: studio.told?.camera?.file ?? null, pitch_deg: null }));
     byId("object").addEventListener("change", (event) => void studio.commit({ object: (event.target as HTMLSelectElement).value || null, height: null }));
+    byId("chosen").addEventListener("change", (event) => void studio.commit(studio.choosing(Number((event.target as HTMLSelectElement).value))));
+    byId("add").addEventListener("change", (event) => {
+      const select = event.target as HTMLSelectElement;
+      if (select.value) void studio.add(select.value);
+      select.value = "";
+    });
+    byId("remove").addEventListener("click", () => studio.remove());
     for (const [id, by] of [["undo", -1], ["redo", 1]] as const) byId(id).addEventListener("click", () => void studio.step(by));
     studio.addEventListener("told", () => this.told());
     studio.addEventListener("state", () => this.state());
@@ -167,12 +174,8 @@ export class Panel {
 
   private choices(): void {
     const told = studio.told!;
-    const select = byId<HTMLSelectElement>("object");
-    const wanted = ["", ...told.objects.map((each) => each.path)];
-    if (wanted.join("\n") !== [...select.options].map((each) => each.value).join("\n")) {
-      const names = ["choose one", ...told.objects.map((each) => each.name)];
-      select.replaceChildren(...wanted.map((path, i) => new Option(names[i], path)));
-    }
+    offer("object", [["", "choose one"], ...told.objects.map((each): [string, string] => [each.path, each.name])]);
+    offer("add", [["", "choose one"], ...told.objects.map((each): [string, string] => [each.path, each.name])]);
     const lenses = byId<HTMLElement>("lenses");
     if (lenses.dataset.shown !== JSON.stringify(told.lenses)) {
       lenses.dataset.shown = JSON.stringify(told.lenses);
@@ -213,6 +216,11 @@ export class Panel {
     for (const { id, name } of NUMBERS) this.fill(id, state[name] === null ? "" : String(state[name]));
     this.fill("height", state.height ?? "");
     byId<HTMLSelectElement>("object").value = state.object ?? "";
+    const objects = studio.objects;
+    offer("chosen", objects.map((each, number): [string, string] => [String(number), `${number + 1}: ${nameOf(each.object)}`]));
+    byId<HTMLSelectElement>("chosen").value = String(state.before.length);
+    byId<HTMLElement>("chosen_row").hidden = objects.length < 2;
+    byId<HTMLElement>("add_row").hidden = !objects.length;
     byId<HTMLInputElement>("sun_auto").checked = state.sun_deg === null;
     byId<HTMLInputElement>("matched").checked = state.matched;
     byId<HTMLInputElement>("plain").checked = state.plain;
@@ -241,6 +249,16 @@ export class Panel {
     if (studio.isChanging) byId("command").textContent = shown.command ?? "";
     if (studio.state) byId("focus_told").textContent = focusTold(studio.state);
   }
+}
+
+const nameOf = (path: string): string => path.replace(/^.*[\\/]/, "").replace(/\.\w+$/, "");
+
+/** Fill a list with values and their names, where it has others. */
+function offer(id: string, choices: [string, string][]): void {
+  const select = byId<HTMLSelectElement>(id);
+  if (select.dataset.shown === JSON.stringify(choices)) return;
+  select.dataset.shown = JSON.stringify(choices);
+  select.replaceChildren(...choices.map(([value, name]) => new Option(name, value)));
 }
 
 /** How the lens is focused, and how much the object is blurred by that. */

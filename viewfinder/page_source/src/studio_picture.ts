@@ -1,7 +1,7 @@
 // The picture: fitted to the window, with the ground over it, and everything that hands do on it.
 import { listen } from "./gestures";
 import { groundOf } from "./studio_ground";
-import { type Pair, studio } from "./studio_model";
+import { type Box, type Pair, studio } from "./studio_model";
 
 const NUDGES_REST_MS = 500;
 const LOUPE_PX = 240;
@@ -102,12 +102,14 @@ export class PictureStage {
     if (photo && ground && state && wanted) {
       this.path("", ground.grid());
       this.path("horizon", `M0 ${ground.horizon_px(0)}L${photo.width_px} ${ground.horizon_px(photo.width_px)}`);
-      if (state.at_px) this.path("foot", ground.circle(state.at_px, ground.cell_m / 2));
+      studio.objects.forEach((each, number) => {
+        this.path(number === state.before.length ? "foot" : "foot other", ground.circle(each.at_px, ground.cell_m / 2));
+      });
       this.words(`one square: ${ground.cell_m} m`, photo.width_px * 0.015, photo.height_px * 0.985, photo.width_px / this.stage.clientWidth);
     }
     if (photo && !studio.isComplete && this.before.complete && this.before.naturalWidth) this.showPhotograph();
     const box = byId<HTMLElement>("box");
-    const sides = studio.isComplete ? studio.shown?.box : null;
+    const sides = studio.isComplete ? this.boxOf(state!.before.length) : null;
     box.hidden = !sides;
     if (sides) {
       const [left, top, right, bottom] = sides.map((each) => 100 * each) as [number, number, number, number];
@@ -148,11 +150,34 @@ export class PictureStage {
     return [within(x, photo.width_px), within(y, photo.height_px)];
   }
 
+  /** The box of an object in the newest picture, if that shows all objects. */
+  private boxOf(number: number): Box | null {
+    const boxes = studio.shown?.boxes ?? [];
+    return boxes.length === studio.objects.length ? boxes[number] ?? null : null;
+  }
+
+  /** Choose the object under a point of the window, the nearest if several are, unless the chosen one is there. Whether it did. */
+  private chose(x: number, y: number): boolean {
+    const [photo, state] = [studio.told?.photo, studio.state];
+    if (!photo || !state) return false;
+    const [x_px, y_px] = this.pixel(x, y);
+    const [u, v] = [x_px / photo.width_px, y_px / photo.height_px];
+    const under = studio.objects.flatMap((each, number) => {
+      const box = this.boxOf(number);
+      return box && u >= box[0] && u <= box[2] && v >= box[1] && v <= box[3] ? [{ number, foot: each.at_px[1] }] : [];
+    });
+    const nearest = under.sort((one, other) => other.foot - one.foot)[0];
+    if (!nearest || under.some((each) => each.number === state.before.length)) return false;
+    studio.change(studio.choosing(nearest.number));
+    return true;
+  }
+
   private gestures(): void {
     listen(this.stage, {
       tap: (x, y) => this.tapped(x, y),
       twice: (x, y) => this.tapped(x, y),
       dragStart: (x, y) => {
+        if (this.loupe.hidden) this.chose(x, y);
         this.from = studio.state?.at_px ?? this.inside(this.pixel(x, y));
         this.moved = [0, 0];
         this.stage.classList.add("dragging");
@@ -177,6 +202,7 @@ export class PictureStage {
     this.stage.focus();
     if (!studio.told?.photo) return;
     if (this.stage.classList.contains("focusing")) return this.focusAt(x, y);
+    if (this.chose(x, y)) return void studio.commit();
     if (!studio.state?.object) return studio.say("choose an object first: in the list at the right, or drop a GLB file");
     const ground = groundOf(studio.told.photo, studio.state);
     if (!ground || ground.isInSight) return void studio.commit({ at_px: this.inside(this.pixel(x, y)) });
@@ -207,7 +233,7 @@ export class PictureStage {
     if (photo.has_depth) return void studio.commit({ focus_at_px: at_px, focus_m: null });
     const ground = groundOf(photo, studio.state);
     if (!ground) return studio.say("the plain ground has no distance to focus on: turn Plain off, or type the metres");
-    const box = studio.shown?.box;
+    const box = this.boxOf(studio.state!.before.length);
     const [u, v] = [at_px[0] / photo.width_px, at_px[1] / photo.height_px];
     const onObject = box && u >= box[0] && u <= box[2] && v >= box[1] && v <= box[3];
     const metres = ground.distance_m(onObject && studio.state?.at_px ? studio.state.at_px : at_px);
@@ -228,6 +254,7 @@ export class PictureStage {
         studio.change({ at_px: this.inside([x + step * move[0], y + step * move[1]]) });
         this.commitLater();
       } else if (shape) this.shape(...shape);
+      else if (event.key === "Delete" || event.key === "Backspace") studio.remove();
       else return;
       event.preventDefault();
     });
