@@ -69,7 +69,8 @@ def test_a_main_light_takes_its_share_of_the_light() -> None:
     np.testing.assert_allclose(irradiance / np.pi, white_at(plate.rgb, 0.5, 28 / HEIGHT), rtol=0.03)
     shade = 1.0 - 0.5 * np.array(main.rgb) / irradiance
     assert float(luminance(shade[None].astype(np.float32))[0]) == pytest.approx(11.8 / 53.7, rel=0.05)
-    assert shade[2] > 1.5 * shade[1] > 1.5 * 1.2 * shade[0]
+    # As measured in shadows of three sunny photographs.
+    assert 1.4 < shade[2] / shade[0] < 2.7 and shade[0] < shade[1] < shade[2]
 
 
 def test_sunshine_shows_in_the_exposure() -> None:
