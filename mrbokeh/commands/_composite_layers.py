@@ -113,22 +113,24 @@ def _object_layers(options: ObjectOptions, rendering: RenderingOptions, first: P
     usual = 0.0 if options.plain else _DARK if catches == "shadow" else 1.0
     shadow = usual if options.shadow is None else options.shadow
     filming = replace(rendering.of_photograph.filming(), catches=catches, caught_share=shadow)
-    grounds = _grounds(objects_of(options, first, shadow))
-    light = _light(options, first, options.first_px if options.at_pixel else _pixel_of(first.camera, grounds[0][0].stands_at_m), kept)
-    grounds = [[replace(each, light=light) for each in ground] for ground in grounds]
+    placed = objects_of(options, first, shadow)
+    light = _light(options, first, options.first_px if options.at_pixel else _pixel_of(first.camera, placed[0].stands_at_m), kept)
+    placed = [replace(each, light=light) for each in placed]
+    grounds = _grounds(placed)
 
     def filmed(*objects: "OneObject") -> LayersFor:
         head, *beside = objects
         return _filmed(head.described(*beside), filming, rendering.time, lambda plate: head.seen_by(plate.camera), kept)
 
-    on_grounds = [filmed(*ground) for ground in grounds]
-    together = filmed(*(replace(each, shadow=0.0) for ground in grounds for each in ground)) if len(grounds) > 1 else None
+    on_grounds = [filmed(*(placed[number] for number in ground)) for ground in grounds]
+    together = filmed(*(replace(each, shadow=0.0) for each in placed)) if len(grounds) > 1 else None
+    feet_px = [[options.pixels[number] for number in ground] if options.at_pixel else [] for ground in grounds]
 
     def layers(plate: Plate) -> list[Layer]:
         parts = [make(plate) for make in on_grounds]
-        caught = [layer for _objects, *some in parts for layer in some]
         objects = parts[0][0] if together is None else together(plate)[0]
-        return [objects, *(ended_shadow(plate, options.pixels, objects, each) if options.at_pixel else each for each in caught)]
+        caught = [(feet, layer) for feet, (_objects, *some) in zip(feet_px, parts, strict=True) for layer in some]
+        return [objects, *(ended_shadow(plate, feet, objects, layer) if feet else layer for feet, layer in caught)]
 
     return layers
 
@@ -147,7 +149,6 @@ def objects_of(options: ObjectOptions, plate: Plate, shadow: float = 0.0) -> "li
         one = OneObject(
             glb=each.glb,
             stands_at_m=stands_at_m,
-            height_m=_height_m(each.height, plate, stands_at_m[2]),
             turn_rad=math.radians(each.turn),
             world_from_camera=np.eye(3) if plate.world_from_camera is None else plate.world_from_camera,
             shadow=shadow,
@@ -155,19 +156,20 @@ def objects_of(options: ObjectOptions, plate: Plate, shadow: float = 0.0) -> "li
         levels = [other.foot_m[1] / one.foot_m[1] for other in placed] if one.foot_m[1] and options.at_pixel else []
         nearer = next((level for level in levels if abs(level - 1.0) < _SAME_LEVEL), 1.0)
         x_m, y_m, z_m = stands_at_m
-        placed.append(one if nearer == 1.0 else replace(one, stands_at_m=(nearer * x_m, nearer * y_m, nearer * z_m)))
+        moved_m = stands_at_m if nearer == 1.0 else (nearer * x_m, nearer * y_m, nearer * z_m)
+        placed.append(replace(one, stands_at_m=moved_m, height_m=_height_m(each.height, plate, moved_m[2])))
     return placed
 
 
-def _grounds(objects: "Sequence[OneObject]") -> "list[list[OneObject]]":
-    """Return the objects by the level of ground on which they stand."""
-    grounds: list[list[OneObject]] = []
-    for each in objects:
-        same = (ground for ground in grounds if math.isclose(ground[0].foot_m[1], each.foot_m[1], rel_tol=_ROUNDING, abs_tol=_ROUNDING))
+def _grounds(objects: "Sequence[OneObject]") -> list[list[int]]:
+    """Return the numbers of the objects by the level of ground on which they stand."""
+    levels_m, grounds = [each.foot_m[1] for each in objects], list[list[int]]()
+    for number, level_m in enumerate(levels_m):
+        same = (ground for ground in grounds if math.isclose(levels_m[ground[0]], level_m, rel_tol=_ROUNDING, abs_tol=_ROUNDING))
         if (ground := next(same, None)) is None:
-            grounds.append([each])
+            grounds.append([number])
         else:
-            ground.append(each)
+            ground.append(number)
     return grounds
 
 

@@ -206,6 +206,8 @@ class ObjectOptions:
         if self.sun and self.sun_by:
             raise InputError("--sun and --sun-by both say where the main light comes from: give one of them")
         told = f"--sun {self.sun}" if self.sun else f"--sun-by {self.sun_by}" if self.sun_by else ""
+        if self.sun_by and not self.object_:
+            raise InputError(f"--sun-by {self.sun_by} lights an --object: give one, or leave it out")
         if told and self.environment:
             raise InputError(
                 f"{told} is a light beside what the photograph tells, which --environment replaces: a panorama has its own sun, so leave "
@@ -413,9 +415,8 @@ class CompositeOptions:
             return self
         factor, height, at_pixel = small_px[1] / whole_px[1], self.standing.height, self.standing.at_pixel
         height = height and [f"{factor * typed_height(each)[0]:.9g}px" if each.endswith("px") else each for each in height]
-        at_pixel, sun_by = at_pixel and [_scaled(each, whole_px, small_px) for each in at_pixel], self.standing.sun_by
-        sun_by = sun_by and ":".join(_scaled(each, whole_px, small_px) for each in sun_by.split(":"))
-        standing = replace(self.standing, at_pixel=at_pixel, height=height, sun_by=sun_by)
+        at_pixel = at_pixel and [_scaled(each, whole_px, small_px) for each in at_pixel]
+        standing = replace(self.standing, at_pixel=at_pixel, height=height)
         focus_at = self.optics.focus_at and _scaled(self.optics.focus_at, whole_px, small_px)
         focus_at = focus_at and ",".join(str(int(float(each))) for each in focus_at.split(","))
         return replace(self, standing=standing, optics=replace(self.optics, focus_at=focus_at))

@@ -106,8 +106,11 @@ def composite(
         plate = replace(plate, lens=_focused(plate.lens, focus, plate.depth_m))
     given = [inserted] if isinstance(inserted, (Layer, str, Path)) else list(inserted)
     glbs = [Path(each) for each in given if not isinstance(each, Layer) and Path(each).suffix.lower() == ".glb"]
-    at_pixels = [f"{x_px},{y_px}" for x_px, y_px in np.reshape([] if at_pixel is None else at_pixel, (-1, 2)).tolist()]
-    heights = [] if height is None else [height] if isinstance(height, (float, int, str)) else height
+    pixels = np.zeros((0, 2)) if at_pixel is None else np.atleast_2d(at_pixel)
+    if pixels.ndim != 2 or pixels.shape[1] != 2:
+        raise InputError(f"at_pixel: expected (x, y), or one for each GLB, got {at_pixel!r}")
+    at_pixels = [f"{x_px},{y_px}" for x_px, y_px in pixels.tolist()]
+    heights = [] if height is None else np.atleast_1d(height).tolist()
     standing = ObjectOptions(object_=glbs, at_pixel=at_pixels, height=[str(each) for each in heights])
     standing.require_places()
     if glbs and len(glbs) < len(given):

@@ -26,7 +26,7 @@ _LEAST_POINTS, _LEAST_SHARE = 40, 0.3
 _WITHIN_PX, _ROUNDS = 1.0, 2
 _SHIFTS = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 1.0, 0.0), (1.0, -1.0, 0.0), (0.0, 0.0, 1.0))
 _LEAST_PARALLAX_PX = 2.0
-_MOST_AHEAD = 0.7
+_MOST_AHEAD = 0.4
 _NEAREST_PERCENT = 95.0
 
 
@@ -120,7 +120,7 @@ def _likeliest(here: Rays, there: Rays, within: float) -> tuple[_Pair, Bool[np.n
         return best, good
     here_2, there_2 = (np.ascontiguousarray(each[:, :2]) for each in (here, there))
     essential, mask = cv2.findEssentialMat(here_2, there_2, np.eye(3), method=cv2.USAC_MAGSAC, prob=0.9999, threshold=within)
-    if mask is None:
+    if essential is None or mask is None or not mask.any():
         return best, good
     voted = mask.ravel() > 0
     _, turn, shift, _ = cv2.recoverPose(essential[:3], here_2[voted], there_2[voted], np.eye(3))

@@ -31,7 +31,7 @@ _QUANTILES = 65
 _WINDOW_PX, _STEP_COST, _JUMP_COST, _UNIQUE_PERCENT = 3, 8, 32, 15
 _SPECKLE_PX, _STEPS_PER_PX = 200, 16
 _SPILL_PX, _MEDIAN_PX, _FILL_PX, _CONTRAST = 6, 5, 40.0, 0.03
-_LEAST_MEASURED = 0.3
+_LEAST_MEASURED, _MOST_WIDER = 0.3, 2.0
 
 
 def stereo_depth(first_rgb: Rgb, second_rgb: Rgb, camera: Camera, baseline_m: float, photos: tuple[Path, Path]) -> DepthMap:
@@ -47,7 +47,7 @@ def stereo_depth(first_rgb: Rgb, second_rgb: Rgb, camera: Camera, baseline_m: fl
     movement = camera_movement(*_alike(first_rgb, second_rgb, small), small, told)
     nearest = float(np.percentile(movement.nearness, 99.5))
     small = _resized(small, _MOST_SHIFT_PX / (nearest * small.focal_px[0]))
-    matched = _matched(*_alike(first_rgb, second_rgb, small), small, movement)
+    matched = _matched(*_alike(first_rgb, second_rgb, small), small, movement, told)
     share = float(matched.measured.mean())
     if share < _LEAST_MEASURED:
         raise InputError(
@@ -90,8 +90,11 @@ class Rows:
     along: Float[np.ndarray, " 3"]
 
 
-def _rows(camera: Camera, movement: Movement, margin_px: int) -> Rows:
-    """Return the view along whose rows the camera moves, as little turned as can be. margin_px: beyond both ends of the picture."""
+def _rows(camera: Camera, movement: Movement, margin_px: int, told: str) -> Rows:
+    """Return the view along whose rows the camera moves, as little turned as can be. margin_px: beyond both ends of the picture.
+
+    Raises InputError where it would be turned so far that the picture is drawn out. told: names the photographs.
+    """
     right = movement.way
     down = np.cross([0.0, 0.0, 1.0], right)
     down /= np.linalg.norm(down)
@@ -99,20 +102,22 @@ def _rows(camera: Camera, movement: Movement, margin_px: int) -> Rows:
     focal_px, middle_px = camera.focal_px[0], np.asarray(camera.principal_px) - 0.5
     lens = np.array([[focal_px, 0.0, middle_px[0]], [0.0, focal_px, middle_px[1]], [0.0, 0.0, 1.0]])
     corners = np.array([[x, y, 1.0] for x in (0, camera.width_px - 1) for y in (0, camera.height_px - 1)]) @ np.linalg.inv(lens).T @ turn.T
-    seen_px = focal_px * corners[:, :2] / corners[:, 2:]
+    seen_px = focal_px * corners[:, :2] / np.maximum(corners[:, 2:], 1e-3)
     least, most = np.floor(seen_px.min(axis=0)), np.ceil(seen_px.max(axis=0))
+    if (most - least > _MOST_WIDER * np.array([camera.width_px, camera.height_px])).any():
+        raise InputError(f"between {told} the camera moved along its view: expected one that moved sideways or up, by a hand's breadth")
     placed = np.array([[focal_px, 0.0, margin_px - least[0]], [0.0, focal_px, -least[1]], [0.0, 0.0, 1.0]]) @ turn
     size_px = (int(most[0] - least[0]) + 1 + 2 * margin_px, int(most[1] - least[1]) + 1)
     return Rows(placed @ np.linalg.inv(lens), placed @ movement.turn.T @ np.linalg.inv(lens), size_px, turn[2])
 
 
-def _matched(first: Grey, second: Grey, camera: Camera, movement: Movement) -> "_Matched":
+def _matched(first: Grey, second: Grey, camera: Camera, movement: Movement, told: str) -> "_Matched":
     """Return the way over depth of each pixel of the first picture, where both agree."""
     focal_px = camera.focal_px[0]
     farthest, nearest = (float(each) * focal_px for each in np.percentile(movement.nearness, [0.5, 99.5]))
     least = max(int(0.6 * farthest) - 4, -4)
     shifts = 16 * int(np.ceil((1.25 * nearest + 4 - least) / 16))
-    rows = _rows(camera, movement, max(shifts + least, 0))
+    rows = _rows(camera, movement, max(shifts + least, 0), told)
     turned = [
         cv2.warpPerspective(each, by, rows.size_px, flags=cv2.INTER_CUBIC) for each, by in ((first, rows.first), (second, rows.second))
     ]
@@ -133,8 +138,8 @@ def _matched(first: Grey, second: Grey, camera: Camera, movement: Movement) -> "
     seen = cv2.warpPerspective(np.ones_like(second), rows.second, rows.size_px, flags=cv2.INTER_NEAREST)
     across, down = np.meshgrid(np.arange(rows.size_px[0], dtype=np.float32), np.arange(rows.size_px[1], dtype=np.float32))
     known = shift_px >= least
-    for least_seen_px in (shift_px, np.full_like(shift_px, np.median(shift_px[known]) if known.any() else 0.0)):
-        known &= cv2.remap(seen, across - least_seen_px, down, cv2.INTER_NEAREST) > 0
+    for by_px in (shift_px, np.full_like(shift_px, np.median(shift_px[known]) if known.any() else 0.0)):
+        known &= cv2.remap(seen, across - by_px, down, cv2.INTER_NEAREST) > 0
     filled = _behind(np.where(known, shift_px, np.nan).astype(np.float32))
     plane = (camera.pixel_centres_px() - camera.principal_px) / focal_px
     per_px = ((plane @ rows.along[:2] + rows.along[2]) / focal_px).astype(np.float32)
@@ -167,7 +172,9 @@ def _behind(shift_px: Plane) -> Plane:
 def _filled(matched: _Matched, first_rgb: Rgb) -> Plane:
     """Return the nearness with holes filled from their surroundings, up to edges of the photograph."""
     known = matched.known
-    steady = np.where(known, cv2.medianBlur(matched.nearness, _MEDIAN_PX), 0.0)
+    # Beside holes, which count as 0, the median may be one of them.
+    median = cv2.medianBlur(matched.nearness, _MEDIAN_PX)
+    steady = np.where(known, np.where(median > 0.0, median, matched.nearness), 0.0)
     guide = np.sqrt(np.clip(cv2.resize(first_rgb, known.shape[::-1], interpolation=cv2.INTER_AREA), 0.0, 1.0))
     around = interpolate(steady, known.astype(np.float32), guide, _FILL_PX**2, _CONTRAST)
     return np.where(known, steady, around).astype(np.float32)

@@ -5,6 +5,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Lock
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
@@ -39,6 +40,7 @@ SizePx = tuple[int, int]
 
 AS_STORED = 1
 _TAG = 0x0112
+_OPENING = Lock()
 _TELLING = (".png", ".jpg", ".jpeg", ".webp")
 # EXIF 2.3: quarter turns counter-clockwise that bring the stored picture upright, and whether it is mirrored left to right first.
 _UPRIGHT = {1: (0, False), 2: (0, True), 3: (2, False), 4: (2, True), 5: (1, True), 6: (3, False), 7: (3, True), 8: (1, False)}
@@ -48,15 +50,18 @@ Picture = TypeVar("Picture", bound=np.ndarray)
 
 @contextmanager
 def header_of(path: Path) -> "Iterator[Image.Image]":
-    """Open a picture with Pillow for what its header tells. It may be of any size: Pillow's limit is for what is decoded."""
+    """Open a picture with Pillow for what its header tells. It may be of any size; Pillow refuses large ones of strangers."""
     from PIL import Image
 
-    most_px, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
-    try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path) as picture:
+    with warnings.catch_warnings(action="ignore"):
+        with _OPENING:
+            most_px, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
+            try:
+                picture = Image.open(path)
+            finally:
+                Image.MAX_IMAGE_PIXELS = most_px
+        with picture:
             yield picture
-    finally:
-        Image.MAX_IMAGE_PIXELS = most_px
 
 
 def stored_orientation(path: Path) -> int:

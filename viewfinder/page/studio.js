@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 3973766f9b4926c1304add1c97042f2b9911126fee0ac0fdad606587cca9f44b
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 95585ba20cd683f927e1a31b6a8e3d17bc7a6e556ed9f35d30d1b978208b0e18
 "use strict";
 (() => {
   // src/model.ts
@@ -307,7 +307,11 @@
       react("focus_auto", () => ({ focus_m: null, focus_at_px: null }));
       react("f_number_auto", () => ({ f_number: null }));
       react("camera_found", () => ({ camera: studio.told?.camera?.file ?? null, pitch_deg: null }));
-      byId("object").addEventListener("change", (event) => void studio.commit({ object: event.target.value || null, height: null }));
+      byId("object").addEventListener("change", (event) => {
+        const object = event.target.value;
+        if (object) void studio.commit({ object, height: null });
+        else studio.remove();
+      });
       byId("chosen").addEventListener("change", (event) => void studio.commit(studio.choosing(Number(event.target.value))));
       byId("add").addEventListener("change", (event) => {
         const select = event.target;

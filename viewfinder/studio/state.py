@@ -76,8 +76,10 @@ class StudioState:
     def with_object(self, path: Path, beside_px: float) -> "StudioState":
         """Return the state with one more object, which is chosen: so far to the right of the chosen one, and as high.
 
-        While no object has a place it takes the place of the only one.
+        Where the chosen one has no place it takes its part. Raises InputError for more objects than a state holds.
         """
+        if len(self.objects) >= _MOST_OBJECTS:
+            raise InputError(f"there are {_MOST_OBJECTS} objects already: remove one first")
         if self.object is None or self.at_px is None:
             return replace(self, object=path, height=None)
         before = self.objects[: len(self.before) + 1]
@@ -148,7 +150,7 @@ def _placed(name: str, value: Any) -> tuple[Placed, ...]:
     known = [each.name for each in fields(Placed)]
     placed = []
     for each in value:
-        if not isinstance(each, Mapping) or not {"object", "at_px"} <= set(each) <= set(known):
+        if not isinstance(each, Mapping) or None in (each.get("object"), each.get("at_px")) or not set(each) <= set(known):
             raise InputError(f"expected each of {name} to have object, at_px, height and turn_deg, got {_shown(each)}")
         placed.append(Placed(**{key: _CHECKS[key](f"{name}.{key}", one) for key, one in each.items() if one is not None}))
     return tuple(placed)

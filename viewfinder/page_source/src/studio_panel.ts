@@ -64,7 +64,11 @@ export class Panel {
     react("focus_auto", () => ({ focus_m: null, focus_at_px: null }));
     react("f_number_auto", () => ({ f_number: null }));
     react("camera_found", () => ({ camera: studio.told?.camera?.file ?? null, pitch_deg: null }));
-    byId("object").addEventListener("change", (event) => void studio.commit({ object: (event.target as HTMLSelectElement).value || null, height: null }));
+    byId("object").addEventListener("change", (event) => {
+      const object = (event.target as HTMLSelectElement).value;
+      if (object) void studio.commit({ object, height: null });
+      else studio.remove();
+    });
     byId("chosen").addEventListener("change", (event) => void studio.commit(studio.choosing(Number((event.target as HTMLSelectElement).value))));
     byId("add").addEventListener("change", (event) => {
       const select = event.target as HTMLSelectElement;
