@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.commands._composite_layers import layers_by, objects_apart
+from mrbokeh.commands._composite_layers import layers_by, objects_apart, objects_of
 from mrbokeh.commands._composite_options import CompositeOptions, ObjectOptions
 from mrbokeh.commands._composited import placed
 from mrbokeh.commands._level_ground import on_level_ground
@@ -122,6 +122,15 @@ def test_what_stands_on_another_level_has_its_own_ground(far_m: float, grounds: 
     np.testing.assert_allclose(objects.alpha[right].sum(), alone[0].alpha[right].sum(), rtol=0.08)
     dark = 1.0 - np.prod([1.0 - each.alpha[right] for each in caught], axis=0)
     assert dark.sum() == pytest.approx(alone[1].alpha[right].sum(), rel=0.1)
+
+
+def test_heights_in_pixels_hold_for_an_object_that_is_moved_to_the_level_of_the_first() -> None:
+    """Both share row 200, so that both are 60 px high where they stand, though the depth of the second is off by 3 %."""
+    standing = replace(LEVEL, object_=[CAKE, CAKE], at_pixel=["80,200", "280,200"], height=["60px"], camera_height=None)
+    plate, options = placed(table(1.03), CompositeOptions(Path("photo.exr"), standing=standing))
+    first, second = objects_of(options.standing, plate)
+    assert second.stands_at_m[2] == pytest.approx(first.stands_at_m[2])
+    assert second.height_m == pytest.approx(first.height_m)
 
 
 PLACES = {"object_": [CAKE, ALIEN], "at_pixel": ["1,2", "3,4"]}

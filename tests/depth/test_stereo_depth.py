@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from datasets_scripts.tracers.thin_lens import trace_pinhole
-from mrbokeh.depth.stereo_depth import stereo_depth
+from mrbokeh.depth.camera_movement import Movement
+from mrbokeh.depth.stereo_depth import _filled, _Matched, _rows, stereo_depth
 from mrbokeh.images.color import srgb_to_linear
 from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.optics.camera import Camera
@@ -142,3 +143,21 @@ def test_options_that_contradict_one_another_are_refused(words: tuple[str, ...],
     given = [str(tmp_path / each) if each.endswith(("png", "exr")) else each for each in words]
     done = mrbokeh("composite", tmp_path / "photo.png", *given, "--object", CAKE, "--at-pixel", "300,330", "--out", tmp_path / "out.png")
     assert done.returncode == 2 and told in done.stderr
+
+
+def test_a_checkerboard_twice_and_views_turned_away_are_refused() -> None:
+    """Nothing tells the movement of the one; rows along a way of 37 degrees ahead draw a wide view of 100 degrees out without end."""
+    squares = np.indices((420, 600)).sum(axis=0) // 20 % 2 + np.indices((420, 600))[0] // 20 % 2
+    board = np.repeat((0.2 + 0.3 * (squares % 2))[..., None], 3, axis=2).astype(np.float32)
+    refused("too little in common|show no depth|moved", stereo_depth, board, board, camera(), 0.1, PHOTOS)
+    wide = replace(camera(), focal_px=(250.0, 250.0))
+    ahead = Movement(np.eye(3), np.array([0.8, 0.0, 0.6]), np.full(50, 0.1))
+    refused("moved along its view", _rows, wide, ahead, 64, "a.jpg and b.jpg")
+
+
+def test_holes_in_what_was_matched_make_nothing_infinitely_far() -> None:
+    """Where most neighbours of a pixel are unknown their median is none of its depth."""
+    known = np.random.default_rng(4).random((60, 80)) < 0.6
+    nearness = np.where(known, np.float32(0.5), np.float32(0.0)).astype(np.float32)
+    filled = _filled(_Matched(nearness, known, known), np.full((60, 80, 3), 0.3, np.float32))
+    np.testing.assert_allclose(filled, 0.5, rtol=1e-3)

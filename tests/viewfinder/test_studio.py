@@ -486,7 +486,8 @@ async def test_objects_are_added_chosen_and_taken_away(photo: Path, tmp_path: Pa
         assert len(told["state"]["before"]) == 2 and told["command"].count("--object") == told["command"].count("--at-pixel") == 3
         assert (await asked(one, made.url + "add", {"object": "/etc/passwd"}))[0] == 400
         stranger = {"object": "/etc/passwd", "at_px": [1, 2]}
-        for bad, why in (([stranger], "may choose only"), ([{"at_px": [1, 2]}], "each of before"), ("cake", "list of at most")):
+        nowhere = {"object": str(ALIEN), "at_px": None}
+        for bad, why in (([stranger], "may choose only"), ([{"at_px": [1, 2]}, nowhere], "each of before"), ("cake", "list of at most")):
             status, answered = await asked(one, made.url + "state", {"changes": {"before": bad}})
             assert status == 400 and why in answered["error"], answered
         await asked(one, made.url + "history", {"step": -1})
