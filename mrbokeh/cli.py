@@ -307,7 +307,7 @@ def _refused(error: OSError) -> str:
 def _complain(message: str, file: Any, *, stopped: bool) -> None:
     channel().said(message if stopped else f"error: {message}")
     with suppress(OSError):
-        console = Console(file=file, soft_wrap=True)
+        console = Console(file=file, soft_wrap=True, emoji=False)
         if not stopped:
             console.print("error:", style="bold red", end=" ")
         console.print(message, markup=False, highlight=False)

@@ -20,7 +20,7 @@ _EYES_M, _LOWEST_M, _HIGHEST_M, _FARTHEST_M = 1.5, 0.15, 5.0, 100.0
 """Height of a camera in the hand; heights that are believed where the focus distance is taken for that of the ground; and its farthest."""
 _BELOW_DEG, _BELOW_SHARE, _BELOW_M = 10.0, 0.5, 1.2
 _SAME_SHAPE = 0.01
-_POINTED_PX, _SURE_DEG, _LEAST_FALL, _LOWEST_SUN = 4.0, 20.0, 1e-4, 0.01
+_POINTED_PX, _SURE_DEG, _LEAST_FALL, _LOWEST_SUN, _LOW_SUN_DEG = 4.0, 20.0, 1e-4, 0.01, 6.0
 
 Pixel = tuple[float, float]
 
@@ -103,6 +103,8 @@ def sun_by_shadow(plate: Plate, top_px: Pixel, foot_px: Pixel, tip_px: Pixel) ->
     """
     for pixel in (top_px, foot_px, tip_px):
         plate.require_pixel(*pixel)
+    if math.dist(foot_px, tip_px) < _POINTED_PX:
+        raise InputError("--sun-by: the foot and the shadow's tip are the same place: expected a shadow that has a length")
     pixels = np.array([top_px, foot_px, tip_px], np.float64)
     towards = _sunwards(plate, pixels)
     shifts = _POINTED_PX * np.eye(6).reshape(6, 3, 2)
@@ -110,7 +112,12 @@ def sun_by_shadow(plate: Plate, top_px: Pixel, foot_px: Pixel, tip_px: Pixel) ->
     off_deg = math.degrees(math.acos(min(1.0, min(float(towards @ each) for each in moved))))
     right_deg = math.degrees(math.atan2(towards[0], towards[2]))
     above_deg = math.degrees(math.asin(-towards[1]))
-    say(f"by the shadow the sun is {right_deg:.0f} degrees to the right of the view and {above_deg:.0f} above the horizon")
+    side = "right" if right_deg >= 0.0 else "left"
+    say(f"by the shadow the sun is {abs(right_deg):.0f} degrees to the {side} of the view and {above_deg:.0f} above the horizon")
+    if above_deg < _LOW_SUN_DEG:
+        warn(
+            f"a sun {above_deg:.0f} degrees above the horizon is low: is the third pixel of --sun-by on the ground, where the shadow ends?"
+        )
     if off_deg > _SURE_DEG:
         warn(
             f"{_POINTED_PX:g} px beside one of the three pixels would turn the sun by {off_deg:.0f} degrees: take a longer shadow, or --sun"

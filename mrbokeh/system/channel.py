@@ -143,7 +143,7 @@ def show(renderable: Any, **figures: Any) -> None:
     from rich.console import Console
 
     channel().figures |= figures
-    console, logged = Console(highlight=False), Console(width=200, force_terminal=False)
+    console, logged = Console(highlight=False, emoji=False), Console(width=200, force_terminal=False, emoji=False)
     console.print(renderable, soft_wrap=not console.is_terminal)
     with logged.capture() as text:
         logged.print(renderable, soft_wrap=True)

@@ -88,7 +88,7 @@ def progress_bars() -> Iterator[Progress]:
         TextColumn("left"),
         TimeRemainingColumn(),
     )
-    console = Console(stderr=True)
+    console = Console(stderr=True, emoji=False)
     with Progress(*columns, console=console) if console.is_terminal else PlainLines(console) as progress:
         yield progress
 
@@ -105,7 +105,7 @@ def track(items: Iterable[Item], description: str, total: int | None = None) -> 
 
 def working(description: str) -> AbstractContextManager[object]:
     """Show a spinner on the terminal while something of unknown length runs."""
-    return Console(stderr=True).status(description)
+    return Console(stderr=True, emoji=False).status(description)
 
 
 @contextmanager

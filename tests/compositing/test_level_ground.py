@@ -135,6 +135,7 @@ def test_a_shadow_tells_where_the_sun_is(right_deg: float, above_deg: float, dow
         (((400, 200), (400, 450), (500, 299)), "the shadow's tip lies above the horizon"),
         (((400, 550), (400, 450), (500, 500)), "the top is not above the ground"),
         (((400, 200), (400, 450), (900, 500)), "outside"),
+        (((400, 200), (400, 450), (402, 451)), "are the same place"),
     ],
 )
 def test_pixels_that_are_no_shadow_are_refused(pixels: tuple[tuple[float, float], ...], words: str) -> None:

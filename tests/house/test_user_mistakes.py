@@ -1,6 +1,7 @@
 """What users get wrong on any day, damaged and too new files: one sentence says what was expected, with the whole path and without the
 words of libraries, the code is 2, and nothing that they have is lost."""
 
+import io
 import os
 import re
 import signal
@@ -283,3 +284,9 @@ def test_nothing_is_said_by_a_command_but_our_line(stored: bytes, tmp_path: Path
     (tmp_path / "odd.png").write_bytes(stored[:-40])
     done = mrbokeh("check", tmp_path / "odd.png")
     assert "odd.png" in done.stderr + done.stdout and capfd.readouterr() == ("", "")
+
+
+def test_words_between_colons_are_no_pictures() -> None:
+    printed = io.StringIO()
+    cli._complain("expected TOP:FOOT:TIP and [red]X[/red]", printed, stopped=False)
+    assert printed.getvalue() == "error: expected TOP:FOOT:TIP and [red]X[/red]\n"
