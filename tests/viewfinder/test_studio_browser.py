@@ -13,6 +13,7 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from tests.support.made_studio import ALIEN, CAKE, HEIGHT, WIDTH, MadeStudio, made_studio, write_floor
+from tests.support.waiting import comes_true
 from viewfinder.studio.state import StudioState
 
 pytestmark = [
@@ -185,7 +186,8 @@ async def test_several_objects_are_added_chosen_by_hand_and_removed(tmp_path: Pa
         await page.comes_true("studio.objects.length === 1")
         await page.value("document.getElementById('remove').click()")
         await page.comes_true("studio.objects.length === 0 && studio.told.state.at_px === null")
-        assert made.desk.state.object is None and page.errors == []
+        await comes_true(lambda: made.desk.state.object is None)
+        assert page.errors == []
 
 
 async def test_two_fingers_scale_and_turn_and_the_wheel_too(tmp_path: Path) -> None:
