@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 95585ba20cd683f927e1a31b6a8e3d17bc7a6e556ed9f35d30d1b978208b0e18
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: aa4f280c9bfcc9fa47f53d69ee59622781d1647d8be6fb0b5d96b66032bbc8fd
 "use strict";
 (() => {
   // src/model.ts
@@ -213,7 +213,7 @@
     async draft() {
       if (this.drafting) return;
       this.drafting = true;
-      for (let drawn = -1; drawn !== this.changes; ) {
+      for (let drawn = -1; drawn !== this.changes && this.isComplete; ) {
         drawn = this.changes;
         await this.ask(true, drawn);
       }

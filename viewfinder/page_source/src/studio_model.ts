@@ -267,7 +267,7 @@ export class Studio extends EventTarget {
   private async draft(): Promise<void> {
     if (this.drafting) return;
     this.drafting = true;
-    for (let drawn = -1; drawn !== this.changes;) {
+    for (let drawn = -1; drawn !== this.changes && this.isComplete;) {
       drawn = this.changes;
       await this.ask(true, drawn);
     }
