@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: aa4f280c9bfcc9fa47f53d69ee59622781d1647d8be6fb0b5d96b66032bbc8fd
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 0159210b49709554ee65b35c4c49fe48bb470f30ac99bb89b9b3383f8c08c33b
 "use strict";
 (() => {
   // src/model.ts

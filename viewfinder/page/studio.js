@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: aa4f280c9bfcc9fa47f53d69ee59622781d1647d8be6fb0b5d96b66032bbc8fd
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 0159210b49709554ee65b35c4c49fe48bb470f30ac99bb89b9b3383f8c08c33b
 "use strict";
 (() => {
   // src/model.ts
@@ -76,6 +76,7 @@
     sending = {};
     sends = Promise.resolve();
     changes = 0;
+    finished = -1;
     drafting = false;
     resting;
     quiet;
@@ -244,6 +245,8 @@
         const shown = JSON.parse(new TextDecoder().decode(new Uint8Array(body, 4, length)));
         const bitmap = await createImageBitmap(new Blob([new Uint8Array(body, 4 + length)], { type: "image/jpeg" }));
         if (!draft && change !== this.changes) return;
+        if (draft && change <= this.finished) return;
+        if (!draft) this.finished = change;
         this.shown = shown;
         this.say(shown.warnings[0] ?? "", true);
         this.counts[draft ? "drafts" : "whole"]++;

@@ -112,6 +112,7 @@ export class Studio extends EventTarget {
   private sending: Partial<State> = {};
   private sends: Promise<void> = Promise.resolve();
   private changes = 0;
+  private finished = -1;
   private drafting = false;
   private resting: ReturnType<typeof setTimeout> | undefined;
   private quiet: ReturnType<typeof setTimeout> | undefined;
@@ -302,6 +303,9 @@ export class Studio extends EventTarget {
       const bitmap = await createImageBitmap(new Blob([new Uint8Array(body, 4 + length)], { type: "image/jpeg" }));
       // A finished picture of what has changed since is older than the draft on the screen.
       if (!draft && change !== this.changes) return;
+      // So is a draft that comes after the finished picture of its change.
+      if (draft && change <= this.finished) return;
+      if (!draft) this.finished = change;
       this.shown = shown;
       this.say(shown.warnings[0] ?? "", true);
       this.counts[draft ? "drafts" : "whole"]++;
