@@ -77,7 +77,8 @@ class BankTables:
         """Return how far light of these diameters travels at most, by a bank over diameters alone."""
         if coc_px.size == 0:
             return 0
-        first, last = self.cells(np.array([coc_px.min(), coc_px.max()], np.float32), Place())
+        diameters_px = coc_px if self.bank.axes[0].is_signed else np.abs(coc_px)
+        first, last = self.cells(np.array([diameters_px.min(), diameters_px.max()], np.float32), Place())
         return int(self.reaches_px[first : last + 1].max())
 
     def codes(
