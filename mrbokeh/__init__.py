@@ -21,7 +21,7 @@ _PUBLIC = {
     "read_focal_stack": "mrbokeh.stacks.focal_stack",
     "read_image": "mrbokeh.images.image_io",
     "read_layer": "mrbokeh.images.image_io",
-    "read_lens": "mrbokeh.optics.lens_file",
+    "read_lens": "mrbokeh.renderers.choose",
     "read_picture": "mrbokeh.commands.on_arrays",
     "render": "mrbokeh.commands.on_arrays",
     "write_image": "mrbokeh.images.image_io",

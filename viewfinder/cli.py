@@ -42,7 +42,8 @@ def viewfinder(
         Path | None, typer.Option(metavar="RGBAZ.exr", help="Instead of a scene: an all-in-focus layer before a camera that stands still.")
     ] = None,
     lens: Annotated[
-        list[Path] | None, typer.Option(help="LENS.json, or NETWORK.onnx (repeat: the page switches between them); else the scene's.")
+        list[Path] | None,
+        typer.Option(help="LENS.json, a bank of PSFs (folder) or NETWORK.onnx (repeat: the page switches between them); else the scene's."),
     ] = None,
     renderer: Annotated[
         list[str] | None,
@@ -51,9 +52,6 @@ def viewfinder(
     scene_renderer: Annotated[
         str, typer.Option(help="What draws the scene: wgpu (a graphics card), embree (the processor), or auto.")
     ] = "auto",
-    psf: Annotated[
-        Path | None, typer.Option(help="A measured bank of kernels (of `mrbokeh lens fit`) in place of the lens's opening.")
-    ] = None,
     board: BoardOption = None,
     pose: Annotated[Path | None, typer.Option(help="CAMERA.json: the camera stands still, with this pose and these intrinsics.")] = None,
     map_: Annotated[
@@ -114,7 +112,6 @@ def viewfinder(
             layer=layer,
             lenses=tuple(lens or ()),
             renderers=tuple(renderer or ()),
-            psf=psf,
             backend=scene_renderer,
             tracking=TrackingOptions(
                 board=board,
@@ -155,7 +152,7 @@ def board_command(
 
     Example: mrbokeh viewfinder board --lens lens.json --near 0.5 --far 1.2 --paper a4 --out board.pdf
     """
-    from mrbokeh.optics.lens_file import read_lens
+    from mrbokeh.renderers.choose import read_lens
     from mrbokeh.system.atomic_files import refuse_existing
     from mrbokeh.tracking.charuco.board import write_board
     from viewfinder.tracking.printed_board import BoardView, plan_board, write_board_pdf
@@ -183,7 +180,7 @@ def calibrate_phone_command(
     board: Annotated[Path, typer.Option(help="BOARD.json of `mrbokeh viewfinder board`, which both see.")],
     out: Annotated[Path, typer.Option(help="RIG.json to write, for --rig.")],
     camera: CameraOption = None,
-    lens: Annotated[Path | None, typer.Option(help="LENS.json, for the intrinsics where there is no --camera.")] = None,
+    lens: Annotated[Path | None, typer.Option(help="The lens, for the intrinsics where there is no --camera.")] = None,
     pairs: Annotated[int, typer.Option(min=5, help="How many views to take.")] = 12,
     seconds: Annotated[float, typer.Option(min=1.0, help="After so long it ends with the views that there are.")] = 300.0,
     max_width: MaxWidthOption = 1280,

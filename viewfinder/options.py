@@ -89,7 +89,6 @@ class ViewfinderOptions:
     layer: Path | None = None
     lenses: tuple[Path, ...] = ()
     renderers: tuple[str, ...] = ()
-    psf: Path | None = None
     backend: str = "auto"
     tracking: TrackingOptions = field(default_factory=TrackingOptions)
     camera: Path | None = None

@@ -79,7 +79,7 @@ def planned_for(
     from dataclasses import replace
 
     from mrbokeh.optics.lens import Lens
-    from mrbokeh.optics.lens_file import read_lens
+    from mrbokeh.renderers.choose import read_lens
 
     if path is not None:
         if focal_length is not None or sensor_width is not None:

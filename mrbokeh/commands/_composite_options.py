@@ -311,15 +311,10 @@ class RenderingOptions(shared.RenderingOptions):
 class LensOptions:
     """Options of the lens. focus: distance of the photograph in metres."""
 
-    lens: Annotated[
-        Path | None, typer.Option(help="LENS.json, or LENS.onnx to blur with a trained network. Default: what the photograph tells.")
-    ] = None
+    lens: Annotated[Path | None, typer.Option(help=f"{shared.ANY_LENS}. Default: what the photograph tells.")] = None
     focus: Annotated[float | None, typer.Option(help="Focus distance of the photograph in metres.")] = None
     focus_at: shared.FocusAtOption = None
-    renderer: Annotated[
-        str | None,
-        typer.Option("--renderer", help="polygon, low-rank, scatter or NETWORK.onnx. Default: --lens if a network, else polygon."),
-    ] = None
+    renderer: Annotated[str | None, typer.Option("--renderer", help=shared.ANY_RENDERER)] = None
 
 
 @dataclass(frozen=True)

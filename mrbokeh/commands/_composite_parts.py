@@ -45,7 +45,7 @@ def plate_by(whole: CompositeOptions, bundle: CaptureBundle | None, *, lens: Len
     photo, options, colour, facts = whole.photo, whole.taken, whole.colour, {} if lens else whole.facts.given
     if facts and photo.is_dir():
         told = " and ".join(flag(name) for name in facts)
-        raise InputError(f"{told} would change the lens that {photo} states itself: leave that out, or give --lens LENS.json")
+        raise InputError(f"{told} would change the lens that {photo} states itself: leave that out, or give --lens")
     if bundle is None:
         slice_index = 0 if options.all_slices else options.slice_
         plate = open_plate(photo, slice_index, lens, focus_m, facts, guessing=whole.guesses_ground)

@@ -32,7 +32,7 @@ class SourceOptions:
     sharp: Annotated[
         Path | None, typer.Option(help="The same before the blur, for the ledger of light, and with --lens for the reach.")
     ] = None
-    lens: Annotated[Path | None, typer.Option(help="LENS.json as it was focused for OUT: how far light of --sharp may reach.")] = None
+    lens: Annotated[Path | None, typer.Option(help="The lens as it was focused for OUT: how far light of --sharp may reach.")] = None
     frames: Annotated[str, typer.Option(metavar="START:STOP", help="Frames of PLATE from which OUT was made; STOP is left out.")] = ":"
 
     @property
@@ -100,7 +100,7 @@ def check(
 
 def _settings(made: SourceOptions, limits: LimitOptions) -> CheckSettings:
     from mrbokeh.commands.video import parse_frames
-    from mrbokeh.optics.lens_file import read_lens
+    from mrbokeh.renderers.choose import read_lens
 
     return CheckSettings(
         layers={name: path for name, path in (("virtual", made.virtual), ("sharp", made.sharp)) if path is not None},

@@ -120,7 +120,7 @@ def spreadlets(
     seed: Annotated[int, typer.Option(min=0, help="Seed of darts and annealing.")] = 0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Compute them again where they are.")] = False,
 ) -> None:
-    """Compute what `render --psf BANK` splats (sparse points of the kernels' Laplacians) and keep it in BANK/spreadlets.npz.
+    """Compute what `--lens BANK --renderer laplacian` splats (sparse points of the kernels' Laplacians) and keep it in BANK/spreadlets.npz.
 
     An interrupted run goes on when the same command is given again. When the bank changes, give it once more.
 

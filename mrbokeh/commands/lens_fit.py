@@ -153,14 +153,14 @@ def fit(
     """Measure the kernels of a lens over signed blur, field and colour.
 
     From merged focal stacks (every blurred pixel tells a little; kernels go by blur in pixels, so that metres need not be known), from
-    pictures of isolated points of light out of focus (each is its kernel), or from both. Use the bank with `mrbokeh render --psf LENS`.
+    pictures of isolated points of light out of focus (each is its kernel), or from both. Use the bank as `--lens LENS`.
 
     Example: mrbokeh lens fit scene --out my_lens --regions 3x3
     """
     from mrbokeh.lens_measuring.fitting.fit_results import bank_of
     from mrbokeh.lens_measuring.fitting.lens_fit import fit_lens
     from mrbokeh.optics.psf_bank_file import refuse_existing_bank, write_bank
-    from mrbokeh.stacks.guessed_metres import metres_notes
+    from mrbokeh.stacks.guessed_metres import is_lens_guessed, metres_notes
 
     refuse_existing_bank(out, overwrite)
     settings = fitting.parsed()
@@ -169,7 +169,8 @@ def fit(
     if note := metres_notes(given):
         guess(f"{note} (kernels are measured over blur in pixels, which needs no metres)")
     fitted = fit_lens(given, found, settings, frame)
-    bank = bank_of(fitted)
+    told = next((stack for stack in given if stack.lens and stack.metres_known and not is_lens_guessed(stack)), None)
+    bank = bank_of(fitted, None if told is None else told.lens_of(told.reference))
     write_bank(out, bank, overwrite)
     _draw(out, fitted, bank)
     tell(f"wrote {out}: {len(bank.kernels)} kernels of up to {2 * bank.radius_px + 1} px, {_proof(fitted)}", kernels=len(bank.kernels))

@@ -13,7 +13,6 @@ from jaxtyping import Float32
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.renderers.choose import DEFAULT
 from mrbokeh.system.errors import InputError
 
 File = str | Path
@@ -34,13 +33,15 @@ def render(
     lens: Lens | File,
     *,
     focus: float | tuple[float, float] | None = None,
-    renderer: str | Renderer = DEFAULT,
+    renderer: str | Renderer | None = None,
 ) -> Rgb:
     """Blur an all-in-focus picture with depth as a lens does; return linear Rec.709 (H, W, 3) of float32.
 
     picture: (H, W, 3) linear, or a file. depth_m: (H, W) metres along the optical axis (inf or <= 0: background), or an EXR with Z.
-    lens: a Lens or a lens file. focus: metres, or the pixel (x, y) to focus on; None keeps the lens's own.
-    renderer: polygon, low-rank, laplacian, lrdm, scatter (exact, slow), the path of a network (.onnx), or a Renderer.
+    lens: a Lens, a lens file, the folder of a bank of PSFs or a network (.onnx). focus: metres, or the pixel (x, y) to focus on; None
+    keeps the lens's own.
+    renderer: polygon, low-rank, laplacian, lrdm, scatter (exact, slow), the path of a network (.onnx) or bank, or a Renderer; None takes
+    the lens's own.
     Raises InputError if sizes differ or a value is no number.
 
     >>> blurred = mrbokeh.render(picture, depth_m, mrbokeh.Lens(focal_length_mm=50, f_number=1.8), focus=1.2)
@@ -48,7 +49,8 @@ def render(
     rgb, surface_m = _rgb(picture, "picture"), _depth_of(depth_m)
     if rgb.shape[:2] != surface_m.shape:
         raise InputError(f"picture and depth must be of one size, got {rgb.shape[:2]} and {surface_m.shape} (height, width)")
-    return _renderer(renderer).render([opaque(rgb, surface_m)], _focused(_lens(lens), focus, surface_m)).rgb
+    held, spreads = _optics(lens, renderer)
+    return spreads.render([opaque(rgb, surface_m)], _focused(held or Lens.default(), focus, surface_m)).rgb
 
 
 def composite(
@@ -63,13 +65,13 @@ def composite(
     at_pixel: tuple[float, float] | Sequence[tuple[float, float]] | None = None,
     height: float | str | Sequence[float | str] | None = None,
     mode: str | None = None,
-    renderer: str | Renderer = DEFAULT,
+    renderer: str | Renderer | None = None,
 ) -> Rgb:
     """Put virtual objects into a photograph, blurred by its lens, before and behind what it shows; return linear Rec.709 (H, W, 3).
 
     photo: (H, W, 3) linear, a photograph's file, or the folder of a merged focal stack with the slice_index to put it into.
     inserted: GLB files, or sharp layers (Layer or EXR with R, G, B, A and Z in metres) of the photograph's size, front first.
-    lens: a Lens or a lens file; None takes what the file or the stack tells. focus: metres, or a pixel (x, y); needs depth.
+    lens, renderer: as in `render`; None takes what the file or the stack tells. focus: metres, or a pixel (x, y); needs depth.
     depth_m: (H, W) metres, or any file that `mrbokeh composite --depth` takes. all_in_focus: the photograph without its blur, if known.
     at_pixel: (x, y) on which a GLB stands, one for each, or to which the depth of layers is scaled. height: of a GLB in metres, or such as
     "120px"; one for each, or one for all.
@@ -86,7 +88,7 @@ def composite(
     from mrbokeh.depth.depth_map import DepthSettings
     from mrbokeh.images.image_io import read_layer
 
-    known_lens = None if lens is None else _lens(lens)
+    known_lens, spreads = _optics(lens, renderer)
     focus_m = None if focus is None or isinstance(focus, tuple) else float(focus)
     if isinstance(photo, (str, Path)):
         plate = open_plate(Path(photo), slice_index, known_lens, focus_m)
@@ -122,7 +124,7 @@ def composite(
         layers = standing_on_pixel(layers, plate, *standing.first_px) if at_pixels else layers
     if at_pixels:
         plate = with_ground_behind(plate, standing.pixels, layers)
-    return insertion_of(mode or best_mode(plate)).insert(plate, layers, _renderer(renderer)).rgb
+    return insertion_of(mode or best_mode(plate)).insert(plate, layers, spreads).rgb
 
 
 def _rgb(given: np.ndarray | File, name: str) -> Rgb:
@@ -148,19 +150,19 @@ def _depth_of(given: np.ndarray | File) -> Plane:
     return np.where(depth_m > 0, depth_m, np.float32(np.inf))
 
 
-def _lens(given: Lens | File) -> Lens:
-    from mrbokeh.optics.lens_file import read_lens
+def _optics(lens: Lens | File | None, renderer: str | Renderer | None) -> tuple[Lens | None, Renderer]:
+    """Return lens and renderer as `lens_and_renderer` does; a Lens that was read brings its renderer too."""
+    from mrbokeh.renderers.choose import lens_and_renderer, read_lens
 
-    return given if isinstance(given, Lens) else read_lens(given)
+    path = lens.spread_by if isinstance(lens, Lens) else None if lens is None else Path(lens)
+    if renderer is None or isinstance(renderer, str):
+        read, spreads = lens_and_renderer(path, renderer)
+    else:
+        read, spreads = None if path is None else read_lens(path), renderer
+    return lens if isinstance(lens, Lens) else read, spreads
 
 
 def _focused(lens: Lens, focus: float | tuple[float, float] | None, depth_m: Plane) -> Lens:
     if isinstance(focus, tuple):
         return lens.focused_on(depth_m, focus[0] + 0.5, focus[1] + 0.5)
     return lens if focus is None else lens.focused_at(float(focus))
-
-
-def _renderer(given: str | Renderer) -> Renderer:
-    from mrbokeh.renderers.choose import make_renderer
-
-    return make_renderer(given) if isinstance(given, str) else given

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.commands._insertion_options import FocusAtOption, LensFacts, require_one_focus, typed_place
+from mrbokeh.commands._insertion_options import ANY_LENS, ANY_RENDERER, FocusAtOption, LensFacts, require_one_focus, typed_place
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.refocus import Refocusing
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
@@ -22,10 +22,8 @@ _SETTINGS = "refocus.json"
 class BlurOptions:
     """Lens and renderer of the new slices."""
 
-    lens: Annotated[Path | None, typer.Option(help="LENS.json or LENS.onnx in place of the stack's lens.")] = None
-    renderer: Annotated[
-        str | None, typer.Option("--renderer", help="polygon, low-rank, scatter or NETWORK.onnx. Default: --lens if a network.")
-    ] = None
+    lens: Annotated[Path | None, typer.Option(help=f"{ANY_LENS}, in place of the stack's.")] = None
+    renderer: Annotated[str | None, typer.Option("--renderer", help=ANY_RENDERER)] = None
     residuals: Annotated[
         bool,
         typer.Option(

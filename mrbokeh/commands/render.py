@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.commands._insertion_options import LensFacts
+from mrbokeh.commands._insertion_options import ANY_LENS, ANY_RENDERER, LensFacts
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.commands._render_inputs import FocusOptions, SharpOptions
 from mrbokeh.images.layer import Layer
@@ -21,12 +21,7 @@ app = typer.Typer(add_completion=False)
 class BlurOptions:
     """Renderer and its settings."""
 
-    method: Annotated[
-        str, typer.Option("--renderer", help="polygon, low-rank, laplacian, lrdm, scatter (exact, slow), or a network (.onnx).")
-    ] = DEFAULT
-    psf: Annotated[Path | None, typer.Option(help="Bank of PSFs in place of the opening, for polygon, low-rank, laplacian, scatter.")] = (
-        None
-    )
+    method: Annotated[str | None, typer.Option("--renderer", help=f"lrdm, {ANY_RENDERER}")] = None
     slices: Annotated[int, typer.Option(help="How many slices of depth at most.", min=1)] = 16
     threads: Annotated[int, typer.Option(help="Threads; 0 takes all cores. The result does not depend on it.", min=0, max=4096)] = 0
     device: Annotated[
@@ -51,9 +46,7 @@ def render(
     facts: LensFacts,
     focus: FocusOptions,
     result: ResultOptions,
-    lens: Annotated[
-        Path | None, typer.Option(help="Lens file (LENS.json), see `mrbokeh lens new`. Default: 50 mm f/1.8, focused at infinity.")
-    ] = None,
+    lens: Annotated[Path | None, typer.Option(help=f"{ANY_LENS}. Default: 50 mm f/1.8, focused at infinity.")] = None,
 ) -> None:
     """Blur a picture with depth, or layers, as a lens does. Layers lie in front of the picture.
 
@@ -64,8 +57,7 @@ def render(
     from mrbokeh.commands._render_inputs import focused, read_sharp, reconstructed
     from mrbokeh.images.image_io import INTEGER_SUFFIXES, require_suffix
     from mrbokeh.layering.layering import Layering
-    from mrbokeh.optics.lens_file import read_lens
-    from mrbokeh.renderers.choose import chosen_renderer
+    from mrbokeh.renderers.choose import lens_and_renderer, spreads_light
     from mrbokeh.system.atomic_files import require_safe_outputs
     from mrbokeh.system.console import working
 
@@ -78,17 +70,19 @@ def render(
     sharp = {} if given.samples is not None else read_sharp(given)
     if given.samples is not None and facts.given:
         raise InputError("--samples hold the blur of their own lens: leave --focal-length, --f-number and --sensor-width out")
-    renderer = chosen_renderer(blur.method, blur.psf, threads=blur.threads, layering=Layering(slices=blur.slices), device=blur.device)
+    layering = Layering(slices=blur.slices)
+    held, renderer = lens_and_renderer(lens, blur.method, threads=blur.threads, layering=layering, device=blur.device)
+    method = blur.method or (str(lens) if spreads_light(lens) else DEFAULT)
     # A network brings its lens.
-    used = focused(facts.on(getattr(renderer, "lens", None) if lens is None else read_lens(lens)), sharp, focus)
+    used = focused(facts.on(getattr(renderer, "lens", None) if held is None else held), sharp, focus)
     with working("rendering"):
         if given.samples is None:
             blurred = renderer.render(list(sharp.values()), used)
         else:
-            blurred = reconstructed(renderer, blur.method, given.samples, used)
+            blurred = reconstructed(renderer, method, given.samples, used)
     _write(out, blurred, result.alpha_out)
-    own_lens = given.samples is not None or blur.method.endswith(".onnx")
-    tell(f"wrote {out}" + ("" if own_lens else f" ({used.described})"), known={} if own_lens else used.facts, method=blur.method)
+    own_lens = given.samples is not None or method.endswith(".onnx")
+    tell(f"wrote {out}" + ("" if own_lens else f" ({used.described})"), known={} if own_lens else used.facts, method=method)
 
 
 def _write(out: Path, blurred: Layer, alpha_out: bool) -> None:

@@ -14,7 +14,15 @@ import numpy as np
 import typer
 from jaxtyping import Float32
 
-from mrbokeh.commands._insertion_options import DisparityOption, FocusAtOption, LensFacts, focused_at_pixel, require_one_focus
+from mrbokeh.commands._insertion_options import (
+    ANY_LENS,
+    ANY_RENDERER,
+    DisparityOption,
+    FocusAtOption,
+    LensFacts,
+    focused_at_pixel,
+    require_one_focus,
+)
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.depth.depth_map import DepthSettings, parse_known, parse_near_far, parse_stereo
 from mrbokeh.optics.lens import Lens
@@ -88,9 +96,7 @@ class FocusOptions:
 class BlurOptions:
     """Renderer, field of view and highlights."""
 
-    renderer: Annotated[
-        str | None, typer.Option("--renderer", help="polygon, low-rank, scatter or NETWORK.onnx. Default: --lens if a network.")
-    ] = None
+    renderer: Annotated[str | None, typer.Option("--renderer", help=ANY_RENDERER)] = None
     same_view: Annotated[
         bool, typer.Option("--same-view", help="Give the lens PHOTO's field of view (from its Exif), keep its f-number.")
     ] = False
@@ -120,7 +126,7 @@ def transfer(
     blur: BlurOptions,
     facts: LensFacts,
     result: ResultOptions,
-    lens: Annotated[Path | None, typer.Option(help="LENS.json, or LENS.onnx to blur with a trained network. Default: 50 mm f/1.8.")] = None,
+    lens: Annotated[Path | None, typer.Option(help=f"{ANY_LENS}. Default: 50 mm f/1.8.")] = None,
 ) -> None:
     """Blur a sharp photograph with depth as another lens would.
 

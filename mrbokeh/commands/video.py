@@ -22,7 +22,7 @@ from mrbokeh.commands._insertion_options import (
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.compositing.choose import DEFAULT_MODE
 from mrbokeh.compositing.plate_look.finishing import LookOptions
-from mrbokeh.renderers.choose import BY_NAME, DEFAULT, make_renderer
+from mrbokeh.renderers.choose import BY_NAME, lens_and_renderer
 from mrbokeh.shots.composite_recipe import CompositeRecipe
 from mrbokeh.shots.executors import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
 from mrbokeh.shots.frame_sources import CameraFile, ClipLook, DepthFiles, FocusPulled, MatteFiles
@@ -45,7 +45,9 @@ ClipArgument = Annotated[
     Path,
     typer.Argument(metavar="CLIP", help="A video; or, with --rate, numbered pictures: frames.%04d.exr, frames.####.exr or their folder."),
 ]
-LensOption = Annotated[Path | None, typer.Option(help="The lens, focused as it was when the clip was shot. Default: 50 mm f/1.8.")]
+LensOption = Annotated[
+    Path | None, typer.Option(help=f"{shared.ANY_LENS}, focused as it was when the clip was shot. Default: 50 mm f/1.8.")
+]
 OutOption = Annotated[
     Path,
     typer.Option(
@@ -92,7 +94,7 @@ class BlurOptions:
     focus_pull: Annotated[
         str | None, typer.Option(metavar="KEYS|FILE.csv", help="Focus by frame: FRAME:METRES,FRAME:METRES or metadata of a camera.")
     ] = None
-    renderer: Annotated[str, typer.Option("--renderer", help="polygon, low-rank, scatter, or a network (.onnx).")] = DEFAULT
+    renderer: Annotated[str | None, typer.Option("--renderer", help=shared.ANY_RENDERER)] = None
 
 
 @dataclass(frozen=True)
@@ -148,7 +150,7 @@ def recipe_of(
     """Return the recipe of every frame. Raises InputError if options do not go together."""
     _check_virtual(virtual, rendering)
     require_one_focus(focus=blur.focus, focus_at=blur.focus_at, focus_pull=blur.focus_pull)
-    facts.on(None, make_renderer(blur.renderer))  # refuses facts that a network cannot follow
+    facts.on(None, lens_and_renderer(lens, blur.renderer)[1])  # refuses facts that a network cannot follow
     holding = SensorOrientation((source.info.width_px, source.info.height_px), source.info.quarter_turns)
     objects = virtual.object_names
     files = tuple(LayerFiles(path.resolve(), objects) for path in virtual.layer or ())
@@ -262,9 +264,9 @@ def _first_number(source: PictureSource, taken: ClipOptions) -> int:
     return source.first_number if taken.first_number is None else taken.first_number
 
 
-def _renderer(name: str) -> str:
-    """Return the renderer's name, a network as an absolute path, for workers may stand elsewhere."""
-    return str(Path(name).resolve()) if name not in BY_NAME and name.endswith(".onnx") else name
+def _renderer(name: str | None) -> str | None:
+    """Return the renderer's name, a network or bank as an absolute path, for workers may stand elsewhere."""
+    return name if name is None or name in BY_NAME else str(Path(name).resolve())
 
 
 app = typer.Typer(add_completion=False)

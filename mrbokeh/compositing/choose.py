@@ -15,6 +15,7 @@ from mrbokeh.layering.motion import farthest_px
 from mrbokeh.layering.pixel_box import NOWHERE, Box, is_same_everywhere, lit_box
 from mrbokeh.layering.psf_over_field import reach_px
 from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.bank.bank_lens import opening_of
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.system.errors import InputError
 
@@ -30,12 +31,16 @@ class InDirtyRectangle:
     """An Insertion that lets another one work where light of the layers can arrive, and leaves the rest of the plate as it is.
 
     The result is that of the whole frame, but that near things which the frame cuts off go on beyond it. Where the blur depends on
-    the place in the frame (tilt, cat-eyes, banks of kernels, networks) the whole frame is taken.
+    the place in the frame (tilt, cat-eyes, banks of kernels, networks) the whole frame is taken. Rays through the pupil take the opening
+    that stands for a bank's kernels.
     """
 
     insertion: Insertion
 
     def insert(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> Inserted:
+        bank = getattr(renderer, "bank", None)
+        if bank is not None:
+            plate = replace(plate, lens=replace(plate.lens, aperture=opening_of(bank)))
         lit = _lit_boxes(same_size(plate, layers))
         if not lit:
             return Inserted(plate.rgb, flatten(layers) if layers else clear(*plate.rgb.shape[:2]))

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -28,6 +29,7 @@ class Lens:
       way up the sensor is meant, for photographs taken the other way up (`mrbokeh.stacks.photograph`), or None.
     petzval_radius_mm: radius of curvature of the surface in focus; positive bends it towards the camera away from the axis
       (as an uncorrected lens does, about 1.5 focal lengths), negative away from it, inf is flat.
+    spread_by: the bank of kernels or the network that it was read from, which spreads its light; None: any renderer, by the opening.
     """
 
     focal_length_mm: float
@@ -38,6 +40,7 @@ class Lens:
     tilt_rad: tuple[float, float] = (0.0, 0.0)
     petzval_radius_mm: float = float("inf")
     sensor_height_mm: float | None = None
+    spread_by: Path | None = None
 
     def __post_init__(self) -> None:
         sizes = (self.focal_length_mm, self.f_number, self.sensor_width_mm)

@@ -249,6 +249,11 @@ def _from_outline(values: Values) -> Aperture:
     return Aperture.from_outline(values.text("path") if "path" in values.document else values.points("points", values.document["points"]))
 
 
+def stated_facts(lens: Lens) -> dict[str, Any]:
+    """Return the document of a lens without its opening, as a bank of its kernels keeps it."""
+    return {name: value for name, value in lens_to_json(lens).items() if name not in ("format", "version", "aperture")}
+
+
 def read_lens(path: Path | str) -> Lens:
     """Read a lens file (LENS.json), with the opening that it names. Raises InputError where it does not describe a lens."""
     return lens_from_json(read_json(path, "a lens file (LENS.json)"), str(path), Path(path).parent)

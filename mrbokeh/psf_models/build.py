@@ -161,12 +161,11 @@ class ModelOptions:
 
 
 def _simple(options: ModelOptions) -> PsfModel:
-    from mrbokeh.optics.aperture import Aperture
-    from mrbokeh.optics.lens_file import read_lens
+    from mrbokeh.optics.lens_file import read_lens, stated_facts
     from mrbokeh.psf_models.simple_lens import SimpleLens
 
-    aperture = Aperture.disc() if options.lens is None else read_lens(options.lens).aperture
-    return SimpleLens(aperture, **_given(options, "diameter_px", "counts", "device"))
+    lens, given = None if options.lens is None else read_lens(options.lens), _given(options, "diameter_px", "counts", "device")
+    return SimpleLens(**given) if lens is None else SimpleLens(lens.aperture, lens=stated_facts(lens), **given)
 
 
 def _combined(options: ModelOptions) -> PsfModel:

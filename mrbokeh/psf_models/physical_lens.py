@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import stated_facts
 from mrbokeh.optics.psf_bank import Axis, Turns
 from mrbokeh.psf_models import _physical_lens_numba as compiled
 from mrbokeh.psf_models._lens_beam import GREEN_UM, LensBeam, area_of
@@ -172,6 +174,7 @@ class PhysicalLens:
         self.lens = lens if f_number is None else lens.stopped_down(f_number)
         self.focus_distance_m, self.vignetting, self.counts, self.device = focus_distance_m, vignetting, counts, device
         width_mm, height_mm = (check_positive("the sensor's width and height in mm", size) for size in sensor_mm)
+        self.stated = Lens(self.lens.focal_length_mm, self.lens.f_number, focus_distance_m, width_mm, sensor_height_mm=height_mm)
         self.mm_per_px = width_mm / check_positive("the picture's width in pixels", float(image_width_px))
         self._depth = Axis("depth_m", check_positive("the nearest depth", nearest_m), farthest_m, EXPONENTS[0])
         sensor_at_mm = self.lens.paraxial_at(GREEN_UM).sensor_mm(focus_distance_m)
@@ -192,6 +195,7 @@ class PhysicalLens:
             "focal_length_mm": round(self.lens.focal_length_mm, 4),
             "f_number": round(self.lens.f_number, 4),
             "focus_distance_m": str(self.focus_distance_m) if np.isinf(self.focus_distance_m) else self.focus_distance_m,
+            "lens": stated_facts(self.stated),
             "half_diagonal_mm": self.beam.half_diagonal_mm,
             "mm_per_px": self.mm_per_px,
             "vignetting": self.vignetting,

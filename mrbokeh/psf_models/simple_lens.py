@@ -3,7 +3,7 @@
 The one is a thin lens with any opening, the other any picture as a point spread function, a little larger or smaller in each colour.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cached_property, partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -169,6 +169,7 @@ class SimpleLens:
     aperture: its spherical aberration and axial colour make the sides of the focus differ, then diameters are signed; what
     varies over the field (cat's eyes, lateral colour) needs a model with an eccentricity.
     diameter_px: the largest of the bank. counts: samples, 100 (twice as many where diameters are signed) in the paper's Table 1.
+    lens: what has this opening, if that is known (`mrbokeh.optics.lens_file.stated_facts`).
     """
 
     name = "simple"
@@ -177,9 +178,14 @@ class SimpleLens:
     default_rays = 0
 
     def __init__(
-        self, aperture: Aperture | None = None, diameter_px: float = LARGEST_PX, counts: tuple[int, ...] | None = None, device: str = ""
+        self,
+        aperture: Aperture | None = None,
+        diameter_px: float = LARGEST_PX,
+        counts: tuple[int, ...] | None = None,
+        device: str = "",
+        lens: Mapping[str, Any] | None = None,
     ) -> None:
-        self.device = device
+        self.device, self.lens = device, lens
         self.aperture = Aperture.disc() if aperture is None else aperture
         if self.aperture.varies_over_field:
             raise InputError("a simple lens looks the same all over the frame: give a lens without cat_eye and lateral_chromatic")
@@ -199,7 +205,8 @@ class SimpleLens:
     def settings(self) -> dict[str, Any]:
         opening = self.aperture
         modifiers = np.array([opening.spherical_aberration, *opening.axial_chromatic])
-        return {"aperture": digest(*opening.outlines, np.array(opening.weights), modifiers)}
+        made_for = {} if self.lens is None else {"lens": dict(self.lens)}
+        return made_for | {"aperture": digest(*opening.outlines, np.array(opening.weights), modifiers)}
 
     def kernel(self, box: Float64[np.ndarray, "axes 2"], rays: int, seed: int) -> Kernel:
         """See `PsfModel.kernel`. Rays go through all of the pupil, evenly, and carry the weight that the opening has there."""

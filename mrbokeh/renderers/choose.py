@@ -1,14 +1,20 @@
-"""Renderers by their names on the command line, with or without a measured bank of kernels; the only module that knows them all."""
+"""Lenses and the renderers of their blur; the only module that knows them all.
+
+A lens is a description (LENS.json), whose opening any renderer spreads light by, a bank of kernels (a folder) or a network (.onnx).
+The last two have their own ways of spreading light, which travel with the `Lens` as the path in `Lens.spread_by`.
+"""
 
 import logging
-from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mrbokeh.layering.layering import Layering
 from mrbokeh.optics.lens import Lens
-from mrbokeh.optics.lens_file import read_lens
+from mrbokeh.optics.lens_file import read_lens as read_description
 from mrbokeh.optics.psf_bank import PsfBank
+from mrbokeh.optics.psf_bank_file import HEAD, read_bank
+from mrbokeh.renderers.bank.bank_lens import lens_of, opening_of, polygons_suit
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.system.errors import InputError
 
@@ -54,56 +60,104 @@ ON_DEVICES = ("laplacian", "lrdm")
 WITH_BANKS = ("polygon", "low-rank", "laplacian", "scatter")
 
 
-def make_renderer(
-    name: str, *, threads: int = 0, layering: Layering | None = None, device: str = "", kernels: Mapping[str, Any] | None = None
-) -> Renderer:
-    """Return the renderer of that name, or the network in that .onnx file (which takes every layer as it is, without slices).
+def make_renderer(name: str, *, threads: int = 0, layering: Layering | None = None, device: str = "") -> Renderer:
+    """Return the renderer of that name, the network in that .onnx file (which takes every layer as it is, without slices), or the best one
+    of the bank in that folder.
 
-    kernels: `bank`, and what is known of it already, as the renderer's constructor takes them (those of WITH_BANKS).
     device: "" for compiled loops on the CPU; "cuda", "cuda:1" or "cpu" for torch there, where the renderer has such a twin.
     """
-    if device and name not in ON_DEVICES:
-        raise InputError(f"--device is for --renderer {' or '.join(ON_DEVICES)}, got {name!r}: others run on the CPU, leave --device out")
+    settings: dict[str, Any] = {"threads": threads, "layering": layering or Layering()}
+    if is_bank(name):
+        return _of_bank(Path(name), read_bank(name), None, settings, device)
     if name in BY_NAME:
-        on = {"device": device} if device else {}
-        return BY_NAME[name](threads=threads, layering=layering or Layering(), **on, **kernels or {})
+        return BY_NAME[name](**settings, **_on(device, name))
+    _on(device, name)
     if name.lower().endswith(".onnx"):
         from mrbokeh.renderers.onnx_network import OnnxNetwork
 
         return OnnxNetwork(Path(name), threads)
-    raise InputError(f"expected a renderer ({', '.join(BY_NAME)}) or the path of a network (.onnx), got {name!r}")
+    raise InputError(f"expected a renderer ({', '.join(BY_NAME)}), a network (.onnx) or the folder of a bank of PSFs, got {name!r}")
 
 
-def lens_and_renderer(lens: Path | None, renderer: str | None) -> tuple[Lens | None, Renderer]:
-    """Return lens and renderer of `--lens` and `--renderer`: a network brings its lens, a lens file is rendered by the default."""
+def lens_and_renderer(
+    lens: Path | None, renderer: str | None, *, threads: int = 0, layering: Layering | None = None, device: str = ""
+) -> tuple[Lens | None, Renderer]:
+    """Return lens and renderer of `--lens` and `--renderer`: networks and banks bring both, a lens file is rendered by the default.
+
+    Of a bank that does not say which lens it was made for, the lens is None: what it blurs has to tell. renderer: of a bank one of
+    WITH_BANKS, by which its kernels are spread. threads, layering, device: see `make_renderer`.
+    """
+    if is_bank(lens):
+        assert lens is not None
+        bank = read_bank(lens)
+        settings = {"threads": threads, "layering": layering or Layering()}
+        return _spread_by(lens_of(bank), lens), _of_bank(lens, bank, renderer, settings, device)
     if lens is not None and lens.suffix.lower() == ".onnx":
         from mrbokeh.renderers.onnx_network import OnnxNetwork
 
-        network = OnnxNetwork(lens)
+        network = OnnxNetwork(lens, threads)
         if network.facts.lens_guessed:
             _log.warning(
                 f"{lens} was trained on stacks whose metres are guessed: how large its blur is at a distance is a guess too; "
                 f"as --renderer it blurs by the lens of the stack or photograph"
             )
-        return network.lens, network if renderer is None else make_renderer(renderer)
-    return None if lens is None else read_lens(lens), make_renderer(renderer or DEFAULT)
+        made = network if renderer is None else make_renderer(renderer, threads=threads, layering=layering, device=device)
+        return _spread_by(network.lens, lens), made
+    made = make_renderer(renderer or DEFAULT, threads=threads, layering=layering, device=device)
+    return None if lens is None else read_description(lens), made
 
 
-def chosen_renderer(method: str, psf: Path | None, *, threads: int = 0, layering: Layering | None = None, device: str = "") -> Renderer:
-    """Return the renderer of that name; psf: the folder of a bank of kernels in place of the lens's opening."""
-    if psf is None:
-        return make_renderer(method, threads=threads, layering=layering, device=device)
-    if method not in WITH_BANKS:
-        raise InputError(
-            f"--psf is for --renderer {', '.join(WITH_BANKS)}, got --renderer {method}: other methods take the opening of the lens file"
-        )
-    from mrbokeh.optics.psf_bank_file import read_bank
+def read_lens(path: Path | str) -> Lens:
+    """Read a lens: a description (LENS.json), a bank of PSFs (its folder) or a network (.onnx), which keep their own blur.
 
-    kernels = {"bank": read_bank(psf)}
-    return make_renderer(method, threads=threads, layering=layering, device=device, kernels=kernels | _beside(method, psf, kernels["bank"]))
+    A bank that does not say which lens it was made for gives that of `Lens.default` with its opening. Raises InputError where it is none.
+    """
+    path = Path(path)
+    if is_bank(path):
+        bank = read_bank(path)
+        return replace(lens_of(bank) or Lens(50.0, 1.8, aperture=opening_of(bank)), spread_by=path)
+    if path.suffix.lower() == ".onnx":
+        from mrbokeh.renderers.onnx_network import OnnxNetwork
+
+        return replace(OnnxNetwork(path).lens, spread_by=path)
+    return read_description(path)
 
 
-def _beside(method: str, psf: Path, bank: PsfBank) -> dict[str, Any]:
+def spreads_light(lens: Path | None) -> bool:
+    """Return whether a lens is a bank or a network, which have their own renderer."""
+    return is_bank(lens) or (lens is not None and lens.suffix.lower() == ".onnx")
+
+
+def files_of(lens: Path) -> list[Path]:
+    """Return the file that changes when a lens, bank or network changes."""
+    return [lens / HEAD if is_bank(lens) else lens]
+
+
+def is_bank(path: Path | str | None) -> bool:
+    """Return whether a lens or renderer is named by a folder, which should be that of a bank."""
+    return path is not None and str(path) not in BY_NAME and Path(path).is_dir()
+
+
+def _spread_by(lens: Lens | None, path: Path) -> Lens | None:
+    return None if lens is None else replace(lens, spread_by=path)
+
+
+def _on(device: str, name: str) -> dict[str, str]:
+    """Return the device as an argument of a renderer's constructor. Raises InputError if it has no twin there."""
+    if device and name not in ON_DEVICES:
+        raise InputError(f"--device is for --renderer {' or '.join(ON_DEVICES)}, got {name!r}: others run on the CPU, leave --device out")
+    return {"device": device} if device else {}
+
+
+def _of_bank(folder: Path, bank: PsfBank, method: str | None, settings: dict[str, Any], device: str) -> Renderer:
+    """Return a renderer by a bank of kernels. method: None takes polygons where they can stand for the kernels, else laplacian."""
+    name = method or (DEFAULT if polygons_suit(bank) and not device else "laplacian")
+    if name not in WITH_BANKS:
+        raise InputError(f"the bank {folder} is for --renderer {', '.join(WITH_BANKS)}, got {name}: it takes the opening of a lens file")
+    return BY_NAME[name](**settings, **_on(device, name), bank=bank, **_beside(name, folder, bank))
+
+
+def _beside(method: str, folder: Path, bank: PsfBank) -> dict[str, Any]:
     """Return the files that the method keeps beside a bank, as arguments of its constructor."""
     from mrbokeh.renderers.bank.kernel_files import apertures_beside, terms_beside
     from mrbokeh.renderers.bank.lattice import BankLattice
@@ -111,12 +165,12 @@ def _beside(method: str, psf: Path, bank: PsfBank) -> dict[str, Any]:
     if method == "laplacian":
         from mrbokeh.renderers.bank.kernel_files import spreadlets_beside
 
-        return {"spreadlets": spreadlets_beside(psf, bank.kernels)}
+        return {"spreadlets": spreadlets_beside(folder, bank.kernels)}
     if method == "polygon":
-        return {"apertures": apertures_beside(psf, BankLattice(bank))}
+        return {"apertures": apertures_beside(folder, BankLattice(bank))}
     if method == "low-rank":
         from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
 
         filters = LowRankFilter()
-        return {"terms": terms_beside(psf, BankLattice(bank), filters.decomposed, [filters.relative_error, filters.max_rank])}
+        return {"terms": terms_beside(folder, BankLattice(bank), filters.decomposed, [filters.relative_error, filters.max_rank])}
     return {}

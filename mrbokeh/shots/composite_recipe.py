@@ -20,9 +20,8 @@ from mrbokeh.images.layer import Layer, clear, flatten
 from mrbokeh.layering.pixel_box import NOWHERE, Box, is_same_everywhere
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
-from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.renderers.choose import BY_NAME, DEFAULT, make_renderer
+from mrbokeh.renderers.choose import BY_NAME, DEFAULT, files_of, lens_and_renderer, read_lens, spreads_light
 from mrbokeh.shots.inputs import CameraSource, DepthSource, Description, Finisher, FocusSource, Kept, LayerSource, MatteSource, Moment
 from mrbokeh.shots.shot import Picture, Rgba
 from mrbokeh.stacks.photograph import SensorOrientation, lens_for_orientation
@@ -119,14 +118,15 @@ def _hidden_layers(layers: Sequence[Layer], photo_depth_m: Plane, box: Box) -> l
 class CompositeRecipe:
     """A MakerRecipe. first_number: what frame 0 of the clip is called by in sequences, tracks and focus pulls.
 
-    lens: None is `Lens.default`; facts: by name, in place of the lens's own. focus: None leaves the lens as that has it.
+    lens: any, None is `Lens.default`; facts: by name, in place of the lens's own. focus: None leaves the lens as that has it.
+    renderer: None is what the lens calls for (`mrbokeh.renderers.choose`).
     holding: of the camera, by which the lens is turned; None leaves it.
     near_m: how far what the matte shows is, where there is no depth. virtual_only: the blurred virtual layer alone, not the picture.
     """
 
     lens: Path | None
     layers: tuple[Description[LayerSource], ...]
-    renderer: str = DEFAULT
+    renderer: str | None = None
     mode: str = DEFAULT_MODE
     camera: Description[CameraSource] | None = None
     focus: Description[FocusSource] | None = None
@@ -142,8 +142,9 @@ class CompositeRecipe:
     @property
     def files(self) -> tuple[Path, ...]:
         described = (*self.layers, self.camera, self.focus, self.depth, self.matte, self.look)
-        network = () if self.renderer in BY_NAME else (Path(self.renderer),)
-        return (*([self.lens] if self.lens else []), *network, *(path for each in described if each is not None for path in each.files))
+        spread_by = [] if self.renderer is None or self.renderer in BY_NAME else [Path(self.renderer)]
+        optics = [file for path in (self.lens, *spread_by) if path is not None for file in files_of(path)]
+        return (*optics, *(path for each in described if each is not None for path in each.files))
 
     @property
     def stated_lens(self) -> Lens:
@@ -166,8 +167,9 @@ class CompositeMaker:
         self._depth = None if recipe.depth is None else recipe.depth.opened(threads)
         self._matte = None if recipe.matte is None else recipe.matte.opened(threads)
         self._finisher = None if recipe.look is None else recipe.look.opened(threads)
-        renderer = make_renderer(recipe.renderer, threads=threads)
-        self._boxed = BoxedInsertion(insertion_of(recipe.mode, recipe.near_m), renderer, local=recipe.renderer in _LOCAL)
+        _, renderer = lens_and_renderer(recipe.lens, recipe.renderer, threads=threads)
+        is_local = (recipe.renderer or DEFAULT) in _LOCAL and not spreads_light(recipe.lens)
+        self._boxed = BoxedInsertion(insertion_of(recipe.mode, recipe.near_m), renderer, local=is_local)
 
     def make(self, index: int, rgb: Rgb, time_s: float, alpha: Plane | None = None) -> Picture:
         height, width = rgb.shape[:2]

@@ -62,7 +62,7 @@ def test_the_lens_and_the_focus_may_be_told_by_facts_and_by_a_pixel(tmp_path: Pa
     assert by_facts.focus_distances_m == pytest.approx(by_file.focus_distances_m)
     np.testing.assert_allclose(by_facts.slice_rgb(0), by_file.slice_rgb(0), atol=1e-5)
     refused("where to focus", run, stack.folder, "--out", tmp_path / "no")
-    monkeypatch.setattr("mrbokeh.renderers.choose.make_renderer", lambda _: object.__new__(OnnxNetwork))
+    monkeypatch.setattr("mrbokeh.renderers.choose.make_renderer", lambda _, **__: object.__new__(OnnxNetwork))
     refused("a network blurs as the lens", run, stack.folder, "--focus", "1", *facts, "--renderer", "my.onnx", "--out", tmp_path / "no")
 
 

@@ -13,7 +13,7 @@ from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.optics.lens_file import stated_facts
 from mrbokeh.optics.psf_bank_file import write_bank
 from mrbokeh.renderers.bank.apertures import _fit, fit_apertures, fit_polygons
 from mrbokeh.renderers.bank.kernel_files import LOW_RANK, POLYGONS, apertures_beside, terms_beside
@@ -130,12 +130,11 @@ def test_fits_are_kept_beside_a_bank_until_its_kernels_change(tmp_path: Path) ->
 @pytest.mark.slow
 def test_the_command_takes_a_bank_for_every_method_that_spreads(tmp_path: Path) -> None:
     discs = discs_bank()
-    write_bank(tmp_path / "bank", discs)
-    write_lens(tmp_path / "lens.json", LENS)
+    write_bank(tmp_path / "bank", replace(discs, settings={"lens": stated_facts(LENS)}))
     layer = slanted(-9.0, 12.0)[0]
     write_exr(tmp_path / "aif.exr", ExrPart({name: layer.rgb[..., i] for i, name in enumerate("RGB")}))
     write_exr(tmp_path / "z.exr", ExrPart({"Z": layer.depth_m}))
-    words = ["--rgb", tmp_path / "aif.exr", "--depth", tmp_path / "z.exr", "--lens", tmp_path / "lens.json", "--psf", tmp_path / "bank"]
+    words = ["--rgb", tmp_path / "aif.exr", "--depth", tmp_path / "z.exr", "--lens", tmp_path / "bank"]
     seen = {}
     for method in ("scatter", "polygon", "low-rank", "laplacian"):
         out = tmp_path / f"{method}.exr"

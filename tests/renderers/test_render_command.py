@@ -169,13 +169,18 @@ def test_a_mistake_gets_one_sentence_and_writes_nothing(folder: Path, mistake: s
 def test_a_bank_of_kernels_takes_the_place_of_the_opening(folder: Path, method: str) -> None:
     """A bank of discs gives what the disc of a lens file gives, as near as its cells are fine."""
     bank = folder / "bank"
-    made = CliRunner().invoke(everything, ["lens", "psf", "simple", "--diameter", "24", "--counts", "48", "--out", str(bank)])
-    assert made.exit_code == 0, made.output
     spoil_lens(folder, aperture={"shape": "disc"})
-    by_bank, by_lens = (read_image(run(folder, *PICTURE[:-1], method, *psf, out=f"{len(psf)}.exr")) for psf in (("--psf", str(bank)), ()))
+    words = ["--diameter", "24", "--counts", "48", "--lens", str(folder / "lens.json"), "--out", str(bank)]
+    made = CliRunner().invoke(everything, ["lens", "psf", "simple", *words])
+    assert made.exit_code == 0, made.output
+    by_lens, by_bank = (
+        read_image(run(folder, *PICTURE[:-1], method, *lens, out=f"{len(lens)}.exr")) for lens in ((), ("--lens", str(bank)))
+    )
     assert psnr(by_bank, by_lens) > 40.0
+    by_renderer = read_image(run(folder, *PICTURE[:-1], str(bank), out="renderer.exr"))
+    assert psnr(by_renderer, by_lens) > 40.0
     with pytest.raises(InputError, match="laplacian"):
-        run(folder, *PICTURE[:-1], "lrdm", "--psf", str(bank), out="other.exr")
+        run(folder, *PICTURE[:-1], "lrdm", "--lens", str(bank), out="other.exr")
 
 
 @pytest.mark.parametrize("method", ["lrdm", "laplacian"])

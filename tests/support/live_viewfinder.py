@@ -72,7 +72,7 @@ async def live(
     """With a board tracker, the polygon renderer and the ray caster. source: the clip as a file unless given. All threads must end."""
     before = Counter(thread.name for thread in threading.enumerate())
     width, height = clip.plates[0].shape[1::-1]
-    renderers = renderers_of(["polygon", "scatter"], None, {})
+    renderers = renderers_of(["polygon", "scatter"], (), {})
     book = LensBook(lenses or {"clip": LENS, "wide": WIDE})
     options = ViewfinderOptions(str(clip.path), scene=clip.scene, backend="embree", captures=captures)
     overlays = open_overlays(options, book.lens, renderers)

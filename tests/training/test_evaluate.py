@@ -35,8 +35,8 @@ from training.evaluation.methods import (
     REFERENCE,
     SCATTERED,
     Method,
-    bank_methods,
     blur_of,
+    lens_methods,
     network_names,
     plain_methods,
     renderer_method,
@@ -201,8 +201,8 @@ def test_renderers_with_a_measured_bank(scene: Path, tmp_path: Path) -> None:
     cells = physical_boxes(axes, NestedGrid(counts, nested=False)).mean(axis=2)[:, 0]
     kernels = tuple(seen.lens.aperture.rasterize(abs(float(size))).kernel[..., None].astype(np.float32) for size in cells)
     write_bank(tmp_path / "bank", PsfBank("measured", axes, counts, kernels, nested=False))
-    (measured,) = bank_methods(["scatter", "lrdm"], tmp_path / "bank")
-    assert (measured.name, measured.kind) == ("scatter, measured", "renderer")
+    (measured,) = lens_methods(["scatter", "lrdm"], tmp_path / "bank")
+    assert (measured.name, measured.kind) == ("scatter, bank", "renderer")
     exact = renderer_method("scatter").blur(seen)
     assert psnr(measured.blur(seen), exact) > 45.0 > psnr(seen.pair.all_in_focus, exact)
 

@@ -169,7 +169,7 @@ def test_facts_of_the_lens_may_stand_in_options(clip: Path, settings: list[str],
     refused("not both", run, clip, *facts, "--focus", "2", "--focus-pull", "0:1", "--out", tmp_path / "no.mkv")
     refused("--disparity 1:9 says what the numbers", run, clip, *facts, "--disparity", "1:9", "--out", tmp_path / "no.mkv")
     refused("there is no depth", run, clip, *facts, "--focus-at", "1,1", "--out", tmp_path / "no.mkv")
-    monkeypatch.setattr("mrbokeh.commands.video.make_renderer", lambda _: object.__new__(OnnxNetwork))
+    monkeypatch.setattr("mrbokeh.renderers.choose.make_renderer", lambda _, **__: object.__new__(OnnxNetwork))
     refused("a network blurs as the lens", run, clip, *facts, "--renderer", "my.onnx", "--out", tmp_path / "no.mkv")
 
 

@@ -77,7 +77,7 @@ REFUSED |= {f"{GIVEN} {more}": sentence for more, sentence in {
     "--scene-renderer vulkan": "--scene-renderer: expected one of auto, wgpu, embree",
     "--scene-renderer embree": "leave --scene-renderer out",
     "--max-rate -1": "--max-rate: expected a positive number", "--renderer magic": "--renderer: expected one of polygon",
-    "--renderer polygon --renderer none.onnx": "no such file", "--renderer lrdm --psf bank.exr": "leave --psf out",
+    "--renderer polygon --renderer none.onnx": "no such file", "--renderer here": "--renderer: expected one of",
     "--board bad.json": "bad.json", "--pose bad.json": "expected width_px", "--camera none.json": "none.json",
     "--board board.json --pose pose.json": "got --board and --pose: give one",
     "--opentrackio 5000 --freed 5001": "got --opentrackio and --freed: give one",

@@ -30,8 +30,8 @@ def evaluate_command(
         typer.Option(help="Renderer to compare with (repeat for more), else polygon, low-rank, laplacian and scatter; `none` for none."),
     ] = None,
     reference: Annotated[bool, typer.Option(help="Also the scatter reference with the aperture of the lens (slow).")] = True,
-    psf: Annotated[
-        Path | None, typer.Option(help="A measured bank of kernels (of `mrbokeh lens fit`): the renderers once more with it.")
+    lens: Annotated[
+        Path | None, typer.Option(help="LENS.json or a bank of PSFs (folder): the renderers once more, with its opening or kernels.")
     ] = None,
     pull: Annotated[int, typer.Option(min=0, help="Frames of the focus pull that shows flicker; 0 leaves it out.")] = 8,
     lpips: Annotated[
@@ -49,12 +49,12 @@ def evaluate_command(
 
     Example: mrbokeh train evaluate attic.onnx scenes/attic --out results
 
-    Example: mrbokeh train evaluate runs/50mm --data lens_50mm --psf lens_50mm.bank --renderer polygon --out measured
+    Example: mrbokeh train evaluate runs/50mm --data lens_50mm --lens lens_50mm.bank --renderer polygon --out measured
     """
     from mrbokeh.stacks.guessed_metres import metres_notes
     from training.data.training_data import training_data
     from training.evaluation.comparison import Extras, compare, unseen_of
-    from training.evaluation.methods import bank_methods, nearest_method, network_methods, plain_methods, renderer_methods
+    from training.evaluation.methods import lens_methods, nearest_method, network_methods, plain_methods, renderer_methods
     from training.evaluation.report import gain_lines, table_rows
     from training.evaluation.scores import OnnxPerceptualDistance
 
@@ -69,9 +69,8 @@ def evaluate_command(
         guess(note)
     unseen = unseen_of(stacks, seen)
     chosen = _renderers(renderer, reference)
-    measured = [] if psf is None else bank_methods(chosen, psf)
     plain = [*plain_methods(), nearest_method()] if unseen.slices else plain_methods()
-    methods = [*of_networks, *plain, *renderer_methods(chosen), *measured]
+    methods = [*of_networks, *plain, *renderer_methods(chosen), *lens_methods(chosen, lens)]
     extras = Extras(None if lpips is None else OnnxPerceptualDistance(lpips), pull)
     result = compare(methods, unseen, folder, extras)
     tell(f"{result.slices} {unseen.words}", psnr_db={name: decibel for name, decibel, *_ in table_rows(result)})

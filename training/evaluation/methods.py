@@ -5,7 +5,7 @@ or as ONNX, becomes a plain function of a pair.
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +16,7 @@ from jaxtyping import Float32
 from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.renderers.choose import BY_NAME, WITH_BANKS, chosen_renderer, make_renderer
+from mrbokeh.renderers.choose import BY_NAME, WITH_BANKS, is_bank, lens_and_renderer, make_renderer, read_lens
 from mrbokeh.renderers.onnx_network import OnnxNetwork
 from mrbokeh.system.errors import InputError
 from training.data.batches import network_inputs
@@ -118,14 +118,20 @@ def renderer_method(name: str) -> Method:
     return _renderer_method(REFERENCE if name == "scatter" else name, make_renderer(name))
 
 
-def bank_methods(names: Sequence[str], bank: Path) -> list[Method]:
-    """Return those renderers that can take a bank of kernels, with it; "polygon, measured" and so on."""
-    return [_renderer_method(f"{name}, measured", chosen_renderer(name, bank)) for name in names if name in WITH_BANKS]
+def lens_methods(names: Sequence[str], lens: Path | None) -> list[Method]:
+    """Return the renderers with the opening of a lens file, or those that can take a bank of kernels, with it: "polygon, LENS"."""
+    if lens is None:
+        return []
+    if lens.suffix.lower() == ".onnx":
+        raise InputError(f"--lens {lens} is a network: name it before --data, among the networks to compare")
+    known, opening = (WITH_BANKS, None) if is_bank(lens) else (tuple(BY_NAME), read_lens(lens).aperture)
+    return [_renderer_method(f"{name}, {lens.stem}", lens_and_renderer(lens, name)[1], opening) for name in names if name in known]
 
 
-def _renderer_method(title: str, renderer: Renderer) -> Method:
+def _renderer_method(title: str, renderer: Renderer, opening: Aperture | None = None) -> Method:
     def blur(seen: UnseenSlice) -> Image:
-        return renderer.render([opaque(seen.pair.all_in_focus, seen.depth_m)], seen.lens).rgb
+        lens = seen.lens if opening is None else replace(seen.lens, aperture=opening)
+        return renderer.render([opaque(seen.pair.all_in_focus, seen.depth_m)], lens).rgb
 
     return Method(title, blur, "renderer")
 

@@ -9,7 +9,7 @@ from threading import Event
 from aiohttp import web
 
 from mrbokeh.optics.camera import Camera, camera_of_lens
-from mrbokeh.optics.lens_file import read_lens
+from mrbokeh.renderers.choose import read_lens
 from mrbokeh.system.atomic_files import refuse_existing
 from mrbokeh.system.channel import say, tell
 from mrbokeh.system.errors import InputError
@@ -116,7 +116,7 @@ async def _calibrated(calibration: Calibration, endpoint: Endpoint, cameras: dic
 
 def _intrinsics(options: CalibrationOptions) -> Callable[[int, int], Camera]:
     if (options.camera is None) == (options.lens is None):
-        raise InputError("expected the camera's intrinsics from either --camera CAMERA.json or --lens LENS.json: give one of them")
+        raise InputError("expected the camera's intrinsics from either --camera CAMERA.json or --lens LENS: give one of them")
     if options.camera is not None:
         return read_fixed_pose(options.camera).camera.resized
     assert options.lens is not None, "one of them"

@@ -13,9 +13,8 @@ from aiohttp import web
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import MM_PER_M, Lens
-from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.renderers.choose import BY_NAME, DEFAULT, WITH_BANKS
+from mrbokeh.renderers.choose import BY_NAME, DEFAULT, WITH_BANKS, is_bank, lens_and_renderer, read_lens, spreads_light
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.charuco.board import CharucoBoard, read_board
 from viewfinder.frames import LensState
@@ -167,26 +166,20 @@ class LensBook:
 
 
 def read_lenses(paths: Sequence[Path], scene: Path | None) -> tuple[LensBook, dict[str, MakeRenderer]]:
-    """Read lenses by the names of their files, or that of the scene file; (lenses, the networks among the files as renderers).
-
-    A network (.onnx) brings its lens.
-    """
+    """Read lenses by the names of their files, or that of the scene file; (lenses, the renderers of networks and banks among them)."""
     lenses: dict[str, Lens] = {}
-    networks: dict[str, MakeRenderer] = {}
+    brought: dict[str, MakeRenderer] = {}
     lens_of_scene = None if scene is None else _lens_of_scene(scene)
     for path in paths:
-        if path.suffix.lower() == ".onnx":
-            from mrbokeh.renderers.onnx_network import OnnxNetwork
-
-            network = OnnxNetwork(path)
-            lenses[path.stem], networks[path.stem] = network.lens, partial(_same, network)
-        else:
-            lenses[path.stem] = read_lens(path)
+        name = path.name if is_bank(path) else path.stem
+        lenses[name] = read_lens(path)
+        if spreads_light(path):
+            brought[name] = partial(_same, lens_and_renderer(path, None, threads=1, layering=LIVE_LAYERING)[1])
     if not lenses and lens_of_scene is not None:
         lenses["scene"] = lens_of_scene
     if not lenses:
         raise InputError("expected a lens, got none: give --lens LENS.json (see `mrbokeh lens new`), or name one in the scene file")
-    return LensBook(lenses), networks
+    return LensBook(lenses), brought
 
 
 def _lens_of_scene(scene: Path) -> Lens | None:
@@ -224,8 +217,8 @@ class Parts:
 
 def open_parts(options: ViewfinderOptions, access: Access, closing: ExitStack) -> Parts:
     """Read all files, then open the camera. closing: gets what has threads; closing a part twice does nothing."""
-    lenses, networks = read_lenses(options.lenses, options.scene)
-    renderers = renderers_of(options.renderers, options.psf, networks)
+    lenses, brought = read_lenses(options.lenses, options.scene)
+    renderers = renderers_of(options.renderers, options.lenses, brought)
     intrinsics = None if options.camera is None else read_fixed_pose(options.camera).camera
     board = options.tracking.board
     focus_board = None if board is None or "board" not in options.focus_from else read_board(board)
@@ -268,43 +261,31 @@ def open_overlays(options: ViewfinderOptions, lens: Lens, renderers: Mapping[str
     return stage
 
 
-def renderers_of(names: Sequence[str], bank: Path | None, networks: Mapping[str, MakeRenderer]) -> dict[str, MakeRenderer]:
-    """Return what the page can switch between, the first of which is used first; bank: measured kernels for those that take them.
+def renderers_of(names: Sequence[str], lenses: Sequence[Path], brought: Mapping[str, MakeRenderer]) -> dict[str, MakeRenderer]:
+    """Return what the page can switch between, the first of which is used first. brought: the renderers of networks and banks.
 
-    Unknown names, and a bank that none of them takes, raise InputError now and not when the page switches.
+    Where the only lens is a bank, a name that takes one spreads its kernels. Unknown names, and a bank that none of them takes, raise
+    InputError now and not when the page switches.
     """
-    wanted = list(names) or ([*networks, DEFAULT] if networks else [DEFAULT, "scatter"])
-    _refuse_unknown(wanted, networks)
-    if bank is not None and not set(wanted) & set(WITH_BANKS):
-        raise InputError(f"--psf is for --renderer {', '.join(WITH_BANKS)}, got {', '.join(wanted)}: leave --psf out, or name one of them")
-    made: dict[str, MakeRenderer] = {}
-    for name in wanted:
-        if name in networks:
-            made[name] = networks[name]
-        elif bank is not None and name in WITH_BANKS:
-            made[name] = _with_bank(name, bank)
-        else:
-            made[name] = _plain(name)
-    return made
+    wanted = list(names) or ([*brought, DEFAULT] if brought else [DEFAULT, "scatter"])
+    _refuse_unknown(wanted, brought)
+    bank = lenses[0] if names and len(lenses) == 1 and is_bank(lenses[0]) else None
+    if bank is not None and not set(wanted) & {*WITH_BANKS, *brought}:
+        raise InputError(f"the bank {bank} is for --renderer {', '.join(WITH_BANKS)}, got {', '.join(wanted)}: name one of them")
+    return {name: brought.get(name) or _live(name, bank if name in WITH_BANKS else None) for name in wanted}
 
 
-def _refuse_unknown(names: Sequence[str], networks: Mapping[str, MakeRenderer]) -> None:
+def _refuse_unknown(names: Sequence[str], brought: Mapping[str, MakeRenderer]) -> None:
     for name in names:
         is_file = name.lower().endswith(".onnx")
         if is_file and not Path(name).is_file():
             raise InputError(f"--renderer: expected a network in an .onnx file, got {name}, where there is no such file")
-        if not is_file and name not in networks and name not in BY_NAME:
-            raise InputError(f"--renderer: expected one of {', '.join([*networks, *BY_NAME])}, or a network (.onnx), got {name!r}")
+        if not is_file and name not in brought and name not in BY_NAME and not is_bank(name):
+            raise InputError(f"--renderer: expected one of {', '.join([*brought, *BY_NAME])}, or a network (.onnx), got {name!r}")
 
 
-def _plain(name: str) -> MakeRenderer:
-    return lambda: live_renderer(name)
-
-
-def _with_bank(name: str, bank: Path) -> MakeRenderer:
-    from mrbokeh.renderers.choose import chosen_renderer
-
-    return lambda: chosen_renderer(name, bank, threads=1, layering=LIVE_LAYERING)
+def _live(name: str, bank: Path | None) -> MakeRenderer:
+    return lambda: live_renderer(name) if bank is None else lens_and_renderer(bank, name, threads=1, layering=LIVE_LAYERING)[1]
 
 
 class SentTo:

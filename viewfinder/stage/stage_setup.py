@@ -9,9 +9,8 @@ from pathlib import Path
 
 from mrbokeh.layering.layering import Layering
 from mrbokeh.optics.lens import Lens
-from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.renderers.choose import make_renderer
+from mrbokeh.renderers.choose import make_renderer, read_lens
 from mrbokeh.scene import SceneRenderer
 from mrbokeh.scene.staging.scene_file import read_scene_file
 from mrbokeh.scene.staging.staged_scene import Assets, StagedScene, modified_s

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from mrbokeh.optics.lens_file import read_lens
+from mrbokeh.renderers.choose import read_lens
 from mrbokeh.system.errors import InputError
 
 _SIDE_PX, _RADIUS_PX = 64, 26.0

@@ -28,7 +28,10 @@ def studio(
         ),
     ] = None,
     lens: Annotated[
-        list[Path] | None, typer.Option(help="LENS.json, or NETWORK.onnx (repeat: the page switches between them); else the photograph's.")
+        list[Path] | None,
+        typer.Option(
+            help="LENS.json, a bank of PSFs (folder) or NETWORK.onnx (repeat: the page switches between them); else the photograph's."
+        ),
     ] = None,
     project: Annotated[
         Path | None,

@@ -83,13 +83,13 @@ def read_project(path: Path) -> Project:
         objects, lenses = ([_found(Path(each), folder) for each in document.get(name) or ()] for name in ("objects", "lenses"))
     except (InputError, TypeError) as error:
         raise InputError(f"expected {_EXPECTED} at {path}, but: {error}") from None
-    there = {name: [each for each in files if each.is_file()] for name, files in (("objects", objects), ("lenses", lenses))}
+    there = {name: [each for each in files if each.exists()] for name, files in (("objects", objects), ("lenses", lenses))}
     project = Project(path, history, place, **there)
     if project.state.camera is not None and not project.state.camera.is_file():
         project.amend(lambda state: replace(state, camera=None))
     named = [(name, getattr(project.state, name)) for name in _PATHS]
     for name, file in (*named, *(("object", each.object) for each in project.state.objects)):
-        if file is not None and not file.is_file():
+        if file is not None and not file.exists():
             raise InputError(f"{path} has the {name} {file}, which is not there any more: put it back, or begin anew without the project")
     return project
 

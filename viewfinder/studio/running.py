@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import mrbokeh
-from mrbokeh.optics.lens_file import read_lens
+from mrbokeh.renderers.choose import read_lens
 from mrbokeh.system.channel import say
 from mrbokeh.system.errors import InputError, require_file
 from viewfinder.options import ListeningOptions
@@ -64,7 +64,7 @@ def _offer(project: Project, options: StudioOptions) -> None:
     for path in options.lenses:
         if path.suffix.lower() != ".onnx":
             read_lens(path)
-        project.offer(_there(path, "a lens file"))
+        project.offer(path if path.is_dir() else _there(path, "a lens file"))
     if given and given[0] not in (project.state.object, *(each.object for each in project.state.objects)):
         project.add(replace(project.state, object=given[0], height=None))
 

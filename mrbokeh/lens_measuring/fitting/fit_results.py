@@ -7,6 +7,8 @@ from jaxtyping import Float32, Float64
 
 from mrbokeh.lens_measuring.fitting.lens_fit import LensFit
 from mrbokeh.lens_measuring.fitting.pupil_picture import kernel_of
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import stated_facts
 from mrbokeh.optics.psf_bank import Axis, PsfBank, physical_boxes
 from mrbokeh.optics.psf_grid import NestedGrid
 from mrbokeh.psf_models.base import centred
@@ -17,10 +19,10 @@ _STEP_PX, _STEP_SHARE = 0.5, 0.03
 _NODES = 3
 
 
-def bank_of(fit: LensFit) -> PsfBank:
+def bank_of(fit: LensFit, lens: Lens | None = None) -> PsfBank:
     """Return a bank over signed diameters and, if the lens varies over the field, positions (or eccentricity, for a symmetric lens).
 
-    Kernels have one channel where colours share theirs, else three.
+    Kernels have one channel where colours share theirs, else three. lens: what the kernels are of, if that is known.
     Each kernel is averaged over its cell's diameters. settings hold for each cell of the bank how many pixels and lights tell of it, and
     how far they disagree with it.
     """
@@ -28,7 +30,8 @@ def bank_of(fit: LensFit) -> PsfBank:
     boxes = physical_boxes(axes, NestedGrid(counts, nested=False))
     kernels = tuple(_kernel(fit, box) for box in track(list(boxes), "bank"))
     turns = "field" if fit.knots.rings else "none"
-    return PsfBank(model="measured", axes=axes, counts=counts, kernels=kernels, turns=turns, nested=False, settings=_settings(fit, boxes))
+    settings = ({} if lens is None else {"lens": stated_facts(lens)}) | _settings(fit, boxes)
+    return PsfBank(model="measured", axes=axes, counts=counts, kernels=kernels, turns=turns, nested=False, settings=settings)
 
 
 def _axes(fit: LensFit) -> tuple[tuple[Axis, ...], tuple[int, ...]]:
