@@ -15,7 +15,8 @@ from mrbokeh.layering.motion import farthest_px
 from mrbokeh.layering.pixel_box import NOWHERE, Box, is_same_everywhere, lit_box
 from mrbokeh.layering.psf_over_field import reach_px
 from mrbokeh.optics.lens import Lens
-from mrbokeh.renderers.bank.bank_lens import opening_of
+from mrbokeh.renderers.bank.bank_lens import opening_of, reach_tables
+from mrbokeh.renderers.bank.tables import BankTables, Place
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.system.errors import InputError
 
@@ -31,24 +32,24 @@ class InDirtyRectangle:
     """An Insertion that lets another one work where light of the layers can arrive, and leaves the rest of the plate as it is.
 
     The result is that of the whole frame, but that near things which the frame cuts off go on beyond it. Where the blur depends on
-    the place in the frame (tilt, cat-eyes, banks of kernels, networks) the whole frame is taken. Rays through the pupil take the opening
-    that stands for a bank's kernels.
+    the place in the frame (tilt, cat-eyes, kernels over more than diameters, networks) the whole frame is taken. Rays through the pupil
+    take the opening that stands for a bank's kernels.
     """
 
     insertion: Insertion
 
     def insert(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> Inserted:
         bank = getattr(renderer, "bank", None)
+        tables = None if bank is None else reach_tables(bank)
         if bank is not None:
             plate = replace(plate, lens=replace(plate.lens, aperture=opening_of(bank)))
         lit = _lit_boxes(same_size(plate, layers))
         if not lit:
             return Inserted(plate.rgb, flatten(layers) if layers else clear(*plate.rgb.shape[:2]))
-        if not (is_same_everywhere(plate.lens) and _blurs_by_aperture(renderer)) or (
-            plate.depth_m is None and plate.near_alpha is not None
-        ):
+        known_reach = hasattr(renderer, "layering") and (bank is None or tables is not None)
+        if not (is_same_everywhere(plate.lens) and known_reach) or (plate.depth_m is None and plate.near_alpha is not None):
             return self.insertion.insert(plate, layers, renderer)
-        box = _dirty_rectangle(plate, lit)
+        box = _dirty_rectangle(plate, lit, tables)
         found = self.insertion.insert(_cut_plate(plate, box), [box.cut_layer(layer) for layer in layers], renderer)
         photo_rgb = plate.rgb.copy()
         box.paste(found.photo_rgb, photo_rgb)
@@ -70,28 +71,34 @@ def _lit_boxes(layers: Sequence[Layer]) -> list[tuple[Layer, Box]]:
     return [(layer, box) for layer, box in boxes if shows(layer.rgb[box.where], layer.alpha[box.where]).any()]
 
 
-def _dirty_rectangle(plate: Plate, lit: Sequence[tuple[Layer, Box]]) -> Box:
-    reached = [_reached(layer, box, plate.lens) for layer, box in lit]
+def _dirty_rectangle(plate: Plate, lit: Sequence[tuple[Layer, Box]], tables: BankTables | None = None) -> Box:
+    """Return the box. tables: of the bank that spreads the light in place of the lens's opening."""
+    reached = [_reached(layer, box, plate.lens, tables) for layer, box in lit]
     arrival = Box(min(b.top for b in reached), max(b.bottom for b in reached), min(b.left for b in reached), max(b.right for b in reached))
-    return arrival.within(plate.rgb.shape) if plate.depth_m is None else _with_sources(arrival, plate.depth_m, plate.lens)
+    return arrival.within(plate.rgb.shape) if plate.depth_m is None else _with_sources(arrival, plate.depth_m, plate.lens, tables)
 
 
-def _reached(layer: Layer, box: Box, lens: Lens) -> Box:
+def _reached(layer: Layer, box: Box, lens: Lens, tables: BankTables | None) -> Box:
     depth_m = box.of(layer.depth_m)[shows(box.of(layer.rgb), box.of(layer.alpha))]
-    return box.grown(reach_px(lens.aperture, _most_coc_px(lens, depth_m, layer.width_px)) + farthest_px([layer]) + _SPARE_PX)
+    ends_px = _coc_ends_px(lens, depth_m, layer.width_px)
+    reach = reach_px(lens.aperture, float(np.abs(ends_px).max())) if tables is None else tables.farthest_px(ends_px)
+    return box.grown(reach + farthest_px([layer]) + _SPARE_PX)
 
 
-def _most_coc_px(lens: Lens, depth_m: np.ndarray, width_px: int) -> float:
-    """The largest circle of confusion: it belongs to the nearest or the farthest depth."""
-    return float(np.abs(lens.coc_px(np.array([depth_m.min(), depth_m.max()]), width_px)).max())
+def _coc_ends_px(lens: Lens, depth_m: np.ndarray, width_px: int) -> Float32[np.ndarray, "2"]:
+    """The circles of confusion of the nearest and the farthest depth: all others lie between."""
+    return np.asarray(lens.coc_px(np.array([depth_m.min(), depth_m.max()]), width_px), np.float32)
 
 
-def _with_sources(arrival: Box, depth_m: Plane, lens: Lens) -> Box:
+def _with_sources(arrival: Box, depth_m: Plane, lens: Lens, tables: BankTables | None) -> Box:
     """Grown to every photographed pixel whose own blur reaches into the box; beyond the frame as far as those reach."""
     height, width = depth_m.shape
-    half = 0.5 * lens.aperture.unit_radius
-    near_by = arrival.grown(int(half * _most_coc_px(lens, depth_m, width)) + 2 * _SPARE_PX).within(depth_m.shape)
-    half_px = half * np.abs(np.asarray(lens.coc_px(near_by.of(depth_m), width), np.float32)) + np.float32(_SPARE_PX)
+    half, ends_px = 0.5 * lens.aperture.unit_radius, _coc_ends_px(lens, depth_m, width)
+    most = int(half * float(np.abs(ends_px).max())) if tables is None else tables.farthest_px(ends_px)
+    near_by = arrival.grown(most + 2 * _SPARE_PX).within(depth_m.shape)
+    coc_px = np.asarray(lens.coc_px(near_by.of(depth_m), width), np.float32)
+    half_px = half * np.abs(coc_px) if tables is None else tables.reaches_px[tables.cells(coc_px, Place())].astype(np.float32)
+    half_px += np.float32(_SPARE_PX)
     rows, columns = np.arange(near_by.top, near_by.bottom), np.arange(near_by.left, near_by.right)
     down = np.maximum(np.maximum(arrival.top - rows, rows - arrival.bottom + 1), 0).astype(np.float32)
     along = np.maximum(np.maximum(arrival.left - columns, columns - arrival.right + 1), 0).astype(np.float32)
@@ -108,11 +115,6 @@ def _with_sources(arrival: Box, depth_m: Plane, lens: Lens) -> Box:
         beyond.left if beyond.left < 0 else left,
         beyond.right if beyond.right > width else right,
     )
-
-
-def _blurs_by_aperture(renderer: Renderer) -> bool:
-    """Return whether the renderer's kernels are those of the lens's opening: banks and networks may know the place in the frame."""
-    return hasattr(renderer, "layering") and getattr(renderer, "bank", None) is None
 
 
 def _cut_plate(plate: Plate, box: Box) -> Plate:

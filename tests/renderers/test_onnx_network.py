@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 import torch
 
+import mrbokeh
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.choose import lens_and_renderer, read_lens
 from mrbokeh.renderers.onnx_network import OnnxNetwork
 from mrbokeh.system.errors import InputError
 from training.export.onnx_export import export_network
@@ -61,6 +63,18 @@ def card(coc_px: float, rgb: tuple[float, float, float] = (0.5, 0.25, 1.0), half
     alpha[SIZE[0] // 2 - half_px : SIZE[0] // 2 + half_px, SIZE[1] // 2 - half_px : SIZE[1] // 2 + half_px] = 1.0
     colour = (alpha[..., None] * np.float32(rgb)).astype(np.float32)
     return Layer(colour, alpha, np.where(alpha > 0, depth_for(coc_px), np.inf).astype(np.float32))
+
+
+def test_a_network_is_a_lens_that_keeps_its_own_blur(tmp_path: Path) -> None:
+    """By its path, and read as a Lens, which another renderer may spread by the opening that it was trained with."""
+    path, settings = tmp_path / "lens.onnx", demo_settings().network
+    export_network(build_network(TrainSettings(network=settings), FACTS).eval(), settings, FACTS, path)
+    lens, sharp, depth_m = read_lens(path), np.full((*SIZE, 3), 0.5, np.float32), np.full(SIZE, depth_for(5.0), np.float32)
+    sharp[::8] = 0.0
+    assert lens.spread_by == path and isinstance(lens_and_renderer(path, None)[1], OnnxNetwork)
+    np.testing.assert_array_equal(mrbokeh.render(sharp, depth_m, lens), mrbokeh.render(sharp, depth_m, path))
+    plain = lens_and_renderer(path, "polygon")[1].render([opaque(sharp, depth_m)], LENS).rgb
+    np.testing.assert_array_equal(mrbokeh.render(sharp, depth_m, lens, renderer="polygon"), plain)
 
 
 @pytest.mark.parametrize("coc_px", [-6.5, -3.0, 0.5, 4.0, 6.9])

@@ -11,6 +11,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import lens_from_json
 from mrbokeh.optics.psf_bank import PsfBank
 from mrbokeh.renderers.bank.apertures import LEAST_FITTED_PX, fit_polygons
+from mrbokeh.renderers.bank.blending import BlendedTables
 from mrbokeh.renderers.bank.lattice import BankLattice
 from mrbokeh.system.errors import InputError
 
@@ -31,7 +32,7 @@ def lens_of(bank: PsfBank) -> Lens | None:
 
 @lru_cache(maxsize=8)
 def opening_of(bank: PsfBank) -> Aperture:
-    """Return the opening that its kernel behind the focus in the middle of the frame shows, all colours together.
+    """Return the opening that its kernel behind the focus in the middle of the frame shows, in green light.
 
     A disc if it shows none: a bank of scattering, or of kernels of less than 8 px.
     """
@@ -42,6 +43,13 @@ def opening_of(bank: PsfBank) -> Aperture:
         return fit_polygons(kernel, diameter_px).aperture
     except InputError:
         return Aperture.disc()
+
+
+@lru_cache(maxsize=8)
+def reach_tables(bank: PsfBank) -> BlendedTables | None:
+    """Return tables that tell how far the light of a diameter travels; None for a bank whose kernels differ by more than that."""
+    alike = [axis.name for axis in bank.axes] == ["diameter_px"] and bank.turns == "none"
+    return BlendedTables(bank, None) if alike else None
 
 
 def polygons_suit(bank: PsfBank) -> bool:
@@ -55,16 +63,16 @@ def polygons_suit(bank: PsfBank) -> bool:
 
 def _middle_kernel(bank: PsfBank) -> tuple[Float64[np.ndarray, "size size"], float]:
     """Return a kernel of the middle of the frame as behind the focus, and its circle of confusion; 0 if the bank does not tell that."""
-    names = [axis.name for axis in bank.axes]
+    names, green = [axis.name for axis in bank.axes], bank.channels // 2
     if "diameter_px" in names:
         at = names.index("diameter_px")
         cell = int(bank.nearest(np.where(np.arange(len(names)) == at, min(bank.axes[at].high, _DRAWN_PX), 0.0)))
-        return bank.kernels[cell].mean(axis=2, dtype=np.float64), float(bank.centres[cell, at])
+        return bank.kernels[cell][..., green].astype(np.float64), float(bank.centres[cell, at])
     lens = stated_lens(bank)
     if lens is None:
         return np.ones((1, 1)), 0.0
     places = bank.centres * (np.array(names) == "depth_m")
     coc_px = lens.coc_px(places.sum(axis=1), round(lens.sensor_width_mm / bank.settings["mm_per_px"]))
     best = int(np.argmin(np.abs(np.abs(coc_px) - _DRAWN_PX)))
-    kernel = bank.kernels[int(bank.nearest(places[best]))].mean(axis=2, dtype=np.float64)
+    kernel = bank.kernels[int(bank.nearest(places[best]))][..., green].astype(np.float64)
     return kernel if coc_px[best] > 0 else kernel[::-1, ::-1].copy(), abs(float(coc_px[best]))
