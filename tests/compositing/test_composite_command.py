@@ -15,12 +15,14 @@ import pytest
 from mrbokeh.compositing.plate import open_plate
 from mrbokeh.demo.plan import DATA
 from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer
+from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
 from tests.house.test_user_mistakes import said
+from tests.support.renderer_banks import bank_folder
 
 HEIGHT, WIDTH = 96, 144
 LENS = Lens(35.0, 2.0, 1.0, 23.5)
@@ -67,6 +69,23 @@ def test_a_layer_goes_behind_the_post_and_before_the_wall(files: Path, composite
     np.testing.assert_allclose(picture[50, 70], [0.9, 0.2, 0.1], rtol=2e-3)  # half float
     untouched = blurred.alpha == 0
     np.testing.assert_allclose(picture[untouched], plate_rgb()[untouched], rtol=2**-11)
+
+
+def test_a_bank_is_a_lens_that_says_what_it_was_made_for_or_lets_the_photograph_say_it(files: Path, composite: Composite) -> None:
+    """As --lens with its facts, as --renderer beside a lens file, and with facts in options where neither bank nor photograph has them."""
+    said_by, silent = bank_folder(files / "bank", LENS), bank_folder(files / "silent", LENS, says_lens=False)
+    facts = ("--focal-length", 35, "--f-number", 2, "--sensor-width", 23.5, "--focus", 1)
+    ways = [("--lens", files / "lens.json"), ("--lens", said_by), ("--lens", files / "lens.json", "--renderer", silent)]
+    ways += [("--lens", silent, *facts), ("--lens", said_by, "--renderer", "laplacian")]
+    found = []
+    for number, way in enumerate(ways):
+        out = files / f"{number}.exr"
+        code, told = composite(files / "photo.exr", "--layer", files / "card.exr", "--depth", files / "depth.exr", *way, "--out", out)
+        assert code == 0 and "35 mm f/2 focused at 1 m" in told, told
+        found.append(read_image(out))
+    assert all(psnr(each, found[0]) > 45.0 for each in found[1:])
+    code, told = composite(files / "photo.exr", "--layer", files / "card.exr", "--lens", silent, "--out", files / "no.exr")
+    assert code == 2 and "does not tell its lens" in told
 
 
 def test_an_object_stands_on_the_pixel_it_was_put_on(files: Path, composite: Composite) -> None:

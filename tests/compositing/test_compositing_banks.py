@@ -12,14 +12,12 @@ from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
-from mrbokeh.optics.lens_file import stated_facts
-from mrbokeh.psf_models.build import build_bank
-from mrbokeh.psf_models.simple_lens import SimpleLens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import lens_and_renderer
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from tests.support.mixed_reality_cases import card_cases
+from tests.support.renderer_banks import bank_folder
 
 LENS = Lens(100.0, 1.0, 1.0, 36.0)  # 20 px of blur per dioptre at 64 px: -8.6 px at 0.7 m, 13.3 px at 3 m
 HEART = replace(LENS, aperture=Aperture.heart())
@@ -31,9 +29,7 @@ each_mode = pytest.mark.parametrize("mode", MODES)
 
 @pytest.fixture(scope="module", name="bank")
 def fixture_bank(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder: Path = tmp_path_factory.mktemp("banks") / "heart"
-    build_bank(SimpleLens(HEART.aperture, 24.0, (64,), lens=stated_facts(HEART)), folder, progress=False)
-    return folder
+    return bank_folder(tmp_path_factory.mktemp("banks") / "heart", HEART)
 
 
 @pytest.fixture(scope="module", name="by_bank", params=METHODS)

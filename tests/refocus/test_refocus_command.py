@@ -25,6 +25,7 @@ from mrbokeh.stacks.focus_places import FocusLookup, parse_focus
 from tests.support.card_stack import CARD_PX, LENS, SIZE, make_card_stack
 from tests.support.command_line import printed_by
 from tests.support.refusals import refused
+from tests.support.renderer_banks import bank_folder
 
 BETWEEN_M = 0.52
 
@@ -64,6 +65,15 @@ def test_the_lens_and_the_focus_may_be_told_by_facts_and_by_a_pixel(tmp_path: Pa
     refused("where to focus", run, stack.folder, "--out", tmp_path / "no")
     monkeypatch.setattr("mrbokeh.renderers.choose.make_renderer", lambda _, **__: object.__new__(OnnxNetwork))
     refused("a network blurs as the lens", run, stack.folder, "--focus", "1", *facts, "--renderer", "my.onnx", "--out", tmp_path / "no")
+
+
+def test_a_bank_is_a_lens_and_as_renderer_takes_the_stacks_own(tmp_path: Path) -> None:
+    stack = card_stack(tmp_path / "stack")
+    bank = bank_folder(tmp_path / "bank", stack.lens_of(stack.reference), 40.0)
+    exact = Refocusing(stack, ScatterReference(threads=1)).rendered(BETWEEN_M)
+    for name, way in (("lens", ("--lens", bank)), ("renderer", ("--renderer", bank, "--no-residuals"))):
+        run(stack.folder, "--focus", BETWEEN_M, *way, "--out", tmp_path / name)
+        assert psnr(read_focal_stack(tmp_path / name).slice_rgb(0), exact) > 38.0
 
 
 def test_nothing_pops_where_a_focus_pull_passes_a_captured_slice(tmp_path: Path) -> None:

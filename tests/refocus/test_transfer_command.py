@@ -22,6 +22,7 @@ from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.stacks.photograph import Photograph
 from mrbokeh.video.clip import read_frames
 from tests.support.refusals import refused
+from tests.support.renderer_banks import bank_folder
 
 LENS = Lens(50.0, 2.0, 1.0, 9.0)
 SIZE = (48, 72)
@@ -63,6 +64,13 @@ def test_the_picture_is_that_of_the_lens(files: dict[str, Path]) -> None:
     np.testing.assert_allclose(read_image(run(files, "b.exr", "--focus", 2.0)), expected(files, 2.0), rtol=half_step, atol=1e-6)
     np.testing.assert_allclose(read_image(run(files, "c.exr", "--focus-at", "60,20")), expected(files, 2.0), rtol=half_step, atol=1e-6)
     assert np.abs(expected(files, 1.0) - expected(files, 2.0)).max() > 0.1
+
+
+def test_a_bank_is_a_lens(files: dict[str, Path]) -> None:
+    """It blurs as the lens that it was made for, in its place or focused elsewhere."""
+    bank = bank_folder(files["folder"] / "bank", LENS, 40.0)
+    found = read_image(run(files, "a.exr", "--lens", bank, "--focus", 2.0))
+    assert psnr(found, expected(files, 2.0)) > 38.0 > psnr(expected(files, 1.0), expected(files, 2.0))
 
 
 def test_disparity_of_sixteen_bit_means_the_same(files: dict[str, Path]) -> None:

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import mrbokeh
+from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
-from mrbokeh.optics.lens_file import stated_facts, write_lens
+from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.optics.psf_bank import PsfBank
 from mrbokeh.psf_models.build import Combined, build_bank
 from mrbokeh.psf_models.physical_lens import PhysicalLens
-from mrbokeh.psf_models.simple_lens import SimpleLens
 from mrbokeh.psf_models.volume import Volume
 from mrbokeh.renderers.bank.apertures import relative_error
 from mrbokeh.renderers.bank.bank_lens import lens_of, opening_of
@@ -22,6 +22,7 @@ from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 from tests.support.refusals import refused
+from tests.support.renderer_banks import bank_folder
 
 HEART = Lens(85.0, 1.4, float("inf"), 24.0, Aperture.heart(), sensor_height_mm=16.0)
 
@@ -30,8 +31,8 @@ HEART = Lens(85.0, 1.4, float("inf"), 24.0, Aperture.heart(), sensor_height_mm=1
 def fixture_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """heart: says its lens; disc: does not; moving: blur of motion too."""
     folder: Path = tmp_path_factory.mktemp("lenses")
-    build_bank(SimpleLens(HEART.aperture, 24.0, (48,), lens=stated_facts(HEART)), folder / "heart", progress=False)
-    build_bank(SimpleLens(diameter_px=24.0, counts=(24,)), folder / "disc", progress=False)
+    bank_folder(folder / "heart", HEART)
+    bank_folder(folder / "disc", Lens.default(), says_lens=False)
     build_bank(Combined(6.0, 3.0, (3, 2)), folder / "moving", progress=False)
     write_lens(folder / "heart.json", HEART)
     return folder
@@ -83,6 +84,11 @@ def test_the_opening_of_banks_without_diameters() -> None:
     lens = lens_of(traced)
     assert lens is not None and lens.focal_length_mm == pytest.approx(50.0, rel=0.02) and lens.focus_distance_m == 1.0
     assert 0.7 < opening_of(traced).unit_radius < 1.4
+    scene, renderer = [opaque(np.ones((20, 400, 3), np.float32), np.full((20, 400), 2.0, np.float32))], LaplacianSpreadlets(traced)
+    assert renderer.render(scene, lens).rgb.max() > 0.0
+    refused("is focused at 1 m from the lens.*--focus 2", renderer.render, scene, lens.focused_at(2.0))
+    small = [opaque(each.rgb[:, :40], each.depth_m[:, :40]) for each in scene]
+    refused("for pictures 400 px wide, but this one is 40 px", renderer.render, small, lens)
     fog = Volume(focal_px=64.0, size_px=15, counts=(1,))
     scattering = PsfBank("volume", fog.axes, (1,), (np.ones((1, 1, 3), np.float32),), nested=False)
     assert lens_of(scattering) is None and opening_of(scattering).unit_radius == pytest.approx(1.0, abs=0.01)

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,8 +11,11 @@ from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.layering.layering import Layering
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import stated_facts
 from mrbokeh.optics.psf_bank import Axis, PsfBank, physical_boxes
 from mrbokeh.optics.psf_grid import NestedGrid
+from mrbokeh.psf_models.build import build_bank
+from mrbokeh.psf_models.simple_lens import SimpleLens
 from mrbokeh.renderers.bank.apertures import BankApertures, fit_apertures
 from mrbokeh.renderers.bank.lattice import BankLattice
 from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
@@ -56,6 +60,13 @@ def lone_pixel(row: int, column: int, coc_px: float) -> list[Layer]:
     rgb, alpha = np.zeros((*SIZE, 3), np.float32), np.zeros(SIZE, np.float32)
     rgb[row, column], alpha[row, column] = (4.0, 2.0, 1.0), 1.0
     return [Layer(rgb, alpha, depth_m(coc_px))]
+
+
+def bank_folder(folder: Path, lens: Lens, largest_px: float = 24.0, counts: int = 64, *, says_lens: bool = True) -> Path:
+    """Build a bank of a lens's opening, which says what it was made for; return the folder."""
+    model = SimpleLens(lens.aperture, largest_px, (counts,), lens=stated_facts(lens) if says_lens else None)
+    build_bank(model, folder, progress=False)
+    return folder
 
 
 @cache

@@ -16,6 +16,7 @@ from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.compositing.plate import plate_of
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer
+from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.camera import camera_to_json
 from mrbokeh.optics.lens import Lens
@@ -31,6 +32,7 @@ from tests.compositing.test_plate_look_options import photo_with_exif
 from tests.stacks.test_exr_layers_cryptomatte import beauty, crypto_channels, header
 from tests.support.command_line import mrbokeh
 from tests.support.refusals import refused
+from tests.support.renderer_banks import bank_folder
 from tests.support.shot_makers import wait_for
 from tests.support.stage_scenes import HEIGHT, ONE_CARD, WIDTH, camera, scene_file
 from tests.support.video_files import filmed
@@ -93,6 +95,15 @@ def test_a_range_of_frames_begins_at_time_zero(clip: Path, settings: list[str], 
     assert [parse_frames(text) for text in (":", "0:50", "10:", ":7")] == [(0, None), (0, 50), (10, None), (0, 7)]
     for text in ("", "5", "7:7", "9:2", "-1:4", "a:b"):
         refused("START:STOP", parse_frames, text)
+
+
+def test_a_bank_is_a_lens(clip: Path, settings: list[str], tmp_path: Path) -> None:
+    """The same film as by the lens file, in workers too, which read the bank themselves."""
+    bank = bank_folder(tmp_path / "bank", LENS)
+    run(clip, *settings, "--frames", "0:6", "--out", tmp_path / "by_file.mkv")
+    run(clip, *settings[:2], "--lens", bank, "--frames", "0:6", "--workers", "2", "--segment", "0.12", "--out", tmp_path / "by_bank.mkv")
+    by_file, by_bank = (list(read_frames(tmp_path / f"by_{way}.mkv")) for way in ("file", "bank"))
+    assert len(by_bank) == 6 and all(psnr(a.rgb, b.rgb) > 40.0 for a, b in zip(by_file, by_bank, strict=True))
 
 
 def test_mistakes_end_in_a_sentence(clip: Path, settings: list[str], tmp_path: Path) -> None:

@@ -36,9 +36,11 @@ from mrbokeh.system.errors import InputError
 from tests.support.command_line import mrbokeh
 from tests.support.made_studio import ALIEN, CAKE, HEIGHT, WIDTH, made_studio, write_floor
 from tests.support.refusals import refused
+from tests.support.renderer_banks import bank_folder
 from tests.support.waiting import comes_true, wait_until
 from viewfinder.studio import desk as desks
 from viewfinder.studio import photograph
+from viewfinder.studio.bokeh import bokeh_svg
 from viewfinder.studio.command_line import command_line, options_of, words_of
 from viewfinder.studio.loupe import Region, WholePhotograph, region_of
 from viewfinder.studio.photograph import MOST_PX, OpenedPhotograph, open_photograph, placed, shrunk
@@ -283,9 +285,14 @@ def test_options_of_the_command_are_checked_before_anything_listens(photo: Path,
         done = mrbokeh("studio", *words)
         assert done.returncode == 2 and why in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
     write_lens(tmp_path / "lens.json", Lens(35.0, 2.8, 1.0, 23.5))
-    project = project_of(StudioOptions(photo, (CAKE,), lenses=(tmp_path / "lens.json",), pictures=tmp_path))
-    assert project.state == StudioState(photo=photo, object=CAKE) and project.lenses == [tmp_path / "lens.json"]
+    lenses = (tmp_path / "lens.json", bank_folder(tmp_path / "bank", Lens(35.0, 2.8, 1.0, 23.5)))
+    project = project_of(StudioOptions(photo, (CAKE,), lenses=lenses, pictures=tmp_path))
+    assert project.state == StudioState(photo=photo, object=CAKE) and project.lenses == [*lenses]
     assert project.path == tmp_path / "a floor.studio.json"
+    project.add(replace(project.state, lens=lenses[1]))
+    project.write()
+    again = read_project(project.path)
+    assert again.state.lens == lenses[1] and again.lenses == [*lenses] and "path" in bokeh_svg(lenses[1])
 
 
 async def asked(session: aiohttp.ClientSession, url: str, message: Any = None) -> tuple[int, Any]:

@@ -38,7 +38,9 @@ from tests.support.command_line import mrbokeh, printed_by
 from tests.support.layer_viewfinder import control, watching
 from tests.support.phone_on_camera import PHONE
 from tests.support.refusals import refused
+from tests.support.renderer_banks import bank_folder
 from tests.support.thin_lens_board import Shot, camera_over, display_bgr, photograph
+from viewfinder.app.opening import read_lenses, renderers_of
 from viewfinder.app.running import opened
 from viewfinder.cli import app, board_command
 from viewfinder.frames import CameraFrame
@@ -120,6 +122,19 @@ def test_what_cannot_be_is_refused_before_a_camera_is_opened(monkeypatch: pytest
         assert isinstance(refused, InputError) and sentence in str(refused) and "\n" not in str(refused), (line, refused)
     with pytest.raises(RuntimeError, match="a camera was opened"):
         printed_by(app, "--source", "test", *shlex.split(f"{GIVEN} --board board.json --focus-from board --smooth"))
+
+
+def test_a_bank_among_the_lenses_brings_its_renderer(folder: Path) -> None:
+    """Alone it is spread by the renderers that are named; beside other lenses the page switches to it by its name."""
+    bank, lens = bank_folder(folder / "heart.bank", LENS), folder / "lens.json"
+    book, brought = read_lenses([bank, lens], None)
+    assert book.names == ["heart.bank", "lens"] and book.lens.facts == LENS.facts
+    made: dict[str, Any] = {name: make() for name, make in renderers_of([], [bank, lens], brought).items()}
+    assert {name: each.bank is not None for name, each in made.items()} == {"heart.bank": True, "polygon": False}
+    (laplacian,) = renderers_of(["laplacian"], [bank], brought).values()
+    spread: Any = laplacian()
+    assert spread.bank is not None
+    refused("is for --renderer polygon", renderers_of, ["lrdm"], [bank], brought)
 
 
 @pytest.mark.usefixtures("in_folder")

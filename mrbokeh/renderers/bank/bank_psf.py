@@ -21,10 +21,11 @@ from mrbokeh.layering.psf_over_field import Channels, Frame, Plane
 from mrbokeh.optics.drawn_diameters import drawn_diameters_px
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.psf_bank import Axis
-from mrbokeh.renderers.bank.bank_lens import opening_of
+from mrbokeh.renderers.bank.bank_lens import opening_of, stated_lens
 from mrbokeh.renderers.bank.tables import BankTables, Place
 from mrbokeh.system.errors import InputError
 
+_SAME_SCALE, _SAME_FOCUS_PX = 0.03, 2.0
 _BEYOND_PX, _BEYOND = 1.0, 1.05  # how far the largest kernel stands for larger ones
 
 
@@ -69,7 +70,8 @@ class BankPsf:
         return drawn_diameters_px(coc_px, opening_of(self.tables.bank))
 
     def margin_px(self, layers: Sequence[Layer], coc_px: Sequence[Plane]) -> int:
-        """Return the margin; InputError if blur or motion is clearly larger than the bank's largest."""
+        """Return the margin; InputError if blur or motion is clearly larger than the bank's largest, or it is of another focus or scale."""
+        self._check_made_for()
         reach, frame = 0, Frame(self.size[1], self.size[0])
         for layer, circles in zip(layers, coc_px, strict=True):
             rows, columns = np.nonzero(layer.alpha > 0)
@@ -148,6 +150,24 @@ class BankPsf:
         if self.lens.has_flat_focus:
             return np.array(1.0 / self.lens.focus_distance_m)
         return self.lens.focus_dioptres(self.size[1], self.size[0])
+
+    def _check_made_for(self) -> None:
+        """Raise InputError if kernels over depth, which hold one focus distance and one size of the pixels, are used with others."""
+        bank, made_for = self.tables.bank, stated_lens(self.tables.bank)
+        if made_for is None or "mm_per_px" not in bank.settings:
+            return
+        wanted_px = round(self.lens.sensor_width_mm / bank.settings["mm_per_px"])
+        if abs(self.size[1] / wanted_px - 1.0) > _SAME_SCALE:
+            raise InputError(
+                f"the bank '{bank.model}' is for pictures {wanted_px} px wide, but this one is {self.size[1]} px wide: build one with "
+                f"--image-width {self.size[1]}, or resize the picture"
+            )
+        off_px = abs(float(self.lens.coc_px(made_for.focus_distance_m, self.size[1])))
+        if off_px > _SAME_FOCUS_PX:
+            raise InputError(
+                f"the bank '{bank.model}' is focused at {made_for.focus_described}, but the lens at {self.lens.focus_described}: build one "
+                f"with --focus {self.lens.focus_distance_m:.4g}"
+            )
 
     def _check_range(self, name: str, values: np.ndarray) -> None:
         axis = next((each for each in self.tables.bank.axes if each.name == name), None)
