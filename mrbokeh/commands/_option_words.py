@@ -42,7 +42,7 @@ PANELS = {
     "What is put in": "camera catch layer mode objects paths pitch scene scene-begin scene-renderer time turn keyframes",
     "Its light": "environment exposure shadow",
     "Its look": "grain grey-value light-wrap match-black match-exposure match-grey match-white plate-exposure vignetting seed",
-    "The lens": "distortion f-number focal-length focus focus-at focus-pull lens petzval-radius psf readout same-view sensor-height "
+    "The lens": "distortion f-number focal-length focus focus-at focus-pull lens petzval-radius readout same-view sensor-height "
     "sensor-width shutter tilt prescription",
     "The opening": "axial-chromatic cat-eye curvature image inner lateral-chromatic levels path rotation shape "
     "spherical-aberration squeeze",
