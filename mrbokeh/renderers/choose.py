@@ -68,7 +68,7 @@ def make_renderer(name: str, *, threads: int = 0, layering: Layering | None = No
     """
     settings: dict[str, Any] = {"threads": threads, "layering": layering or Layering()}
     if is_bank(name):
-        return _of_bank(Path(name), read_bank(name), None, settings, device)
+        return _of_bank(Path(name), _read_bank(Path(name)), None, settings, device)
     if name in BY_NAME:
         return BY_NAME[name](**settings, **_on(device, name))
     _on(device, name)
@@ -89,7 +89,7 @@ def lens_and_renderer(
     """
     if is_bank(lens):
         assert lens is not None
-        bank = read_bank(lens)
+        bank = _read_bank(lens)
         settings = {"threads": threads, "layering": layering or Layering()}
         return _spread_by(lens_of(bank), lens), _of_bank(lens, bank, renderer, settings, device)
     if lens is not None and lens.suffix.lower() == ".onnx":
@@ -114,8 +114,8 @@ def read_lens(path: Path | str) -> Lens:
     """
     path = Path(path)
     if is_bank(path):
-        bank = read_bank(path)
-        return replace(lens_of(bank) or Lens(50.0, 1.8, aperture=opening_of(bank)), spread_by=path)
+        bank = _read_bank(path)
+        return replace(lens_of(bank) or replace(Lens.default(), aperture=opening_of(bank)), spread_by=path)
     if path.suffix.lower() == ".onnx":
         from mrbokeh.renderers.onnx_network import OnnxNetwork
 
@@ -136,6 +136,15 @@ def files_of(lens: Path) -> list[Path]:
 def is_bank(path: Path | str | None) -> bool:
     """Return whether a lens or renderer is named by a folder, which should be that of a bank."""
     return path is not None and str(path) not in BY_NAME and Path(path).is_dir()
+
+
+def _read_bank(folder: Path) -> PsfBank:
+    if not (folder / HEAD).is_file():
+        raise InputError(
+            f"expected a lens at {folder}, but it is a folder that holds no bank of PSFs ({HEAD}): give LENS.json, or a folder of "
+            f"`mrbokeh lens psf` or `lens fit`"
+        )
+    return read_bank(folder)
 
 
 def _spread_by(lens: Lens | None, path: Path) -> Lens | None:

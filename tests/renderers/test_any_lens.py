@@ -57,8 +57,8 @@ def test_banks_are_refused_where_nothing_takes_them(folder: Path) -> None:
     refused("is for --renderer polygon, low-rank, laplacian, scatter, got lrdm", lens_and_renderer, folder / "disc", "lrdm")
     refused("got network.onnx", lens_and_renderer, folder / "disc", "network.onnx")
     refused("--device is for", lens_and_renderer, folder / "disc", "polygon", device="cpu")
-    refused("expected a bank of PSFs", lens_and_renderer, folder, None)
-    refused("expected a bank of PSFs", lens_and_renderer, None, str(folder))
+    refused("holds no bank of PSFs", lens_and_renderer, folder, None)
+    refused("holds no bank of PSFs", lens_and_renderer, None, str(folder))
 
 
 def test_in_python_a_lens_that_was_read_keeps_its_kernels(folder: Path) -> None:
