@@ -299,7 +299,7 @@ def video(
     require_safe_outputs((out,), (clip, taken.depth, taken.matte, *virtual.files, rendering.distortion, lens), overwrite=True)
     source = open_source(clip, taken.rate, colour.of_plate)
     recipe = recipe_of(source, lens, facts, taken, virtual, rendering, look, blur, virtual_only=result.virtual_only)
-    if lens is None and not {"focal_length_mm", "f_number"} <= facts.given.keys():
+    if lens_and_renderer(lens, blur.renderer)[0] is None and not {"focal_length_mm", "f_number"} <= facts.given.keys():
         guess(f"no whole lens is stated, so that this one is taken: {recipe.stated_lens.described}")
     target = target_of(out, source, recipe, colour, result)
     shot = shot_of(source, recipe, target, taken.frames, work.segment)

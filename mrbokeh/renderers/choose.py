@@ -110,7 +110,8 @@ def lens_and_renderer(
 def read_lens(path: Path | str) -> Lens:
     """Read a lens: a description (LENS.json), a bank of PSFs (its folder) or a network (.onnx), which keep their own blur.
 
-    A bank that does not say which lens it was made for gives that of `Lens.default` with its opening. Raises InputError where it is none.
+    A bank that does not say which lens it was made for gives that of `Lens.default` with its opening: `Lens.stating` says more. Raises
+    InputError where it is none.
     """
     path = Path(path)
     if is_bank(path):
