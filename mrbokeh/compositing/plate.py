@@ -47,7 +47,8 @@ class Plate:
 
     rgb: (H, W, 3) linear, blurred by the real lens. depth_m: (H, W) of the sharp scene or None. lens: as focused for this photograph.
     sharp_rgb: (H, W, 3) the same view all in focus (of a focal stack), in the colours of rgb, or None.
-    near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects, sharp; or None.
+    near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects: sharp where its distance is known
+    (by depth or told), else as the photograph shows it; NaN where depth is to tell; or None.
     alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
     depth_note: what is known and what is guessed of a phone's own depth and focus, in words.
     metres_guessed: of a stack that knows no focus distance, and of a phone's depth without a unit; blur is right in pixels all the same.
@@ -326,9 +327,16 @@ def with_stereo(
 _HANDS_BREADTH_M = 0.1
 
 
-def with_matte(plate: Plate, path: Path) -> Plate:
-    """The plate with a user's matte of what stands in front, whose numbers are taken as coverage."""
-    return replace(plate, near_alpha=np.ascontiguousarray(read_image(path, "linear")[..., 1]))
+def read_matte(path: Path) -> Float32[np.ndarray, "height width"]:
+    """Read a user's matte of what stands in front: numbers are coverage, NaN where it is transparent; of a cut-out, its alpha."""
+    picture, alpha = read_image(path, "linear"), read_alpha(path)
+    if alpha is None:
+        return np.ascontiguousarray(picture[..., 1])
+    coloured = np.ptp(picture, axis=2)[alpha > _HALF] > _COLOURED
+    return alpha if coloured.any() else np.where(alpha < _HALF, np.float32(np.nan), picture[..., 1])
+
+
+_HALF, _COLOURED = 0.5, 0.02
 
 
 def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus_m: float | None) -> Plate:
