@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 0159210b49709554ee65b35c4c49fe48bb470f30ac99bb89b9b3383f8c08c33b
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 3aa1243704ee511161552ceefdc526557004825fbd4f5c8c260231d5c229567c
 "use strict";
 (() => {
   // src/model.ts
@@ -581,6 +581,92 @@
     }, { passive: false });
   }
 
+  // src/studio_brush.ts
+  var byId2 = (id) => document.getElementById(id);
+  var MOST_POINTS = 2e3;
+  var Brush = class {
+    size = byId2("brush_size");
+    drawn = byId2("stroke");
+    tint = byId2("matte");
+    points = [];
+    waiting = 0;
+    constructor() {
+      const button = byId2("brush");
+      button.addEventListener("click", () => {
+        button.setAttribute("aria-pressed", String(!this.on));
+        this.show();
+      });
+      const behind = byId2("brush_behind");
+      behind.addEventListener("click", () => behind.setAttribute("aria-pressed", String(behind.getAttribute("aria-pressed") !== "true")));
+      byId2("brush_clear").addEventListener("click", () => void studio.commit({ matte: null }));
+      const stage = byId2("stage");
+      stage.addEventListener("pointerleave", () => this.points.length || this.drawn.replaceChildren());
+      studio.addEventListener("state", () => this.show());
+    }
+    get on() {
+      return byId2("brush").getAttribute("aria-pressed") === "true";
+    }
+    get radius_px() {
+      return this.size.valueAsNumber / 1e3 * (studio.told?.photo?.width_px ?? 1e3);
+    }
+    /** Show the brush's settings, and what it has told so far. */
+    show() {
+      const matte = studio.state?.matte ?? null;
+      byId2("stage").classList.toggle("painting", this.on);
+      byId2("brush_row").hidden = !this.on;
+      byId2("brush_clear").disabled = !matte;
+      this.tint.hidden = !this.on || !matte;
+      if (!this.on) this.drawn.replaceChildren();
+      const source = `/matte?of=${encodeURIComponent(matte ?? "")}`;
+      if (matte && this.on && this.tint.getAttribute("src") !== source) this.tint.src = source;
+    }
+    /** A wheel or two fingers change the brush's size. */
+    scale(factor) {
+      this.size.valueAsNumber *= factor;
+    }
+    start(at_px) {
+      this.points = [at_px];
+      this.draw();
+    }
+    move(at_px) {
+      const last = this.points.at(-1);
+      if (!last || Math.hypot(at_px[0] - last[0], at_px[1] - last[1]) < this.radius_px / 6 || this.points.length >= MOST_POINTS) return;
+      this.points.push(at_px);
+      this.draw();
+    }
+    /** The ring of the brush under a pointer that only hovers. */
+    hover(at_px) {
+      if (this.points.length || this.waiting) return;
+      this.points = [at_px];
+      this.draw();
+      this.points = [];
+    }
+    async end() {
+      const photo = studio.told.photo;
+      const within = (value, most) => Number(Math.min(most, Math.max(0, value)).toFixed(1));
+      const points = this.points.map(([x, y]) => [within(x, photo.width_px), within(y, photo.height_px)]);
+      const front = byId2("brush_behind").getAttribute("aria-pressed") !== "true";
+      this.points = [];
+      this.waiting++;
+      studio.say("finding the edge ...", true);
+      const told = await studio.post("/paint", { points, radius: Math.max(1, this.radius_px), front });
+      if (told) studio.take(told);
+      if (--this.waiting) return;
+      this.drawn.replaceChildren();
+      if (told) studio.say("");
+    }
+    draw() {
+      const photo = studio.told?.photo;
+      if (!photo) return;
+      this.drawn.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
+      const line = document.createElementNS(this.drawn.namespaceURI, "path");
+      const data = this.points.map(([x, y], i) => `${i ? "L" : "M"}${x.toFixed(1)} ${y.toFixed(1)}`).join("");
+      line.setAttribute("d", this.points.length > 1 ? data : `${data}l0.01 0`);
+      line.setAttribute("stroke-width", String(2 * this.radius_px));
+      this.drawn.replaceChildren(line);
+    }
+  };
+
   // src/studio_ground.ts
   var ACROSS = 5;
   var WIDE = 40;
@@ -711,7 +797,7 @@
   var LOUPE_PX = 240;
   var DRAWN_AGAIN_MS = 900;
   var LOOKS_MS = 150;
-  var byId2 = (id) => document.getElementById(id);
+  var byId3 = (id) => document.getElementById(id);
   function scaledHeight(height, factor) {
     if (height === null) return null;
     const unit = height.endsWith("px") ? "px" : "";
@@ -719,11 +805,12 @@
   }
   var within180 = (turn_deg) => ((turn_deg + 180) % 360 + 360) % 360 - 180;
   var PictureStage = class {
-    stage = byId2("stage");
-    picture = byId2("picture");
-    before = byId2("before");
-    ground = byId2("ground");
-    loupe = byId2("loupe");
+    stage = byId3("stage");
+    picture = byId3("picture");
+    before = byId3("before");
+    ground = byId3("ground");
+    loupe = byId3("loupe");
+    brush = new Brush();
     photoName = "";
     hint = "";
     from = null;
@@ -732,7 +819,7 @@
     looking;
     quiet;
     constructor() {
-      new ResizeObserver(() => this.fit()).observe(byId2("room"));
+      new ResizeObserver(() => this.fit()).observe(byId3("room"));
       studio.addEventListener("told", () => this.fit());
       studio.addEventListener("state", () => this.mark());
       studio.addEventListener("picture", (event) => this.show(event.detail));
@@ -744,9 +831,9 @@
     fit() {
       const photo = studio.told?.photo ?? null;
       this.stage.hidden = !photo;
-      byId2("welcome").hidden = Boolean(photo);
+      byId3("welcome").hidden = Boolean(photo);
       if (!photo) return;
-      const room = byId2("room").getBoundingClientRect();
+      const room = byId3("room").getBoundingClientRect();
       const scale = Math.min(room.width / photo.width_px, room.height / photo.height_px);
       this.stage.style.width = `${photo.width_px * scale}px`;
       this.stage.style.height = `${photo.height_px * scale}px`;
@@ -764,6 +851,7 @@
     next() {
       const [told, state] = [studio.told, studio.state];
       if (told?.busy) return `${told.busy} ...`;
+      if (this.brush.on && !state?.matte) return "Paint over what is in front of the object; the edge snaps to the picture's";
       if (this.hint) return this.hint;
       if (!told?.photo || !state) return "";
       return state.object ? state.at_px ? "" : "Click where the object is to stand" : "Choose an object, or drop a GLB file";
@@ -784,9 +872,9 @@
     mark() {
       const [photo, state] = [studio.told?.photo ?? null, studio.state];
       const ground = groundOf(photo, state);
-      const wanted = byId2("grid").getAttribute("aria-pressed") === "true";
+      const wanted = byId3("grid").getAttribute("aria-pressed") === "true";
       this.stage.classList.toggle("placed", Boolean(state?.at_px));
-      const badge = byId2("badge");
+      const badge = byId3("badge");
       badge.textContent = this.next();
       badge.hidden = !badge.textContent;
       this.ground.replaceChildren();
@@ -800,7 +888,7 @@
         this.words(`one square: ${ground.cell_m} m`, photo.width_px * 0.015, photo.height_px * 0.985, photo.width_px / this.stage.clientWidth);
       }
       if (photo && !studio.isComplete && this.before.complete && this.before.naturalWidth) this.showPhotograph();
-      const box = byId2("box");
+      const box = byId3("box");
       const sides = studio.isComplete ? this.boxOf(state.before.length) : null;
       box.hidden = !sides;
       if (sides) {
@@ -862,28 +950,35 @@
         tap: (x, y) => this.tapped(x, y),
         twice: (x, y) => this.tapped(x, y),
         dragStart: (x, y) => {
+          if (this.brush.on) return this.brush.start(this.pixel(x, y));
           if (this.loupe.hidden) this.chose(x, y);
           this.from = studio.state?.at_px ?? this.inside(this.pixel(x, y));
           this.moved = [0, 0];
           this.stage.classList.add("dragging");
         },
-        drag: (_x, _y, dx, dy) => {
+        drag: (x, y, dx, dy) => {
+          if (this.brush.on) return this.brush.move(this.pixel(x, y));
           if (!this.from || !studio.state?.object || !this.loupe.hidden) return;
           const scale = studio.told.photo.width_px / this.stage.clientWidth;
           this.moved = [this.moved[0] + dx * scale, this.moved[1] + dy * scale];
           studio.change({ at_px: this.inside([this.from[0] + this.moved[0], this.from[1] + this.moved[1]]) });
         },
         dragEnd: () => {
+          if (this.brush.on) return void this.brush.end();
           this.from = null;
           this.stage.classList.remove("dragging");
           void studio.commit();
         },
-        pinch: (factor, _x, _y, _dx, _dy, turn_deg) => this.shape(factor, turn_deg)
+        pinch: (factor, _x, _y, _dx, _dy, turn_deg) => this.brush.on ? this.brush.scale(factor) : this.shape(factor, turn_deg)
       });
     }
     tapped(x, y) {
       this.stage.focus();
       if (!studio.told?.photo) return;
+      if (this.brush.on) {
+        this.brush.start(this.pixel(x, y));
+        return void this.brush.end();
+      }
       if (this.stage.classList.contains("focusing")) return this.focusAt(x, y);
       if (this.chose(x, y)) return void studio.commit();
       if (!studio.state?.object) return studio.say("choose an object first: in the list at the right, or drop a GLB file");
@@ -909,7 +1004,7 @@
     focusAt(x, y) {
       const photo = studio.told.photo;
       const at_px = this.inside(this.pixel(x, y));
-      byId2("focus_here").click();
+      byId3("focus_here").click();
       if (photo.has_depth) return void studio.commit({ focus_at_px: at_px, focus_m: null });
       const ground = groundOf(photo, studio.state);
       if (!ground) return studio.say("the plain ground has no distance to focus on: turn Plain off, or type the metres");
@@ -938,7 +1033,8 @@
         event.preventDefault();
       });
       document.addEventListener("keydown", (event) => {
-        if (event.key === "Escape" && this.stage.classList.contains("focusing")) byId2("focus_here").click();
+        const tool = this.brush.on ? "brush" : this.stage.classList.contains("focusing") ? "focus_here" : null;
+        if (event.key === "Escape" && tool) byId3(tool).click();
         if (!(event.ctrlKey || event.metaKey) || event.target.matches?.("input[type=text], input[type=number]")) return;
         const key = event.key.toLowerCase();
         if (key !== "z" && key !== "y") return;
@@ -948,7 +1044,7 @@
     }
     buttons() {
       const pressed = (id, told) => {
-        const button = byId2(id);
+        const button = byId3(id);
         button.addEventListener("click", () => {
           const on = button.getAttribute("aria-pressed") !== "true";
           button.setAttribute("aria-pressed", String(on));
@@ -961,8 +1057,11 @@
         studio.say(on ? "click what is to be in focus: the object, or a place on the ground" : "", on);
       });
       pressed("magnify", (on) => this.loupe.hidden = !on);
-      this.stage.addEventListener("pointermove", (event) => !this.loupe.hidden && this.magnify(event));
-      const hold = byId2("hold_before");
+      this.stage.addEventListener("pointermove", (event) => {
+        if (!this.loupe.hidden) this.magnify(event);
+        if (this.brush.on && studio.told?.photo) this.brush.hover(this.pixel(event.clientX, event.clientY));
+      });
+      const hold = byId3("hold_before");
       const show = (on) => {
         this.before.hidden = !on;
       };

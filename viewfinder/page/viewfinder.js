@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 0159210b49709554ee65b35c4c49fe48bb470f30ac99bb89b9b3383f8c08c33b
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 3aa1243704ee511161552ceefdc526557004825fbd4f5c8c260231d5c229567c
 "use strict";
 (() => {
   // src/model.ts

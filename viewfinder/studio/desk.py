@@ -12,10 +12,11 @@ from mrbokeh.system.channel import apart, say
 from mrbokeh.system.errors import InputError
 from viewfinder.studio.project import Project
 from viewfinder.studio.saving import Saves
-from viewfinder.studio.state import StudioState, state_of
+from viewfinder.studio.state import Stroke, StudioState, state_of
 
 if TYPE_CHECKING:
     from mrbokeh.solving.solved_camera import SolvedCamera
+    from viewfinder.studio.brush import Brush
     from viewfinder.studio.photograph import OpenedPhotograph
 
 _log = logging.getLogger(__name__)
@@ -41,6 +42,8 @@ class Desk:
         self._opened: dict[tuple[Path | None, Path | None], OpenedPhotograph] = {}
         self._cameras: dict[Path, dict[str, Any]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
+        self._strokes = asyncio.Lock()
+        self._brush: tuple[OpenedPhotograph, Brush] | None = None
 
     @property
     def state(self) -> StudioState:
@@ -102,6 +105,7 @@ class Desk:
             "lens": [*self.project.lenses],
             "photo": [self.state.photo],
             "depth": [self.state.depth],
+            "matte": [self.state.matte],
             "camera": [self.state.camera, Path(found) if found else None],
         }
 
@@ -122,6 +126,24 @@ class Desk:
         self.project.add(state.with_object(Path(path), beside_px))
         self._keep()
         await self._complete()
+
+    async def paint(self, stroke: Stroke) -> None:
+        """Add a stroke of the brush to what is told to be in front; strokes come one after the other. Raises InputError."""
+        from viewfinder.studio.brush import Brush
+
+        async with self._strokes:
+            opened, state = self.photograph, self.state
+            if opened is None:
+                raise InputError("there is no photograph to paint on yet: drop one on the page")
+            if self._brush is None or self._brush[0] is not opened:
+                self._brush = opened, Brush(opened.path, has_depth=opened.has_depth)
+            png = await asyncio.to_thread(self._brush[1].matte, state.matte, stroke)
+            self.uploads.mkdir(parents=True, exist_ok=True)
+            path = _free(self.uploads / f"{opened.path.stem}_in_front.png")
+            await asyncio.to_thread(path.write_bytes, png)
+            if self.photograph is opened:
+                self.project.add(replace(self.state, matte=_short(path)))
+                self._keep()
 
     async def step(self, by: Any) -> None:
         """Undo or redo."""

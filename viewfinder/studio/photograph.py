@@ -4,6 +4,7 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Float32
 
@@ -11,7 +12,7 @@ from mrbokeh.commands._composite_layers import held_upright
 from mrbokeh.commands._composite_options import CompositeOptions
 from mrbokeh.commands._insertion_options import focused_at_pixel, require_one_focus
 from mrbokeh.commands._level_ground import HIGH_SHARE, on_level_ground, usual_tilt_rad, with_camera_of_file
-from mrbokeh.compositing.plate import HeldLens, LensWishes, Plate, held_lens, phone_photo, photograph_plate, shrunk, with_depth
+from mrbokeh.compositing.plate import HeldLens, LensWishes, Plate, held_lens, phone_photo, photograph_plate, read_matte, shrunk, with_depth
 from mrbokeh.compositing.plate_look.finishing import Finishing
 from mrbokeh.depth.depth_map import DepthSettings
 from mrbokeh.depth.phone_depth import PhonePhoto
@@ -73,6 +74,8 @@ class OpenedPhotograph:
         lens = lens and options.facts.on(lens, renderer)
         stated, guessing = {} if lens else options.facts.given, not options.standing.plain
         small, focus_at = self._at(most_px), options.optics.focus_at
+        if (matte := options.taken.matte) is not None:
+            small = replace(small, near_alpha=_matte_of(matte, modified_s(matte), small.rgb.shape[1::-1]))
         focus_m = options.optics.focus if focus_at is None else 1.0
         held = held_lens(self.path, self.told, self.phone, LensWishes(lens, focus_m, stated, guessing))
         plate = _with_lens(small, held)
@@ -146,6 +149,12 @@ def _with_lens(plate: Plate, held: HeldLens) -> Plate:
 def _lens_of(path: Path | None, _changed_s: float) -> tuple[Lens | None, Renderer]:
     """Return lens and renderer of a lens file, read again when it changed."""
     return lens_and_renderer(path, None)
+
+
+@lru_cache(maxsize=4)
+def _matte_of(path: Path, _changed_s: float, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
+    """Return a matte of some size, read again when it changed."""
+    return np.asarray(cv2.resize(read_matte(path), size_px, interpolation=cv2.INTER_AREA), np.float32)
 
 
 def solved(photograph: Photograph) -> SolvedCamera:

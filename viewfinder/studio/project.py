@@ -14,7 +14,7 @@ FORMAT, VERSION = "mrbokeh studio", 1
 _EXPECTED = "a project file of `mrbokeh studio`"
 _MOST_STORED = 500
 """States of the history that a file keeps: half a megabyte; while the studio runs there is no limit."""
-_PATHS = ("photo", "depth", "object", "lens", "camera")
+_PATHS = ("photo", "depth", "matte", "object", "lens", "camera")
 
 
 @dataclass

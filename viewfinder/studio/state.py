@@ -32,6 +32,7 @@ class Placed:
 class StudioState:
     """State of the studio; None leaves a thing to the command's own default.
 
+    matte: what of the photograph the brush says is in front.
     object, at_px, height, turn_deg: of the chosen object; before, after: those that come before and after it in the command line.
     at_px: where it stands, in pixels of the whole photograph. height: metres such as "0.3", or pixels such as "120px". focus_at_px: the
     pixel that is in focus, where the photograph has depth; focus_m otherwise. sun_deg: where the main light comes from, degrees to the
@@ -41,6 +42,7 @@ class StudioState:
 
     photo: Path | None = None
     depth: Path | None = None
+    matte: Path | None = None
     object: Path | None = None
     lens: Path | None = None
     camera: Path | None = None
@@ -115,6 +117,25 @@ def state_of(document: Any) -> StudioState:
     return state
 
 
+@dataclass(frozen=True)
+class Stroke:
+    """Line of a brush. points_px: x, y in pixels of the photograph. radius_px: of the brush. is_front: what it marks is in front."""
+
+    points_px: tuple[Pair, ...]
+    radius_px: float
+    is_front: bool
+
+
+def stroke_of(document: Mapping[str, Any]) -> Stroke:
+    """Return the stroke of a page's message. Raises InputError that names the first value that cannot be meant."""
+    points = document.get("points")
+    if not isinstance(points, list) or not 0 < len(points) <= _MOST_POINTS:
+        raise InputError(f"expected the points of a stroke as a list of 1 to {_MOST_POINTS}, got {_shown(points)}")
+    within = _pair(_PIXELS, _PIXELS)
+    line = tuple(within(f"points[{number}]", each) for number, each in enumerate(points))
+    return Stroke(line, _number(1.0, _PIXELS[1])("radius", document.get("radius")), _flag("front", document.get("front")))
+
+
 def _path(name: str, value: Any) -> Path:
     if not isinstance(value, str) or not value or "\0" in value or len(value) > 4096:
         raise InputError(f"expected {name} to be the name of a file, got {_shown(value)}")
@@ -183,10 +204,11 @@ def _shown(value: Any) -> str:
     return repr(value)[:60]
 
 
-_PIXELS, _MOST_OBJECTS = (0.0, 200_000.0), 50
+_PIXELS, _MOST_OBJECTS, _MOST_POINTS = (0.0, 200_000.0), 50, 2000
 _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "photo": _path,
     "depth": _path,
+    "matte": _path,
     "object": _path,
     "lens": _path,
     "camera": _path,

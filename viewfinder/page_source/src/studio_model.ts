@@ -15,6 +15,7 @@ export interface Placed {
 /** The state as the server keeps it; null leaves a thing to the command's own default. Object, place, height and turn are the chosen one's. */
 export interface State {
   photo: string | null;
+  matte: string | null;
   object: string | null;
   lens: string | null;
   camera: string | null;

@@ -1,5 +1,6 @@
 // The picture: fitted to the window, with the ground over it, and everything that hands do on it.
 import { listen } from "./gestures";
+import { Brush } from "./studio_brush";
 import { groundOf } from "./studio_ground";
 import { type Box, type Pair, studio } from "./studio_model";
 
@@ -26,6 +27,7 @@ export class PictureStage {
   private readonly before = byId<HTMLImageElement>("before");
   private readonly ground = byId<SVGSVGElement>("ground");
   private readonly loupe = byId<HTMLCanvasElement>("loupe");
+  private readonly brush = new Brush();
   private photoName = "";
   private hint = "";
   private from: Pair | null = null;
@@ -69,6 +71,7 @@ export class PictureStage {
   private next(): string {
     const [told, state] = [studio.told, studio.state];
     if (told?.busy) return `${told.busy} ...`;
+    if (this.brush.on && !state?.matte) return "Paint over what is in front of the object; the edge snaps to the picture's";
     if (this.hint) return this.hint;
     if (!told?.photo || !state) return "";
     return state.object ? (state.at_px ? "" : "Click where the object is to stand") : "Choose an object, or drop a GLB file";
@@ -177,12 +180,14 @@ export class PictureStage {
       tap: (x, y) => this.tapped(x, y),
       twice: (x, y) => this.tapped(x, y),
       dragStart: (x, y) => {
+        if (this.brush.on) return this.brush.start(this.pixel(x, y));
         if (this.loupe.hidden) this.chose(x, y);
         this.from = studio.state?.at_px ?? this.inside(this.pixel(x, y));
         this.moved = [0, 0];
         this.stage.classList.add("dragging");
       },
-      drag: (_x, _y, dx, dy) => {
+      drag: (x, y, dx, dy) => {
+        if (this.brush.on) return this.brush.move(this.pixel(x, y));
         // Under the loupe a finger looks, and moves nothing.
         if (!this.from || !studio.state?.object || !this.loupe.hidden) return;
         const scale = studio.told!.photo!.width_px / this.stage.clientWidth;
@@ -190,17 +195,22 @@ export class PictureStage {
         studio.change({ at_px: this.inside([this.from[0] + this.moved[0], this.from[1] + this.moved[1]]) });
       },
       dragEnd: () => {
+        if (this.brush.on) return void this.brush.end();
         this.from = null;
         this.stage.classList.remove("dragging");
         void studio.commit();
       },
-      pinch: (factor, _x, _y, _dx, _dy, turn_deg) => this.shape(factor, turn_deg),
+      pinch: (factor, _x, _y, _dx, _dy, turn_deg) => (this.brush.on ? this.brush.scale(factor) : this.shape(factor, turn_deg)),
     });
   }
 
   private tapped(x: number, y: number): void {
     this.stage.focus();
     if (!studio.told?.photo) return;
+    if (this.brush.on) {
+      this.brush.start(this.pixel(x, y));
+      return void this.brush.end();
+    }
     if (this.stage.classList.contains("focusing")) return this.focusAt(x, y);
     if (this.chose(x, y)) return void studio.commit();
     if (!studio.state?.object) return studio.say("choose an object first: in the list at the right, or drop a GLB file");
@@ -259,7 +269,8 @@ export class PictureStage {
       event.preventDefault();
     });
     document.addEventListener("keydown", (event) => {
-      if (event.key === "Escape" && this.stage.classList.contains("focusing")) byId<HTMLElement>("focus_here").click();
+      const tool = this.brush.on ? "brush" : this.stage.classList.contains("focusing") ? "focus_here" : null;
+      if (event.key === "Escape" && tool) byId<HTMLElement>(tool).click();
       if (!(event.ctrlKey || event.metaKey) || (event.target as Element).matches?.("input[type=text], input[type=number]")) return;
       const key = event.key.toLowerCase();
       if (key !== "z" && key !== "y") return;
@@ -283,7 +294,10 @@ export class PictureStage {
       studio.say(on ? "click what is to be in focus: the object, or a place on the ground" : "", on);
     });
     pressed("magnify", (on) => (this.loupe.hidden = !on));
-    this.stage.addEventListener("pointermove", (event) => !this.loupe.hidden && this.magnify(event));
+    this.stage.addEventListener("pointermove", (event) => {
+      if (!this.loupe.hidden) this.magnify(event);
+      if (this.brush.on && studio.told?.photo) this.brush.hover(this.pixel(event.clientX, event.clientY));
+    });
     const hold = byId<HTMLElement>("hold_before");
     const show = (on: boolean): void => {
       this.before.hidden = !on;
