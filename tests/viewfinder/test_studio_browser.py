@@ -207,6 +207,34 @@ async def test_two_fingers_scale_and_turn_and_the_wheel_too(tmp_path: Path) -> N
         assert float(made.desk.state.height or 0) == pytest.approx(1.5 * high / np.e, rel=0.06)
 
 
+@pytest.mark.parametrize("size_px", [DESK, UPRIGHT], ids=["desk", "upright"])
+async def test_what_is_in_front_is_painted(tmp_path: Path, size_px: tuple[int, int]) -> None:
+    """A dark tile of the floor is painted over the cake; then a smaller brush says that it is behind, and both are undone."""
+    async with opened(tmp_path, size_px) as (page, made):
+        await placed(page, made)
+        await page.tap("#brush")
+        assert not await page.value("document.getElementById('brush_row').hidden")
+        assert "paint over" in await page.value(MESSAGE)
+        left, top, width, height = await page.box("#stage")
+        await dragged(page, (left + 0.45 * width, top + 0.7 * height), (0.1 * width, 0.0), mouse=size_px == DESK)
+        await page.comes_true("studio.told.state.matte !== null && !studio.isChanging", 30.0)
+        await page.comes_true("!document.getElementById('matte').hidden && document.getElementById('matte').naturalWidth > 0")
+        first = made.desk.state
+        assert first.at_px == (0.5 * WIDTH, 0.8 * HEIGHT) and first.matte is not None, "the object stays"
+        await page.tap("#brush_behind")
+        await page.send("Input.dispatchMouseEvent", type="mouseWheel", x=left + width / 2, y=top + height / 2, deltaX=0, deltaY=200)
+        await page.comes_true("document.getElementById('brush_size').valueAsNumber < 35")
+        await page.tap("#stage", 0.5, 0.7)
+        await page.comes_true(f"studio.told.state.matte !== '{first.matte}'", 30.0)
+        await page.tap("#undo")
+        await page.comes_true(f"studio.told.state.matte === '{first.matte}'")
+        await pressed(page, "Escape")
+        await page.comes_true("document.getElementById('matte').hidden && document.getElementById('brush_row').hidden")
+        await page.comes_true(RESTS, 60.0)
+        assert "--matte" in await page.value("document.getElementById('command').textContent")
+        assert page.errors == []
+
+
 async def test_light_lens_and_before_are_shown(tmp_path: Path) -> None:
     photo = write_floor(tmp_path / "floor.png")
     async with opened(tmp_path, DESK, StudioState(photo=photo, pitch_deg=0.0)) as (page, made):
@@ -262,6 +290,7 @@ async def test_the_page_is_accessible(tmp_path: Path, size_px: tuple[int, int]) 
     async with opened(tmp_path, size_px) as (page, made):
         await placed(page, made)
         await page.value("document.querySelectorAll('details').forEach((each) => (each.open = true))")
+        await page.tap("#brush")
         await page.value(AXE.read_text() + "; 0")
         found = await page.value(
             "axe.run(document, {runOnly: ['wcag2a', 'wcag2aa', 'wcag21a', 'wcag21aa']})"
@@ -275,7 +304,7 @@ async def test_the_page_is_accessible(tmp_path: Path, size_px: tuple[int, int]) 
             reached.add(
                 await page.value("document.activeElement.id || document.activeElement.dataset.format || document.activeElement.tagName")
             )
-        wanted = {"stage", "undo", "focus_here", "grid", "hold_before", "magnify", "object", "height", "turn", "focus", "f_number"}
+        wanted = {"stage", "undo", "focus_here", "grid", "hold_before", "magnify", "brush", "object", "height", "turn", "focus", "f_number"}
         wanted |= {"sun_right", "sun_above", "exposure", "shadow", "matched", "pitch", "camera_height", "png", "copy", "open_photo"}
         assert wanted <= reached, wanted - reached
 

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 3aa1243704ee511161552ceefdc526557004825fbd4f5c8c260231d5c229567c
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 29160b685e7406a81984ad791ac9dded4f1ef21e835f8058a6af0f9f23a33b2e
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 3aa1243704ee511161552ceefdc526557004825fbd4f5c8c260231d5c229567c
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 29160b685e7406a81984ad791ac9dded4f1ef21e835f8058a6af0f9f23a33b2e
 "use strict";
 (() => {
   // src/model.ts
@@ -594,6 +594,7 @@
       const button = byId2("brush");
       button.addEventListener("click", () => {
         button.setAttribute("aria-pressed", String(!this.on));
+        studio.say(this.on ? "paint over what is in front of the object: the edge snaps to the picture's" : "", this.on);
         this.show();
       });
       const behind = byId2("brush_behind");
@@ -851,7 +852,6 @@
     next() {
       const [told, state] = [studio.told, studio.state];
       if (told?.busy) return `${told.busy} ...`;
-      if (this.brush.on && !state?.matte) return "Paint over what is in front of the object; the edge snaps to the picture's";
       if (this.hint) return this.hint;
       if (!told?.photo || !state) return "";
       return state.object ? state.at_px ? "" : "Click where the object is to stand" : "Choose an object, or drop a GLB file";

@@ -71,7 +71,6 @@ export class PictureStage {
   private next(): string {
     const [told, state] = [studio.told, studio.state];
     if (told?.busy) return `${told.busy} ...`;
-    if (this.brush.on && !state?.matte) return "Paint over what is in front of the object; the edge snaps to the picture's";
     if (this.hint) return this.hint;
     if (!told?.photo || !state) return "";
     return state.object ? (state.at_px ? "" : "Click where the object is to stand") : "Choose an object, or drop a GLB file";
