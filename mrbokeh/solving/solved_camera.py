@@ -98,6 +98,13 @@ class SolvedCamera:
         """Return the camera with the width of its sensor along the rows of the picture, None if it is unknown."""
         return replace(self, sensor_width_mm=width_mm)
 
+    def resized(self, width_px: int, height_px: int) -> "SolvedCamera":
+        """Return the camera of the same picture in another size; its sizes in pixels go by the width."""
+        named = ("focal_length_px", "focal_length_sd_px", "solved_focal_length_px", "solved_focal_length_sd_px")
+        factor = width_px / self.width_px
+        told = {name: None if getattr(self, name) is None else factor * getattr(self, name) for name in named}
+        return replace(self, width_px=width_px, height_px=height_px, segments_px=factor * self.segments_px, **told)
+
     def camera(self) -> Camera:
         """Return the pinhole, which stands camera_height_m above the world's origin."""
         pose = np.eye(4)

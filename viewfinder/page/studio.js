@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 29160b685e7406a81984ad791ac9dded4f1ef21e835f8058a6af0f9f23a33b2e
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: a702a38abe6da1bcf4a2c19db46ba8af3a5ccc0a90c488e6ff5ac984f4a099b3
 "use strict";
 (() => {
   // src/model.ts
@@ -668,6 +668,89 @@
     }
   };
 
+  // src/studio_lines.ts
+  var byId3 = (id) => document.getElementById(id);
+  var AXES = ["y", "x", "z"];
+  var NEAR = 16;
+  var SHORTEST = 12;
+  var Lines = class {
+    drawn = byId3("lines");
+    axis = "y";
+    lines = null;
+    /** The end that is dragged: line, and 0 or 2 for its first coordinate. */
+    end = [0, 2];
+    constructor() {
+      const button = byId3("draw_lines");
+      button.addEventListener("click", () => {
+        button.setAttribute("aria-pressed", String(!this.on));
+        studio.say(this.on ? "draw along two edges of one direction and one of another: the ground follows; tap a line to remove it" : "", this.on);
+        this.draw();
+      });
+      for (const axis of AXES) {
+        byId3(`axis_${axis}`).addEventListener("click", () => {
+          this.axis = axis;
+          for (const each of AXES) byId3(`axis_${each}`).setAttribute("aria-pressed", String(each === axis));
+        });
+      }
+      byId3("lines_clear").addEventListener("click", () => void studio.commit({ lines: [] }));
+      studio.addEventListener("state", () => this.draw());
+      studio.addEventListener("told", () => this.on && studio.state?.lines.length && studio.say(studio.told?.camera?.told ?? "", true));
+    }
+    get on() {
+      return byId3("draw_lines").getAttribute("aria-pressed") === "true";
+    }
+    /** Take the near end of a line of the chosen direction, or begin a new line. px: pixels of the photograph in one of the window. */
+    start(at_px, px) {
+      this.lines = (studio.state?.lines ?? []).map((each) => [...each]);
+      const ends = this.lines.flatMap((each, line) => [0, 2].map((i) => ({ line, i, away: Math.hypot(each[i] - at_px[0], each[i + 1] - at_px[1]) })));
+      const nearest = ends.sort((one, other) => one.away - other.away).find((each) => this.lines[each.line][4] === this.axis);
+      if (nearest && nearest.away < NEAR * px) this.end = [nearest.line, nearest.i];
+      else this.end = [this.lines.push([at_px[0], at_px[1], at_px[0], at_px[1], this.axis]) - 1, 2];
+    }
+    move(at_px) {
+      const photo = studio.told?.photo;
+      const line = this.lines?.[this.end[0]];
+      if (!photo || !line) return;
+      const within = (value, most) => Number(Math.min(most, Math.max(0, value)).toFixed(1));
+      line[this.end[1]] = within(at_px[0], photo.width_px);
+      line[this.end[1] + 1] = within(at_px[1], photo.height_px);
+      this.draw();
+    }
+    stop(px) {
+      const lines = this.lines?.filter((each) => Math.hypot(each[2] - each[0], each[3] - each[1]) > SHORTEST * px);
+      this.lines = null;
+      if (lines) void studio.commit({ lines });
+    }
+    /** Remove the line under a finger. */
+    tap([x, y], px) {
+      const lines = studio.state?.lines ?? [];
+      const away = ([x1, y1, x2, y2]) => {
+        const along = Math.min(1, Math.max(0, ((x - x1) * (x2 - x1) + (y - y1) * (y2 - y1)) / Math.hypot(x2 - x1, y2 - y1) ** 2));
+        return Math.hypot(x1 + along * (x2 - x1) - x, y1 + along * (y2 - y1) - y);
+      };
+      const nearest = [...lines].sort((one, other) => away(one) - away(other))[0];
+      if (nearest && away(nearest) < NEAR * px) void studio.commit({ lines: lines.filter((each) => each !== nearest) });
+    }
+    draw() {
+      const photo = studio.told?.photo;
+      const lines = this.lines ?? studio.state?.lines ?? [];
+      byId3("lines_row").hidden = !this.on;
+      byId3("lines_clear").disabled = !lines.length;
+      this.drawn.replaceChildren();
+      if (!photo || !this.on) return;
+      this.drawn.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
+      const size = photo.width_px / this.drawn.clientWidth;
+      for (const [x1, y1, x2, y2, axis] of lines) {
+        const line = document.createElementNS(this.drawn.namespaceURI, "path");
+        const ring = (x, y) => `M${x - 5 * size} ${y}a${5 * size} ${5 * size} 0 1 0 ${10 * size} 0a${5 * size} ${5 * size} 0 1 0 ${-10 * size} 0`;
+        line.setAttribute("d", `M${x1} ${y1}L${x2} ${y2}${ring(x1, y1)}${ring(x2, y2)}`);
+        line.setAttribute("class", axis);
+        line.setAttribute("vector-effect", "non-scaling-stroke");
+        this.drawn.append(line);
+      }
+    }
+  };
+
   // src/studio_ground.ts
   var ACROSS = 5;
   var WIDE = 40;
@@ -798,7 +881,7 @@
   var LOUPE_PX = 240;
   var DRAWN_AGAIN_MS = 900;
   var LOOKS_MS = 150;
-  var byId3 = (id) => document.getElementById(id);
+  var byId4 = (id) => document.getElementById(id);
   function scaledHeight(height, factor) {
     if (height === null) return null;
     const unit = height.endsWith("px") ? "px" : "";
@@ -806,12 +889,13 @@
   }
   var within180 = (turn_deg) => ((turn_deg + 180) % 360 + 360) % 360 - 180;
   var PictureStage = class {
-    stage = byId3("stage");
-    picture = byId3("picture");
-    before = byId3("before");
-    ground = byId3("ground");
-    loupe = byId3("loupe");
+    stage = byId4("stage");
+    picture = byId4("picture");
+    before = byId4("before");
+    ground = byId4("ground");
+    loupe = byId4("loupe");
     brush = new Brush();
+    lines = new Lines();
     photoName = "";
     hint = "";
     from = null;
@@ -820,7 +904,7 @@
     looking;
     quiet;
     constructor() {
-      new ResizeObserver(() => this.fit()).observe(byId3("room"));
+      new ResizeObserver(() => this.fit()).observe(byId4("room"));
       studio.addEventListener("told", () => this.fit());
       studio.addEventListener("state", () => this.mark());
       studio.addEventListener("picture", (event) => this.show(event.detail));
@@ -832,9 +916,9 @@
     fit() {
       const photo = studio.told?.photo ?? null;
       this.stage.hidden = !photo;
-      byId3("welcome").hidden = Boolean(photo);
+      byId4("welcome").hidden = Boolean(photo);
       if (!photo) return;
-      const room = byId3("room").getBoundingClientRect();
+      const room = byId4("room").getBoundingClientRect();
       const scale = Math.min(room.width / photo.width_px, room.height / photo.height_px);
       this.stage.style.width = `${photo.width_px * scale}px`;
       this.stage.style.height = `${photo.height_px * scale}px`;
@@ -872,9 +956,9 @@
     mark() {
       const [photo, state] = [studio.told?.photo ?? null, studio.state];
       const ground = groundOf(photo, state);
-      const wanted = byId3("grid").getAttribute("aria-pressed") === "true";
+      const wanted = byId4("grid").getAttribute("aria-pressed") === "true";
       this.stage.classList.toggle("placed", Boolean(state?.at_px));
-      const badge = byId3("badge");
+      const badge = byId4("badge");
       badge.textContent = this.next();
       badge.hidden = !badge.textContent;
       this.ground.replaceChildren();
@@ -888,7 +972,7 @@
         this.words(`one square: ${ground.cell_m} m`, photo.width_px * 0.015, photo.height_px * 0.985, photo.width_px / this.stage.clientWidth);
       }
       if (photo && !studio.isComplete && this.before.complete && this.before.naturalWidth) this.showPhotograph();
-      const box = byId3("box");
+      const box = byId4("box");
       const sides = studio.isComplete ? this.boxOf(state.before.length) : null;
       box.hidden = !sides;
       if (sides) {
@@ -917,6 +1001,10 @@
       const box = this.stage.getBoundingClientRect();
       const photo = studio.told.photo;
       return [(x - box.left) / box.width * photo.width_px, (y - box.top) / box.height * photo.height_px];
+    }
+    /** Pixels of the photograph in one of the window. */
+    get px() {
+      return studio.told.photo.width_px / this.stage.clientWidth;
     }
     inside(at_px) {
       const photo = studio.told.photo;
@@ -951,6 +1039,7 @@
         twice: (x, y) => this.tapped(x, y),
         dragStart: (x, y) => {
           if (this.brush.on) return this.brush.start(this.pixel(x, y));
+          if (this.lines.on) return this.lines.start(this.pixel(x, y), this.px);
           if (this.loupe.hidden) this.chose(x, y);
           this.from = studio.state?.at_px ?? this.inside(this.pixel(x, y));
           this.moved = [0, 0];
@@ -958,13 +1047,14 @@
         },
         drag: (x, y, dx, dy) => {
           if (this.brush.on) return this.brush.move(this.pixel(x, y));
+          if (this.lines.on) return this.lines.move(this.pixel(x, y));
           if (!this.from || !studio.state?.object || !this.loupe.hidden) return;
-          const scale = studio.told.photo.width_px / this.stage.clientWidth;
-          this.moved = [this.moved[0] + dx * scale, this.moved[1] + dy * scale];
+          this.moved = [this.moved[0] + dx * this.px, this.moved[1] + dy * this.px];
           studio.change({ at_px: this.inside([this.from[0] + this.moved[0], this.from[1] + this.moved[1]]) });
         },
         dragEnd: () => {
           if (this.brush.on) return void this.brush.end();
+          if (this.lines.on) return this.lines.stop(this.px);
           this.from = null;
           this.stage.classList.remove("dragging");
           void studio.commit();
@@ -979,6 +1069,7 @@
         this.brush.start(this.pixel(x, y));
         return void this.brush.end();
       }
+      if (this.lines.on) return this.lines.tap(this.pixel(x, y), this.px);
       if (this.stage.classList.contains("focusing")) return this.focusAt(x, y);
       if (this.chose(x, y)) return void studio.commit();
       if (!studio.state?.object) return studio.say("choose an object first: in the list at the right, or drop a GLB file");
@@ -1004,7 +1095,7 @@
     focusAt(x, y) {
       const photo = studio.told.photo;
       const at_px = this.inside(this.pixel(x, y));
-      byId3("focus_here").click();
+      byId4("focus_here").click();
       if (photo.has_depth) return void studio.commit({ focus_at_px: at_px, focus_m: null });
       const ground = groundOf(photo, studio.state);
       if (!ground) return studio.say("the plain ground has no distance to focus on: turn Plain off, or type the metres");
@@ -1033,8 +1124,8 @@
         event.preventDefault();
       });
       document.addEventListener("keydown", (event) => {
-        const tool = this.brush.on ? "brush" : this.stage.classList.contains("focusing") ? "focus_here" : null;
-        if (event.key === "Escape" && tool) byId3(tool).click();
+        const tool = this.brush.on ? "brush" : this.lines.on ? "draw_lines" : this.stage.classList.contains("focusing") ? "focus_here" : null;
+        if (event.key === "Escape" && tool) byId4(tool).click();
         if (!(event.ctrlKey || event.metaKey) || event.target.matches?.("input[type=text], input[type=number]")) return;
         const key = event.key.toLowerCase();
         if (key !== "z" && key !== "y") return;
@@ -1044,7 +1135,7 @@
     }
     buttons() {
       const pressed = (id, told) => {
-        const button = byId3(id);
+        const button = byId4(id);
         button.addEventListener("click", () => {
           const on = button.getAttribute("aria-pressed") !== "true";
           button.setAttribute("aria-pressed", String(on));
@@ -1052,6 +1143,13 @@
         });
       };
       pressed("grid", () => this.mark());
+      const tools = ["focus_here", "brush", "draw_lines"];
+      for (const id of tools) {
+        byId4(id).addEventListener("click", () => {
+          const others = tools.filter((each) => each !== id && byId4(each).getAttribute("aria-pressed") === "true");
+          if (byId4(id).getAttribute("aria-pressed") === "true") others.forEach((each) => byId4(each).click());
+        });
+      }
       pressed("focus_here", (on) => {
         this.stage.classList.toggle("focusing", on);
         studio.say(on ? "click what is to be in focus: the object, or a place on the ground" : "", on);
@@ -1061,7 +1159,7 @@
         if (!this.loupe.hidden) this.magnify(event);
         if (this.brush.on && studio.told?.photo) this.brush.hover(this.pixel(event.clientX, event.clientY));
       });
-      const hold = byId3("hold_before");
+      const hold = byId4("hold_before");
       const show = (on) => {
         this.before.hidden = !on;
       };

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 29160b685e7406a81984ad791ac9dded4f1ef21e835f8058a6af0f9f23a33b2e
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: a702a38abe6da1bcf4a2c19db46ba8af3a5ccc0a90c488e6ff5ac984f4a099b3
 "use strict";
 (() => {
   // src/model.ts

@@ -12,7 +12,7 @@ from mrbokeh.system.channel import apart, say
 from mrbokeh.system.errors import InputError
 from viewfinder.studio.project import Project
 from viewfinder.studio.saving import Saves
-from viewfinder.studio.state import Stroke, StudioState, state_of
+from viewfinder.studio.state import DrawnLine, Stroke, StudioState, state_of
 
 if TYPE_CHECKING:
     from mrbokeh.solving.solved_camera import SolvedCamera
@@ -25,6 +25,7 @@ LARGEST = {"photo": 300 << 20, "object": 200 << 20}
 """Bytes of what is dropped on the page."""
 _OBJECTS = (".glb",)
 _KEPT_PHOTOGRAPHS = 2
+_TELL_TILT = "set below how far the camera looks down, or draw lines along edges"
 _BESIDE = 0.15
 """How far beside another an object is added, in widths of the photograph."""
 
@@ -41,6 +42,7 @@ class Desk:
         self._changed = asyncio.Event()
         self._opened: dict[tuple[Path | None, Path | None], OpenedPhotograph] = {}
         self._cameras: dict[Path, dict[str, Any]] = {}
+        self._drawn: dict[tuple[DrawnLine, ...], dict[str, Any]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._strokes = asyncio.Lock()
         self._brush: tuple[OpenedPhotograph, Brush] | None = None
@@ -111,9 +113,31 @@ class Desk:
 
     async def change(self, changes: Any) -> None:
         """Take changes of a page over, complete what follows from them, and keep the project."""
+        before = self.state.lines
         self.project.add(self.changed_state(changes))
         self._keep()
+        if self.state.lines != before:
+            await self._by_hand()
         await self._complete()
+
+    async def _by_hand(self) -> None:
+        """Give the state the camera of its drawn lines, or without any that of the picture's own."""
+        state, opened = self.state, self.photograph
+        if opened is None or state.photo is None:
+            return
+        found = self._cameras.get(state.photo, {})
+        if state.lines:
+            file = _free(self.uploads / f"{state.photo.stem}.drawn.camera.json")
+            self.busy = "looking for the camera of the lines"
+            self.tell_all()
+            try:
+                found = self._drawn[state.lines] = await asyncio.to_thread(_camera_of_lines, opened, state.lines, file)
+            finally:
+                self.busy = ""
+        if self.state == state:
+            camera = Path(found["file"]) if found.get("file") and (state.lines or found.get("is_sure")) else None
+            self.project.amend(lambda state: replace(state, camera=camera, pitch_deg=None))
+        self._keep()
 
     async def add_object(self, path: Any) -> None:
         """Add an object that the page was offered, beside the chosen one. Raises InputError."""
@@ -209,7 +233,9 @@ class Desk:
             self.busy = "looking for the camera in the picture's lines" if path not in self._cameras else ""
             self.tell_all()
             if path not in self._cameras:
-                self._cameras[path] = await asyncio.to_thread(_camera_found, camera, self.uploads / f"{path.stem}.camera.json")
+                self._cameras[path] = await asyncio.to_thread(
+                    _camera_found, camera, self.uploads / f"{path.stem}.camera.json", "picture's straight", _TELL_TILT
+                )
                 self._take_camera(path)
             await self._complete()
         except InputError as error:
@@ -241,6 +267,8 @@ class Desk:
 
     def camera_told(self) -> dict[str, Any] | None:
         """Return what the picture's lines tell of its camera, or why they do not; None while they are looked at."""
+        if self.state.lines:
+            return self._drawn.get(self.state.lines, {"told": "The camera is that of the drawn lines.", "file": str(self.state.camera)})
         return None if self.state.photo is None else self._cameras.get(self.state.photo)
 
 
@@ -273,17 +301,33 @@ def placed_state(state: StudioState, opened: "OpenedPhotograph") -> StudioState:
             return state
 
 
-def _camera_found(look: "Callable[[], SolvedCamera | str]", path: Path) -> dict[str, Any]:
-    """Look for a camera; return what is told of it, and its file. is_sure: whether it is taken without being asked for."""
+def _camera_of_lines(opened: "OpenedPhotograph", lines: tuple[DrawnLine, ...], path: Path) -> dict[str, Any]:
+    """Return what is told of the camera of drawn lines, and its file where they tell it."""
+    from viewfinder.studio.photograph import solved_by_hand
+
+    def look() -> "SolvedCamera | str":
+        try:
+            return solved_by_hand(opened, lines)
+        except InputError as error:
+            return str(error)
+
+    return _camera_found(look, path, "drawn", "draw more lines along edges, upright and level ones")
+
+
+def _camera_found(look: "Callable[[], SolvedCamera | str]", path: Path, kind: str, advice: str) -> dict[str, Any]:
+    """Look for a camera; return what is told of it, and its file. is_sure: whether it is taken without being asked for.
+
+    kind: of the lines, in words. advice: what to do where they tell none.
+    """
     from mrbokeh.solving.solved_camera import LOW, write_solved_camera
 
     camera = look()
     if isinstance(camera, str):
-        return {"told": f"{camera.partition(': give ')[0]}: set below how far the camera looks down."}
+        return {"told": f"{camera.partition(': give ')[0]}: {advice}."}
     write_solved_camera(path, camera)
     sd = f" ± {camera.pitch_sd_deg:.1f}" if camera.pitch_sd_deg > 0.05 else ""
     way, rolled = "up" if camera.pitch_deg > 0 else "down", f", turned by {camera.roll_deg:.1f}°" if abs(camera.roll_deg) > 0.5 else ""
-    told = f"By the picture's straight lines the camera looks {way} by {abs(camera.pitch_deg):.1f}{sd}°{rolled}"
+    told = f"By the {kind} lines the camera looks {way} by {abs(camera.pitch_deg):.1f}{sd}°{rolled}"
     told += f", {camera.focal_length_35mm:.0f} mm on full frame ({camera.confidence} confidence)."
     return {"told": told, "file": str(_short(path)), "is_sure": camera.confidence != LOW}
 

@@ -1,5 +1,6 @@
 """OpenedPhotograph: a photograph read once, made smaller for previews, with the lens of any state and the camera that its lines tell."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
@@ -22,12 +23,12 @@ from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import lens_and_renderer
 from mrbokeh.scene.staging.scene_description import looking_down
 from mrbokeh.scene.staging.staged_scene import modified_s
-from mrbokeh.solving.solve_camera import solve_camera
+from mrbokeh.solving.solve_camera import Line, solve_camera
 from mrbokeh.solving.solved_camera import SolvedCamera
 from mrbokeh.stacks.photograph import Photograph, read_photograph
 from mrbokeh.system.errors import InputError
 from viewfinder.studio.command_line import options_of, preview_scale
-from viewfinder.studio.state import StudioState
+from viewfinder.studio.state import DrawnLine, StudioState
 
 MOST_PX = 1e6
 """Pixels of the largest preview."""
@@ -157,14 +158,25 @@ def _matte_of(path: Path, _changed_s: float, size_px: tuple[int, int]) -> Float3
     return np.asarray(cv2.resize(read_matte(path), size_px, interpolation=cv2.INTER_AREA), np.float32)
 
 
-def solved(photograph: Photograph) -> SolvedCamera:
-    """Return the camera that a photograph's lines tell, with the focal length that it states. Raises InputError if they do not tell."""
+def solved(photograph: Photograph, lines: Sequence[DrawnLine] = ()) -> SolvedCamera:
+    """Return the camera that a photograph's lines tell, with the focal length that it states; drawn ones decide. Raises InputError if
+    they do not tell.
+    """
     height_px, width_px = photograph.rgb.shape[:2]
     focal_px = None
     if photograph.focal_length_mm is not None and photograph.sensor_width_mm is not None:
         stated_px = photograph.focal_length_mm / photograph.sensor_width_mm * width_px
         focal_px = stated_px if 0.3 < stated_px / max(height_px, width_px) < 30.0 else None
-    return solve_camera(photograph.rgb, focal_px).of_sensor(photograph.sensor_width_mm)
+    told = [Line((x1, y1, x2, y2), axis) for x1, y1, x2, y2, axis in lines]
+    return solve_camera(photograph.rgb, focal_px, told).of_sensor(photograph.sensor_width_mm)
+
+
+def solved_by_hand(opened: OpenedPhotograph, lines: Sequence[DrawnLine]) -> SolvedCamera:
+    """Return the camera by lines that are drawn on a photograph, in its pixels. Raises InputError if they do not tell."""
+    width_px, _height_px = opened.size_px
+    scale = opened.plate.rgb.shape[1] / width_px
+    small = [(*(scale * each for each in (x1, y1, x2, y2)), axis) for x1, y1, x2, y2, axis in lines]
+    return solved(replace(opened.told, rgb=opened.plate.rgb), small).resized(*opened.size_px)
 
 
 def placed(state: StudioState, opened: OpenedPhotograph) -> StudioState:

@@ -9,6 +9,8 @@ from typing import Any
 from mrbokeh.system.errors import InputError
 
 Pair = tuple[float, float]
+DrawnLine = tuple[float, float, float, float, str]
+"""Both ends of an edge in pixels, and its direction in the world: "y" upright, "x" and "z" the two level ones."""
 
 _DIGITS = 6
 """Significant digits of numbers: the command line shows them all, so that it makes the very same picture."""
@@ -32,12 +34,12 @@ class Placed:
 class StudioState:
     """State of the studio; None leaves a thing to the command's own default.
 
-    matte: what of the photograph the brush says is in front.
-    object, at_px, height, turn_deg: of the chosen object; before, after: those that come before and after it in the command line.
-    at_px: where it stands, in pixels of the whole photograph. height: metres such as "0.3", or pixels such as "120px". focus_at_px: the
-    pixel that is in focus, where the photograph has depth; focus_m otherwise. sun_deg: where the main light comes from, degrees to the
-    right of the view and above the horizon. camera: file of `mrbokeh capture solve`; pitch_deg comes before it. matched: black and grain
-    of the objects are those of the photograph. plain: guess neither light nor ground.
+    matte: what of the photograph the brush says is in front. object, at_px, height, turn_deg: of the chosen object; before, after: those
+    that come before and after it in the command line. at_px: where it stands, in pixels of the whole photograph. height: metres such as
+    "0.3", or pixels such as "120px". focus_at_px: the pixel that is in focus, where the photograph has depth; focus_m otherwise. sun_deg:
+    where the main light comes from, degrees to the right of the view and above the horizon. camera: file of `mrbokeh capture solve`;
+    pitch_deg comes before it. lines: drawn ones, by which it was solved. matched: black and grain of the objects are those of the
+    photograph. plain: guess neither light nor ground.
     """
 
     photo: Path | None = None
@@ -46,6 +48,7 @@ class StudioState:
     object: Path | None = None
     lens: Path | None = None
     camera: Path | None = None
+    lines: tuple[DrawnLine, ...] = ()
     at_px: Pair | None = None
     height: str | None = None
     turn_deg: float = 0.0
@@ -177,6 +180,21 @@ def _placed(name: str, value: Any) -> tuple[Placed, ...]:
     return tuple(placed)
 
 
+def _lines(name: str, value: Any) -> tuple[DrawnLine, ...]:
+    """Return lines that are drawn on the photograph."""
+    if not isinstance(value, list | tuple) or len(value) > _MOST_LINES:
+        raise InputError(f"expected {name} to be a list of at most {_MOST_LINES} lines, got {_shown(value)}")
+    pixel, lines = _number(*_PIXELS), []
+    for each in value:
+        if not isinstance(each, list | tuple) or len(each) != 5 or each[4] not in ("x", "y", "z"):
+            raise InputError(f"expected each of {name} as x1, y1, x2, y2 and its direction x, y or z, got {_shown(each)}")
+        x1, y1, x2, y2 = (pixel(name, one) for one in each[:4])
+        if math.hypot(x2 - x1, y2 - y1) < 1.0:
+            raise InputError(f"expected each of {name} between two pixels, got {_shown(each)}: draw along an edge")
+        lines.append((x1, y1, x2, y2, each[4]))
+    return tuple(lines)
+
+
 def _flag(name: str, value: Any) -> bool:
     if not isinstance(value, bool):
         raise InputError(f"expected {name} to be true or false, got {_shown(value)}")
@@ -204,7 +222,7 @@ def _shown(value: Any) -> str:
     return repr(value)[:60]
 
 
-_PIXELS, _MOST_OBJECTS, _MOST_POINTS = (0.0, 200_000.0), 50, 2000
+_PIXELS, _MOST_OBJECTS, _MOST_POINTS, _MOST_LINES = (0.0, 200_000.0), 50, 2000, 60
 _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "photo": _path,
     "depth": _path,
@@ -212,6 +230,7 @@ _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "object": _path,
     "lens": _path,
     "camera": _path,
+    "lines": _lines,
     "at_px": _pair(_PIXELS, _PIXELS),
     "height": _height,
     "turn_deg": _number(-100_000.0, 100_000.0),

@@ -4,6 +4,9 @@ import { sentenceOf } from "./server";
 
 export type Pair = [number, number];
 
+/** Both ends of an edge in pixels, and its direction in the world: y upright, x and z the two level ones. */
+export type DrawnLine = [number, number, number, number, "x" | "y" | "z"];
+
 /** An object that stands in the photograph. */
 export interface Placed {
   object: string;
@@ -19,6 +22,7 @@ export interface State {
   object: string | null;
   lens: string | null;
   camera: string | null;
+  lines: DrawnLine[];
   at_px: Pair | null;
   height: string | null;
   turn_deg: number;

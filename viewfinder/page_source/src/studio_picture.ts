@@ -1,6 +1,7 @@
 // The picture: fitted to the window, with the ground over it, and everything that hands do on it.
 import { listen } from "./gestures";
 import { Brush } from "./studio_brush";
+import { Lines } from "./studio_lines";
 import { groundOf } from "./studio_ground";
 import { type Box, type Pair, studio } from "./studio_model";
 
@@ -28,6 +29,7 @@ export class PictureStage {
   private readonly ground = byId<SVGSVGElement>("ground");
   private readonly loupe = byId<HTMLCanvasElement>("loupe");
   private readonly brush = new Brush();
+  private readonly lines = new Lines();
   private photoName = "";
   private hint = "";
   private from: Pair | null = null;
@@ -144,6 +146,11 @@ export class PictureStage {
     return [((x - box.left) / box.width) * photo.width_px, ((y - box.top) / box.height) * photo.height_px];
   }
 
+  /** Pixels of the photograph in one of the window. */
+  private get px(): number {
+    return studio.told!.photo!.width_px / this.stage.clientWidth;
+  }
+
   private inside(at_px: Pair): Pair {
     const photo = studio.told!.photo!;
     const ground = groundOf(photo, studio.state);
@@ -180,6 +187,7 @@ export class PictureStage {
       twice: (x, y) => this.tapped(x, y),
       dragStart: (x, y) => {
         if (this.brush.on) return this.brush.start(this.pixel(x, y));
+        if (this.lines.on) return this.lines.start(this.pixel(x, y), this.px);
         if (this.loupe.hidden) this.chose(x, y);
         this.from = studio.state?.at_px ?? this.inside(this.pixel(x, y));
         this.moved = [0, 0];
@@ -187,14 +195,15 @@ export class PictureStage {
       },
       drag: (x, y, dx, dy) => {
         if (this.brush.on) return this.brush.move(this.pixel(x, y));
+        if (this.lines.on) return this.lines.move(this.pixel(x, y));
         // Under the loupe a finger looks, and moves nothing.
         if (!this.from || !studio.state?.object || !this.loupe.hidden) return;
-        const scale = studio.told!.photo!.width_px / this.stage.clientWidth;
-        this.moved = [this.moved[0] + dx * scale, this.moved[1] + dy * scale];
+        this.moved = [this.moved[0] + dx * this.px, this.moved[1] + dy * this.px];
         studio.change({ at_px: this.inside([this.from[0] + this.moved[0], this.from[1] + this.moved[1]]) });
       },
       dragEnd: () => {
         if (this.brush.on) return void this.brush.end();
+        if (this.lines.on) return this.lines.stop(this.px);
         this.from = null;
         this.stage.classList.remove("dragging");
         void studio.commit();
@@ -210,6 +219,7 @@ export class PictureStage {
       this.brush.start(this.pixel(x, y));
       return void this.brush.end();
     }
+    if (this.lines.on) return this.lines.tap(this.pixel(x, y), this.px);
     if (this.stage.classList.contains("focusing")) return this.focusAt(x, y);
     if (this.chose(x, y)) return void studio.commit();
     if (!studio.state?.object) return studio.say("choose an object first: in the list at the right, or drop a GLB file");
@@ -268,7 +278,7 @@ export class PictureStage {
       event.preventDefault();
     });
     document.addEventListener("keydown", (event) => {
-      const tool = this.brush.on ? "brush" : this.stage.classList.contains("focusing") ? "focus_here" : null;
+      const tool = this.brush.on ? "brush" : this.lines.on ? "draw_lines" : this.stage.classList.contains("focusing") ? "focus_here" : null;
       if (event.key === "Escape" && tool) byId<HTMLElement>(tool).click();
       if (!(event.ctrlKey || event.metaKey) || (event.target as Element).matches?.("input[type=text], input[type=number]")) return;
       const key = event.key.toLowerCase();
@@ -288,6 +298,13 @@ export class PictureStage {
       });
     };
     pressed("grid", () => this.mark());
+    const tools = ["focus_here", "brush", "draw_lines"];
+    for (const id of tools) {
+      byId(id).addEventListener("click", () => {
+        const others = tools.filter((each) => each !== id && byId(each).getAttribute("aria-pressed") === "true");
+        if (byId(id).getAttribute("aria-pressed") === "true") others.forEach((each) => byId<HTMLElement>(each).click());
+      });
+    }
     pressed("focus_here", (on) => {
       this.stage.classList.toggle("focusing", on);
       studio.say(on ? "click what is to be in focus: the object, or a place on the ground" : "", on);

@@ -1,4 +1,8 @@
-"""The studio's brush: strokes snap to edges of the picture, mattes are as soft as that, and previews, loupe and command agree on them."""
+"""The studio's tools on the picture.
+
+Brush: strokes snap to edges of the picture, mattes are as soft as that, and previews, loupe and command agree on them. Lines: the camera
+follows them.
+"""
 
 from io import BytesIO
 from pathlib import Path
@@ -12,15 +16,17 @@ from mrbokeh.commands._composite_kept import KeptParts
 from mrbokeh.compositing.plate import read_matte
 from mrbokeh.images.color import srgb_codes
 from mrbokeh.images.image_io import write_image
+from mrbokeh.solving.solved_camera import read_solved_camera
 from mrbokeh.system.errors import InputError
 from tests.support.command_line import mrbokeh
 from tests.support.made_studio import ALIEN, CAKE, HEIGHT, WIDTH, made_studio, write_floor
 from viewfinder.studio.brush import Brush, as_shown, snapped, tinted
 from viewfinder.studio.command_line import options_of, words_of
 from viewfinder.studio.loupe import Region, WholePhotograph, region_of
-from viewfinder.studio.photograph import open_photograph
+from viewfinder.studio.photograph import open_photograph, solved_by_hand
 from viewfinder.studio.preview import preview_of
-from viewfinder.studio.state import Stroke, StudioState, stroke_of
+from viewfinder.studio.project import read_project
+from viewfinder.studio.state import Stroke, StudioState, state_of, stroke_of
 
 SIZE, MIDDLE, RADIUS = 300, (150, 150), 60.0
 
@@ -161,3 +167,56 @@ async def test_pages_paint_and_see_it(tmp_path: Path) -> None:
 def test_strokes_that_cannot_be_meant_are_refused(message: dict[str, object], why: str) -> None:
     with pytest.raises(InputError, match=why):
         stroke_of(message)
+
+
+FLOOR_LINES = [[140, 110, 200, 170, "z"], [100, 110, 40, 170, "z"], [20, 150, 220, 150, "x"]]
+"""Edges of the floor's tiles: those ahead meet at the middle of the level horizon."""
+
+
+async def test_drawn_lines_give_the_camera_until_they_are_taken_away(tmp_path: Path) -> None:
+    async with made_studio(tmp_path, StudioState(photo=write_floor(tmp_path / "floor.png"), object=CAKE, pitch_deg=12.0)) as made:
+        desk = made.desk
+        while desk.photograph is None or desk.busy:
+            await desk.news_after(desk.number, 1.0)
+        await desk.change({"lines": FLOOR_LINES[:1]})
+        assert desk.state.camera is None and "too little" in (desk.camera_told() or {})["told"]
+        await desk.change({"lines": FLOOR_LINES})
+        assert desk.state.camera is not None and desk.state.pitch_deg is None and "drawn lines" in (desk.camera_told() or {})["told"]
+        solved = read_solved_camera(desk.state.camera)
+        assert (solved.width_px, solved.height_px) == (WIDTH, HEIGHT)
+        assert abs(solved.pitch_deg) < 0.3 and abs(solved.roll_deg) < 0.3
+        first = desk.state
+        await desk.step(-1)
+        assert len(desk.state.lines) == 1
+        await desk.step(1)
+        assert desk.state == first
+        kept = read_project(desk.project.path)
+        assert kept.state.lines == tuple(tuple(each) for each in FLOOR_LINES)
+        await desk.change({"lines": []})
+        assert desk.state.lines == () and desk.state.camera != first.camera
+
+
+def test_drawn_lines_count_in_pixels_of_the_whole_photograph(tmp_path: Path) -> None:
+    """A photograph of 3 MP, whose preview is smaller: the camera of its lines is that of the whole."""
+    scale = 8.5
+    opened, _rgb = open_photograph(write_floor(tmp_path / "large.png", round(scale * WIDTH), round(scale * HEIGHT)))
+    lines = [(*(scale * each for each in line[:4]), line[4]) for line in FLOOR_LINES]  # type: ignore[operator]
+    solved = solved_by_hand(opened, lines)  # type: ignore[arg-type]
+    assert (solved.width_px, solved.height_px) == opened.size_px and opened.plate.rgb.shape[1] < solved.width_px
+    assert abs(solved.pitch_deg) < 0.3 and 0.3 < solved.focal_length_px / solved.width_px < 3.0
+    assert max(solved.segments_px[: len(lines)].max(1)) > opened.plate.rgb.shape[1], "segments too"
+
+
+@pytest.mark.parametrize(
+    ("lines", "why"),
+    [
+        ("x", "list of at most 60 lines"),
+        ([[0, 0, 5, 5]], "x1, y1, x2, y2 and its direction"),
+        ([[0, 0, 5, 5, "w"]], "x1, y1, x2, y2 and its direction"),
+        ([[3, 3, 3, 3, "y"]], "draw along an edge"),
+        ([[3, 3, -3, 3, "y"]], "number from 0"),
+    ],
+)
+def test_lines_that_cannot_be_meant_are_refused(lines: object, why: str) -> None:
+    with pytest.raises(InputError, match=why):
+        state_of({"lines": lines})
