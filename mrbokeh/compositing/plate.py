@@ -25,6 +25,7 @@ from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.depth.phone_photo import PhoneFocus, PhonePhoto
 from mrbokeh.depth.stereo_depth import stereo_depth
 from mrbokeh.images.alpha_io import is_straight, read_alpha
+from mrbokeh.images.apple_notes import held_by_phone
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
 from mrbokeh.images.xmp import jpeg_xmp
@@ -150,7 +151,7 @@ def photograph_plate(photo: Path, photograph: Photograph, phone: PhonePhoto | No
         _require_no_panorama(photo, photograph)
     held = held_lens(photo, photograph, phone, wishes)
     plate = with_own_alpha(plate_of(photograph.rgb, held.lens), photo, read_alpha(photo, photograph.orientation))
-    plate = replace(plate, white_lux=held.white_lux)
+    plate = replace(plate, white_lux=held.white_lux, world_from_camera=held_by_phone(photo))
     if phone is None:
         return replace(plate, focus_known=held.focus_known, view_known=held.view_known, rough_focus_m=held.rough_focus_m)
     original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None

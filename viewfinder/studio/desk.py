@@ -250,7 +250,13 @@ class Desk:
         """Give the state the camera of the picture's lines, if it is still that photograph's and nobody chose how it was held."""
         state, found = self.state, self._cameras[path]
         opened = self.photograph
-        is_free = state.camera is None and state.pitch_deg is None and opened is not None and not opened.has_depth
+        is_free = (
+            state.camera is None
+            and state.pitch_deg is None
+            and opened is not None
+            and not opened.has_depth
+            and opened.plate.world_from_camera is None
+        )
         if state.photo == path and is_free and found.get("is_sure"):
             self.project.amend(lambda state: replace(state, camera=Path(found["file"])))
             self._keep()

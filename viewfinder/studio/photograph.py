@@ -186,7 +186,7 @@ def placed(state: StudioState, opened: OpenedPhotograph) -> StudioState:
     """
     if opened.has_depth and state.camera_height_m is not None:
         state = replace(state, camera_height_m=None)
-    is_told = state.camera is not None or state.pitch_deg is not None
+    is_told = state.camera is not None or state.pitch_deg is not None or opened.plate.world_from_camera is not None
     whole = state.height is not None and (opened.has_depth or (state.camera_height_m is not None and is_told))
     if not state.is_complete or state.plain or whole:
         return state
