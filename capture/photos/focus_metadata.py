@@ -128,7 +128,8 @@ def _apple(tags: Tags) -> FocusReading | None:
         return None
     nearest_m, farthest_m = range_m
     distance_m = 2.0 / (1.0 / nearest_m + 1.0 / farthest_m)
-    return FocusReading(distance_m, nearest_m, farthest_m, "lens", f"Apple's FocusDistanceRange = {nearest_m:.4g} to {farthest_m:.4g} m")
+    source = f"Apple's FocusDistanceRange = {nearest_m:.4g} to {farthest_m:.4g} m"
+    return FocusReading(distance_m, nearest_m=nearest_m, farthest_m=farthest_m, origin="lens", source=source)
 
 
 _APPLE = "65 112 112 108 101 "
