@@ -100,10 +100,17 @@ class SolvedCamera:
 
     def resized(self, width_px: int, height_px: int) -> "SolvedCamera":
         """Return the camera of the same picture in another size; its sizes in pixels go by the width."""
-        named = ("focal_length_px", "focal_length_sd_px", "solved_focal_length_px", "solved_focal_length_sd_px")
-        factor = width_px / self.width_px
-        told = {name: None if getattr(self, name) is None else factor * getattr(self, name) for name in named}
-        return replace(self, width_px=width_px, height_px=height_px, segments_px=factor * self.segments_px, **told)
+        factor, own, own_sd = width_px / self.width_px, self.solved_focal_length_px, self.solved_focal_length_sd_px
+        return replace(
+            self,
+            width_px=width_px,
+            height_px=height_px,
+            focal_length_px=factor * self.focal_length_px,
+            focal_length_sd_px=factor * self.focal_length_sd_px,
+            solved_focal_length_px=None if own is None else factor * own,
+            solved_focal_length_sd_px=None if own_sd is None else factor * own_sd,
+            segments_px=factor * self.segments_px,
+        )
 
     def camera(self) -> Camera:
         """Return the pinhole, which stands camera_height_m above the world's origin."""

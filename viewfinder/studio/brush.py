@@ -162,7 +162,7 @@ def tinted(path: Path, size_px: tuple[int, int]) -> bytes:
     held = read_matte(path)
     told = ~np.isnan(held) if np.isnan(held).any() else held > 0.0
     front = np.nan_to_num(held, nan=0.0)
-    colours = np.where(front[..., None] > 0.0, np.float32(_FRONT), np.float32(_BEHIND))
+    colours = np.where(front[..., None] > 0.0, _FRONT, _BEHIND)
     cover = np.where(told, np.maximum(front, np.float32(np.isnan(held).any())), 0.0) * _TINT
     shown = np.dstack([colours, 255.0 * cover]).astype(np.uint8)
     kept = BytesIO()
@@ -170,4 +170,4 @@ def tinted(path: Path, size_px: tuple[int, int]) -> bytes:
     return kept.getvalue()
 
 
-_FRONT, _BEHIND, _TINT = (255, 140, 0), (40, 120, 255), 0.5
+_FRONT, _BEHIND, _TINT = np.array([255, 140, 0]), np.array([40, 120, 255]), 0.5
