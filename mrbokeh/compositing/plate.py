@@ -33,7 +33,7 @@ from mrbokeh.optics.camera import Camera, camera_of_lens
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.stacks.capture_bundle import CaptureBundle
-from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
+from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, read_focal_stack
 from mrbokeh.stacks.guessed_metres import is_lens_guessed
 from mrbokeh.stacks.photograph import Photograph, lens_for_photograph, read_photograph
 from mrbokeh.system.channel import guess
@@ -346,15 +346,20 @@ def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus
         raise InputError(
             f"{folder} is a focal stack of {len(stack)} slices: choose one with --slice 0 to {len(stack) - 1}, or --all-slices"
         )
-    focused = stack.registered_lens_of(slice_index) if lens is None else lens.focused_at(stack.lens_of(slice_index).focus_distance_m)
-    focused = focused if focus_m is None else focused.focused_at(focus_m)
+    focused, blur_from = slice_lens(stack, slice_index, lens, focus_m)
     rgb = stack.slice_rgb(slice_index)
     camera = stack.camera or camera_of_lens(stack.lens_of(stack.reference), rgb.shape[1], rgb.shape[0])
     # A stack of a scene knows where its camera stood; objects are placed in camera axes.
     upright = replace(camera, camera_from_world=np.eye(4))
     plate = Plate(rgb=rgb, depth_m=stack.depth_m(), lens=focused, camera=upright, sharp_rgb=stack.all_in_focus())
+    return replace(plate, metres_guessed=not stack.metres_known, blur_from=blur_from)
+
+
+def slice_lens(stack: FocalStack, slice_index: int, lens: Lens | None, focus_m: float | None) -> tuple[Lens, str]:
+    """Return the lens of a slice, and where its blur is from (`Plate.blur_from`). lens, focus_m: in place of its own."""
+    focused = stack.registered_lens_of(slice_index) if lens is None else lens.focused_at(stack.lens_of(slice_index).focus_distance_m)
     guessed = lens is None and is_lens_guessed(stack)
-    return replace(plate, metres_guessed=not stack.metres_known, blur_from="blur as measured in the slices" if guessed else "")
+    return focused if focus_m is None else focused.focused_at(focus_m), "blur as measured in the slices" if guessed else ""
 
 
 @dataclass(frozen=True)

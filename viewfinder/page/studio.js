@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: a702a38abe6da1bcf4a2c19db46ba8af3a5ccc0a90c488e6ff5ac984f4a099b3
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: b36d0cf5ba1d062f8a0d018e749bd9791647183717b699732482b1a89b5e2363
 "use strict";
 (() => {
   // src/model.ts
@@ -302,6 +302,7 @@
       for (const each of SLIDERS) this.slider(each);
       for (const each of NUMBERS) this.number(each.id, each.name, each.also ?? {});
       this.height();
+      this.slices();
       this.switches();
       this.dome();
       this.result();
@@ -345,6 +346,19 @@
     height() {
       const input = byId("height");
       input.addEventListener("change", () => void studio.commit({ height: input.value.trim().replace(",", ".") || null }));
+    }
+    /** Another picture of the stack is opened once the hand lets the handle go. */
+    slices() {
+      const input = byId("slice");
+      input.addEventListener("input", () => this.sliceTold(input.valueAsNumber));
+      input.addEventListener("change", () => void studio.commit({ slice: input.valueAsNumber }));
+    }
+    sliceTold(slice) {
+      const photo = studio.told?.photo;
+      const metres = photo?.focus_distances_m?.[slice];
+      const told = `${slice + 1} of ${photo?.slices ?? 1}${metres ? `, focused at ${Number(metres.toPrecision(3))} m` : ""}`;
+      byId("slice_row").querySelector("output").textContent = told;
+      byId("slice").setAttribute("aria-valuetext", told);
     }
     switches() {
       const auto = byId("sun_auto");
@@ -406,6 +420,15 @@
       byId("camera_told").textContent = told.photo?.has_depth ? "The photograph has depth: the ground slopes as that says." : told.camera?.told ?? (told.photo ? "The camera is looked for in the picture's lines." : "");
       byId("camera_found").disabled = told.camera?.file === void 0;
       byId("plain").disabled = Boolean(told.photo && !told.photo.has_depth && !told.state.plain);
+      const photo = told.photo;
+      byId("slice_row").hidden = photo?.slices === void 0;
+      document.querySelectorAll(".of_one").forEach((each) => each.hidden = photo?.slices !== void 0);
+      if (photo?.slices !== void 0) {
+        const input = byId("slice");
+        input.max = String(photo.slices - 1);
+        input.value = String(told.state.slice ?? 0);
+        this.sliceTold(input.valueAsNumber);
+      }
       byId("kept").textContent = `Everything is kept in ${told.project}`;
       this.choices();
       this.saves(told.saves);
@@ -495,12 +518,12 @@
   function focusTold(state) {
     const shown = studio.shown;
     if (!shown || !studio.isComplete) return "Click Focus here, then what is to be in focus.";
-    const from = state.focus_m !== null || state.focus_at_px !== null ? "as chosen" : studio.told?.photo?.focus_m ? "as the photograph states" : "on the object";
+    const from = state.focus_m !== null || state.focus_at_px !== null ? "as chosen" : studio.told?.photo?.focus_m ? "as the photograph states" : studio.told?.photo?.slices ? "as the stack tells" : "on the object";
+    if (studio.told?.photo?.focus_distances_m?.length === 0) return `The stack does not know its metres; the object is blurred${blurTold(shown.coc_px)}.`;
     const at = shown.focus_m === null ? "infinity" : `${Number(shown.focus_m.toPrecision(3))} m`;
-    const [least, most] = [shown.coc_px[0], shown.coc_px[1]];
-    const blur = least === void 0 || most === void 0 ? "" : `; the object is blurred by ${least.toFixed(1)} to ${most.toFixed(1)} px of the photograph`;
-    return `Focused at ${at}, ${from}${blur}.`;
+    return `Focused at ${at}, ${from}; the object is blurred${blurTold(shown.coc_px)}.`;
   }
+  var blurTold = ([least, most]) => least === void 0 || most === void 0 ? " by its distance" : ` by ${least.toFixed(1)} to ${most.toFixed(1)} px of the photograph`;
   function lensChoice(path, name, number) {
     const label = document.createElement("label");
     const input = Object.assign(document.createElement("input"), { type: "radio", name: "lens", value: path });
@@ -923,7 +946,7 @@
       this.stage.style.width = `${photo.width_px * scale}px`;
       this.stage.style.height = `${photo.height_px * scale}px`;
       studio.pixels = Math.max(4e4, photo.width_px * photo.height_px * (scale * devicePixelRatio) ** 2);
-      const name = `${photo.name} ${studio.told?.state.photo} ${photo.width_px}`;
+      const name = `${photo.name} ${studio.told?.state.photo} ${photo.slice ?? ""} ${photo.width_px}`;
       if (name !== this.photoName) {
         this.photoName = name;
         this.hint = "";

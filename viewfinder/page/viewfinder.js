@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: a702a38abe6da1bcf4a2c19db46ba8af3a5ccc0a90c488e6ff5ac984f4a099b3
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: b36d0cf5ba1d062f8a0d018e749bd9791647183717b699732482b1a89b5e2363
 "use strict";
 (() => {
   // src/model.ts

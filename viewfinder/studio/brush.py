@@ -18,6 +18,7 @@ from PIL import Image
 from mrbokeh.compositing.plate import read_matte
 from mrbokeh.depth.depth_filters import guided_upsampling
 from mrbokeh.images.color import srgb_codes
+from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.stacks.photograph import read_photograph
 from mrbokeh.system.channel import apart
 from mrbokeh.system.errors import InputError
@@ -131,15 +132,18 @@ def _from_edge_px(marked: Mask) -> Plane:
 
 
 class Brush:
-    """Brush for one photograph. has_depth: depth tells what no stroke reached, and mattes are hard."""
+    """Brush for one photograph, or for a focal stack, whose all-in-focus picture shows its edges.
 
-    def __init__(self, path: Path, *, has_depth: bool) -> None:
-        self._path, self._has_depth = path, has_depth
+    has_depth: depth tells what no stroke reached, and mattes are hard.
+    """
+
+    def __init__(self, path: Path, stack: FocalStack | None = None, *, has_depth: bool) -> None:
+        self._path, self._stack, self._has_depth = path, stack, has_depth
 
     @cached_property
     def _codes(self) -> Codes:
         with apart():
-            return srgb_codes(read_photograph(self._path).rgb, np.uint8)
+            return srgb_codes(self._stack.all_in_focus() if self._stack else read_photograph(self._path).rgb, np.uint8)
 
     def matte(self, before: Path | None, stroke: Stroke) -> bytes:
         """Return a matte as a PNG for `mrbokeh composite --matte`: an earlier one with a stroke. Raises InputError for another size."""

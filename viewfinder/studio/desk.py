@@ -24,7 +24,7 @@ _log = logging.getLogger(__name__)
 LARGEST = {"photo": 300 << 20, "object": 200 << 20}
 """Bytes of what is dropped on the page."""
 _OBJECTS = (".glb",)
-_KEPT_PHOTOGRAPHS = 2
+_KEPT_PHOTOGRAPHS = 6
 _TELL_TILT = "set below how far the camera looks down, or draw lines along edges"
 _BESIDE = 0.15
 """How far beside another an object is added, in widths of the photograph."""
@@ -40,7 +40,7 @@ class Desk:
         self.busy = ""
         self._number = 0
         self._changed = asyncio.Event()
-        self._opened: dict[tuple[Path | None, Path | None], OpenedPhotograph] = {}
+        self._opened: dict[tuple[Path | None, Path | None, int | None], OpenedPhotograph] = {}
         self._cameras: dict[Path, dict[str, Any]] = {}
         self._drawn: dict[tuple[DrawnLine, ...], dict[str, Any]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
@@ -54,7 +54,7 @@ class Desk:
     @property
     def photograph(self) -> "OpenedPhotograph | None":
         """The opened photograph of the state, None while there is none."""
-        return self._opened.get((self.state.photo, self.state.depth))
+        return self._opened.get((self.state.photo, self.state.depth, self.state.slice))
 
     @property
     def number(self) -> int:
@@ -79,7 +79,7 @@ class Desk:
     def start(self) -> None:
         """Open the photograph of the state, if there is one."""
         if self.state.photo is not None:
-            self._begin(self._open(self.state.photo, self.state.depth))
+            self._begin(self._open())
 
     async def close(self) -> None:
         for task in self._tasks:
@@ -113,9 +113,13 @@ class Desk:
 
     async def change(self, changes: Any) -> None:
         """Take changes of a page over, complete what follows from them, and keep the project."""
-        before = self.state.lines
-        self.project.add(self.changed_state(changes))
+        before, state, opened = self.state.lines, self.changed_state(changes), self.photograph
+        if opened is not None and opened.stack is not None and state.focus_at_px is not None:
+            state = replace(state, slice=opened.slice_in_focus(*state.focus_at_px), focus_at_px=None)
+        self.project.add(state)
         self._keep()
+        if self.state.photo is not None and opened is not None and self.photograph is None:
+            await self._open()
         if self.state.lines != before:
             await self._by_hand()
         await self._complete()
@@ -160,7 +164,7 @@ class Desk:
             if opened is None:
                 raise InputError("there is no photograph to paint on yet: drop one on the page")
             if self._brush is None or self._brush[0] is not opened:
-                self._brush = opened, Brush(opened.path, has_depth=opened.has_depth)
+                self._brush = opened, Brush(opened.path, opened.stack, has_depth=opened.has_depth)
             png = await asyncio.to_thread(self._brush[1].matte, state.matte, stroke)
             self.uploads.mkdir(parents=True, exist_ok=True)
             path = _free(self.uploads / f"{opened.path.stem}_in_front.png")
@@ -176,7 +180,7 @@ class Desk:
         self.project.step(int(by))
         self._keep()
         if self.state.photo is not None and self.photograph is None:
-            self._begin(self._open(self.state.photo, self.state.depth))
+            self._begin(self._open())
 
     async def upload(self, kind: str, name: str, body: AsyncIterator[bytes]) -> None:
         """Keep a file that was dropped on the page, if it is what it should be. Raises InputError."""
@@ -198,7 +202,7 @@ class Desk:
         else:
             self.project.add(StudioState(photo=path, object=self.state.object, lens=self.state.lens))
             self._keep()
-            self._begin(self._open(path, None))
+            self._begin(self._open())
 
     def _require_photograph(self, path: Path) -> None:
         from viewfinder.studio.photograph import open_photograph
@@ -221,15 +225,21 @@ class Desk:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _open(self, path: Path, depth: Path | None) -> None:
-        """Open a photograph, then look for its camera."""
+    async def _open(self) -> None:
+        """Open the state's photograph, or its slice of a stack, then look for its camera."""
+        state = self.state
+        path, depth = state.photo, state.depth
+        assert path is not None
         self.busy = "opening the photograph"
         self.tell_all()
         try:
-            opened, camera = await asyncio.to_thread(_opened_photograph, path, depth)
+            opened, camera = await asyncio.to_thread(_opened_photograph, path, depth, state.slice)
             while len(self._opened) >= _KEPT_PHOTOGRAPHS:
                 del self._opened[next(iter(self._opened))]
-            self._opened[path, depth] = opened
+            self._opened[path, depth, opened.slice] = opened
+            if opened.stack is not None:
+                _ = self.state == state and self.project.amend(lambda state: replace(state, slice=opened.slice))
+                self._cameras.setdefault(path, {})
             self.busy = "looking for the camera in the picture's lines" if path not in self._cameras else ""
             self.tell_all()
             if path not in self._cameras:
@@ -278,12 +288,14 @@ class Desk:
         return None if self.state.photo is None else self._cameras.get(self.state.photo)
 
 
-def _opened_photograph(path: Path, depth: Path | None) -> "tuple[OpenedPhotograph, Callable[[], SolvedCamera | str]]":
+def _opened_photograph(
+    path: Path, depth: Path | None, slice_index: int | None
+) -> "tuple[OpenedPhotograph, Callable[[], SolvedCamera | str]]":
     """Return the photograph, and what looks for its camera: it returns the camera, or the sentence why there is none."""
     from viewfinder.studio.photograph import open_photograph, solved
 
     with apart() as words:
-        opened, rgb = open_photograph(path, depth)
+        opened, rgb = open_photograph(path, depth, slice_index)
     for warning in words.warnings:
         say(f"warning: {warning}", err=True)
 

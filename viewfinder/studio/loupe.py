@@ -11,7 +11,7 @@ from mrbokeh.commands._composite_layers import objects_of
 from mrbokeh.commands._composite_options import CompositeOptions
 from mrbokeh.commands._composited import composited, placed
 from mrbokeh.compositing.between import COLOURS_REACH_PX
-from mrbokeh.compositing.plate import Plate, phone_photo, read_matte
+from mrbokeh.compositing.plate import Plate, read_matte
 from mrbokeh.compositing.plate_look.finishing import Finishing
 from mrbokeh.layering.pixel_box import Box, is_same_everywhere
 from mrbokeh.optics.camera import camera_of_lens
@@ -45,7 +45,8 @@ class WholePhotograph:
         path, plate = self.photograph.path, self.photograph.plate
         if plate.rgb.shape[1::-1] != self.photograph.size_px:
             with apart():
-                plate = whole_plate(path, read_photograph(path), phone_photo(path), self.photograph.depth)
+                photograph = None if self.photograph.stack else read_photograph(path)
+                plate = whole_plate(path, photograph, self.photograph.phone, self.photograph.depth, self.photograph.slice)
         return replace(plate, rgb=np.broadcast_to(np.float32(0.0), plate.rgb.shape)), plate.rgb.astype(np.float16)
 
     @property

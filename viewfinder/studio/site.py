@@ -229,6 +229,12 @@ def _photo_told(opened: "OpenedPhotograph", state: StudioState) -> dict[str, Any
     width_px, height_px = opened.size_px
     told = opened.told
     shown: dict[str, Any] = {"name": opened.path.name, "width_px": width_px, "height_px": height_px, "has_depth": opened.has_depth}
+    if (stack := opened.stack) is not None:
+        shown |= {
+            "slice": opened.slice,
+            "slices": len(stack),
+            "focus_distances_m": list(stack.focus_distances_m) if stack.metres_known else [],
+        }
     shown |= {"f_number": told.f_number, "focus_m": told.focus_distance_m, "focal_length_mm": told.focal_length_mm}
     try:
         with apart():

@@ -34,15 +34,17 @@ class Placed:
 class StudioState:
     """State of the studio; None leaves a thing to the command's own default.
 
-    matte: what of the photograph the brush says is in front. object, at_px, height, turn_deg: of the chosen object; before, after: those
-    that come before and after it in the command line. at_px: where it stands, in pixels of the whole photograph. height: metres such as
-    "0.3", or pixels such as "120px". focus_at_px: the pixel that is in focus, where the photograph has depth; focus_m otherwise. sun_deg:
-    where the main light comes from, degrees to the right of the view and above the horizon. camera: file of `mrbokeh capture solve`;
-    pitch_deg comes before it. lines: drawn ones, by which it was solved. matched: black and grain of the objects are those of the
-    photograph. plain: guess neither light nor ground.
+    photo: a photograph, or the folder of a focal stack, of which slice counts the pictures from 0. matte: what of the photograph the brush
+    says is in front. object, at_px, height, turn_deg: of the chosen object; before, after: those that come before and after it in the
+    command line. at_px: where it stands, in pixels of the whole photograph. height: metres such as "0.3", or pixels such as "120px".
+    focus_at_px: the pixel that is in focus, where the photograph has depth; focus_m otherwise. sun_deg: where the main light comes from,
+    degrees to the right of the view and above the horizon. camera: file of `mrbokeh capture solve`; pitch_deg comes before it. lines:
+    drawn ones, by which it was solved. matched: black and grain of the objects are those of the photograph. plain: guess neither light
+    nor ground.
     """
 
     photo: Path | None = None
+    slice: int | None = None
     depth: Path | None = None
     matte: Path | None = None
     object: Path | None = None
@@ -156,6 +158,17 @@ def _number(low: float, high: float) -> Callable[[str, Any], float]:
     return checked
 
 
+def _whole(least: int, most: int) -> Callable[[str, Any], int]:
+    """Return a check for whole numbers from least up to most."""
+
+    def checked(name: str, value: Any) -> int:
+        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+            raise InputError(f"expected {name} to be a whole number from {least} to {most}, got {_shown(value)}")
+        return value
+
+    return checked
+
+
 def _pair(first: tuple[float, float], second: tuple[float, float]) -> Callable[[str, Any], Pair]:
     """Return a check for two numbers in two ranges."""
 
@@ -225,6 +238,7 @@ def _shown(value: Any) -> str:
 _PIXELS, _MOST_OBJECTS, _MOST_POINTS, _MOST_LINES = (0.0, 200_000.0), 50, 2000, 60
 _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "photo": _path,
+    "slice": _whole(0, 100_000),
     "depth": _path,
     "matte": _path,
     "object": _path,

@@ -18,6 +18,7 @@ export interface Placed {
 /** The state as the server keeps it; null leaves a thing to the command's own default. Object, place, height and turn are the chosen one's. */
 export interface State {
   photo: string | null;
+  slice: number | null;
   matte: string | null;
   object: string | null;
   lens: string | null;
@@ -55,6 +56,10 @@ export interface Photo {
   world_from_camera: Matrix3 | null;
   pitch_deg: number | null;
   lens_f_number: number | null;
+  /** Of a focal stack: which picture this is, how many there are, and where each is focused. */
+  slice?: number;
+  slices?: number;
+  focus_distances_m?: (number | null)[];
   problem?: string;
 }
 

@@ -59,7 +59,7 @@ export class PictureStage {
     this.stage.style.width = `${photo.width_px * scale}px`;
     this.stage.style.height = `${photo.height_px * scale}px`;
     studio.pixels = Math.max(4e4, photo.width_px * photo.height_px * (scale * devicePixelRatio) ** 2);
-    const name = `${photo.name} ${studio.told?.state.photo} ${photo.width_px}`;
+    const name = `${photo.name} ${studio.told?.state.photo} ${photo.slice ?? ""} ${photo.width_px}`;
     if (name !== this.photoName) {
       this.photoName = name;
       this.hint = "";
