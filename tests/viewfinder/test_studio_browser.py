@@ -278,6 +278,9 @@ async def test_light_lens_and_before_are_shown(tmp_path: Path) -> None:
         await page.value("document.querySelector('#lenses img').parentElement.click()")
         await page.comes_true(f"studio.told.state.lens === '{tmp_path / 'ring.json'}'")
         await page.comes_true("document.querySelector('#lenses img').naturalWidth > 0")
+        await page.comes_true("/^Black [0-9.]+ %, white [0-9.]+ %/.test(document.getElementById('clipped').textContent)")
+        painted = "document.getElementById('histogram').getContext('2d').getImageData(0, 0, 256, 80).data.filter((each) => each).length"
+        assert await page.value(painted) > 1000
         await page.comes_true(RESTS, 60.0)
         left, top, _width, _height = await page.box("#hold_before")
         shown = "!document.getElementById('before').hidden"

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: b36d0cf5ba1d062f8a0d018e749bd9791647183717b699732482b1a89b5e2363
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: ca22d42ea1bf01ed536ddb118d93bcc0546274692aecec0a14e20f941a0a096b
 "use strict";
 (() => {
   // src/model.ts
