@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: ca22d42ea1bf01ed536ddb118d93bcc0546274692aecec0a14e20f941a0a096b
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 7b33c71e8924ed56d143e3de0c368d454d1f309047d06ce72a70b12b909e6975
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: ca22d42ea1bf01ed536ddb118d93bcc0546274692aecec0a14e20f941a0a096b
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 7b33c71e8924ed56d143e3de0c368d454d1f309047d06ce72a70b12b909e6975
 "use strict";
 (() => {
   // src/model.ts
@@ -1204,11 +1204,9 @@
       };
       pressed("grid", () => this.mark());
       const tools = ["focus_here", "brush", "draw_lines"];
+      const isOn = (id) => byId5(id).getAttribute("aria-pressed") === "true";
       for (const id of tools) {
-        byId5(id).addEventListener("click", () => {
-          const others = tools.filter((each) => each !== id && byId5(each).getAttribute("aria-pressed") === "true");
-          if (byId5(id).getAttribute("aria-pressed") === "true") others.forEach((each) => byId5(each).click());
-        });
+        byId5(id).addEventListener("click", () => isOn(id) || tools.filter((each) => each !== id && isOn(each)).forEach((each) => byId5(each).click()), true);
       }
       pressed("focus_here", (on) => {
         this.stage.classList.toggle("focusing", on);

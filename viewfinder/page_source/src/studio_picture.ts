@@ -299,11 +299,10 @@ export class PictureStage {
     };
     pressed("grid", () => this.mark());
     const tools = ["focus_here", "brush", "draw_lines"];
+    const isOn = (id: string): boolean => byId(id).getAttribute("aria-pressed") === "true";
     for (const id of tools) {
-      byId(id).addEventListener("click", () => {
-        const others = tools.filter((each) => each !== id && byId(each).getAttribute("aria-pressed") === "true");
-        if (byId(id).getAttribute("aria-pressed") === "true") others.forEach((each) => byId<HTMLElement>(each).click());
-      });
+      // Before the tool itself is told: the others fall silent, then it speaks.
+      byId(id).addEventListener("click", () => isOn(id) || tools.filter((each) => each !== id && isOn(each)).forEach((each) => byId<HTMLElement>(each).click()), true);
     }
     pressed("focus_here", (on) => {
       this.stage.classList.toggle("focusing", on);
