@@ -238,8 +238,9 @@ class Desk:
                 del self._opened[next(iter(self._opened))]
             self._opened[path, depth, opened.slice] = opened
             if opened.stack is not None:
-                _ = self.state == state and self.project.amend(lambda state: replace(state, slice=opened.slice))
                 self._cameras.setdefault(path, {})
+                if self.state == state:
+                    self.project.amend(lambda state: replace(state, slice=opened.slice))
             self.busy = "looking for the camera in the picture's lines" if path not in self._cameras else ""
             self.tell_all()
             if path not in self._cameras:
