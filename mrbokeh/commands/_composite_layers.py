@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from mrbokeh.commands._composite_kept import KeptParts
     from mrbokeh.scene.staging.filming import Filming
     from mrbokeh.scene.staging.scene_description import Lighting, OneObject
+    from mrbokeh.solving.sun_of_photograph import SunOfPhotograph
     from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples
 
 _COVERED = 0.5
@@ -217,14 +218,38 @@ def _light(options: ObjectOptions, plate: Plate, foot_px: tuple[float, float], k
         return Lighting(options.environment, exposure=options.exposure)
     lit = picture_light if kept is None else kept.light
     world_from_camera = np.eye(3) if plate.world_from_camera is None else plate.world_from_camera
-    made = lit(plate, foot_px, world_from_camera, None if options.sun is None else typed_sun(options.sun))
-    if options.sun is None and is_sunlit(plate, foot_px):
-        guess("by the exposure the sun shines: a soft light from behind the camera is taken (--sun RIGHT,ABOVE says where it is)")
-    elif options.sun is None:
-        guess("the object's light is guessed from the photograph (else --exposure, --sun RIGHT,ABOVE, --environment or --plain)")
-    else:
+    if options.sun is not None:
+        sun_degrees: tuple[float, float] | None = typed_sun(options.sun)
         guess("--sun is as strong beside the sky as on a clear day; how bright both are is guessed from the photograph (--exposure)")
+    else:
+        sun_degrees = _sun_by_file(plate.sun, shines=is_sunlit(plate, foot_px))
+    made = lit(plate, foot_px, world_from_camera, sun_degrees)
     return Lighting(exposure=options.exposure, made=made)
+
+
+def _sun_by_file(sun: "SunOfPhotograph | None", *, shines: bool) -> tuple[float, float] | None:
+    """Return degrees to the right of the view and above the horizon as the file tells them, if the sun shines, and say what is taken."""
+    is_known = sun is not None and sun.is_up and sun.right_deg is not None
+    option = f"--sun {sun.right_deg:.0f},{sun.above_deg:.0f}" if is_known else "--sun RIGHT,ABOVE"
+    if not shines:
+        there = ", where the sun would be by the file" if is_known else ""
+        guess(f"the object's light is guessed from the photograph (else --exposure, {option}{there}, --environment or --plain)")
+        return None
+    if sun is None:
+        guess("by the exposure the sun shines: a soft light from behind the camera is taken (--sun RIGHT,ABOVE says where it is)")
+        return None
+    if sun.right_deg is None:
+        guess(
+            f"by the exposure the sun shines, and by time and place in the file it stood {sun.above_deg:.0f} degrees high; no compass tells on "
+            f"which side: a soft light from behind the camera is taken (--sun RIGHT,{sun.above_deg:.0f} says where it is, or --sun-by)"
+        )
+        return None
+    north = ", turned from magnetic to true north," if sun.from_magnetic_north else ""
+    guess(
+        f"by the exposure the sun shines, and by time, place and compass{north} in the file it stood at {option}, which is taken; a compass "
+        f"may be wrong by 20 degrees and more (--sun RIGHT,ABOVE, --sun-by TOP:FOOT:TIP)"
+    )
+    return round(sun.right_deg), round(sun.above_deg)
 
 
 def _height_m(text: str | None, plate: Plate, depth_m: float) -> float | None:

@@ -43,6 +43,8 @@ _PALER_RAD = 0.5
 """Angle beyond the frame in which colours fade by a factor of e."""
 _SUNLIT_LUX = 40_000.0
 """What an overcast sky seldom gives, and the sun does from 30 degrees up."""
+_SUNLIT_SHARE = 0.5
+"""Share of a clear day's light that an overcast sky, which gives 0.13 to 0.25 of it in the mean (RP-21), and shade seldom have."""
 _USUAL_SUN, _SPOT_POWER = (-150.0, 60.0), 8.0
 """Where the sun is taken to be if nothing but the exposure tells of it: high, and behind the photographer. It is made 47 degrees wide (to
 half its brightness), so that it is harder than an overcast sky, and its direction, which is a guess, tells little."""
@@ -101,10 +103,16 @@ def surroundings_of(plate: Plate, foot_px: tuple[float, float], world_from_camer
 
 
 def is_sunlit(plate: Plate, foot_px: tuple[float, float]) -> bool:
-    """Return whether the exposure of a photograph tells that the sun shines where an object stands."""
+    """Return whether the exposure of a photograph tells that the sun shines where an object stands.
+
+    A low sun gives less: where the file tells its height, half of what a clear day then gives is enough.
+    """
+    if plate.white_lux is None or (plate.sun is not None and not plate.sun.is_up):
+        return False
     height_px, width_px = plate.rgb.shape[:2]
     near = float(np.sqrt(_whites(_small(plate), foot_px[0] / width_px, foot_px[1] / height_px)[1].prod()))
-    return plate.white_lux is not None and plate.white_lux * near > _SUNLIT_LUX
+    clear_lux = math.inf if plate.sun is None else 1000.0 * sum(clear_day_klx(math.radians(plate.sun.above_deg)))
+    return plate.white_lux * near > min(_SUNLIT_LUX, _SUNLIT_SHARE * clear_lux)
 
 
 def _wide_light(travels: tuple[float, float, float], white: Triple) -> Rgb:
@@ -115,13 +123,18 @@ def _wide_light(travels: tuple[float, float, float], white: Triple) -> Rgb:
     return (math.pi * white / ground * spot).astype(np.float32)
 
 
-def sky_share(above_rad: float) -> float:
-    """Return the share of the light on level ground that comes from the sky, for a sun so high over the horizon, on clear days.
+def clear_day_klx(above_rad: float) -> tuple[float, float]:
+    """Return the illuminance of level ground by the sun, so high over the horizon, and by the sky, on clear days, in kilolux.
 
-    Illuminance of sun and sky by the Illuminating Engineering Society (RP-21, 1984; Gillette and Pierpoint 1982), in kilolux.
+    By the Illuminating Engineering Society (RP-21, 1984; Gillette and Pierpoint 1982).
     """
     height = math.sin(max(above_rad, 0.02))
-    of_sun, of_sky = 127.5 * math.exp(-0.21 / height) * height, 0.8 + 15.5 * math.sqrt(height)
+    return 127.5 * math.exp(-0.21 / height) * height, 0.8 + 15.5 * math.sqrt(height)
+
+
+def sky_share(above_rad: float) -> float:
+    """Return the share of the light on level ground that comes from the sky, for a sun so high over the horizon, on clear days."""
+    of_sun, of_sky = clear_day_klx(above_rad)
     return of_sky / (of_sky + of_sun)
 
 
