@@ -229,27 +229,26 @@ def _light(options: ObjectOptions, plate: Plate, foot_px: tuple[float, float], k
 
 def _sun_by_file(sun: "SunOfPhotograph | None", *, shines: bool) -> tuple[float, float] | None:
     """Return degrees to the right of the view and above the horizon as the file tells them, if the sun shines, and say what is taken."""
-    is_known = sun is not None and sun.is_up and sun.right_deg is not None
-    option = f"--sun {sun.right_deg:.0f},{sun.above_deg:.0f}" if is_known else "--sun RIGHT,ABOVE"
+    degrees = None if sun is None or sun.right_deg is None or not sun.is_up else (round(sun.right_deg), round(sun.above_deg))
+    option = "--sun RIGHT,ABOVE" if degrees is None else f"--sun {degrees[0]},{degrees[1]}"
     if not shines:
-        there = ", where the sun would be by the file" if is_known else ""
+        there = "" if degrees is None else ", where the sun would be by the file"
         guess(f"the object's light is guessed from the photograph (else --exposure, {option}{there}, --environment or --plain)")
         return None
     if sun is None:
         guess("by the exposure the sun shines: a soft light from behind the camera is taken (--sun RIGHT,ABOVE says where it is)")
-        return None
-    if sun.right_deg is None:
+    elif degrees is None:
         guess(
-            f"by the exposure the sun shines, and by time and place in the file it stood {sun.above_deg:.0f} degrees high; no compass tells on "
-            f"which side: a soft light from behind the camera is taken (--sun RIGHT,{sun.above_deg:.0f} says where it is, or --sun-by)"
+            f"by the exposure the sun shines, and by time and place in the file it stood {sun.above_deg:.0f} degrees high; no compass "
+            f"tells on which side: a soft light from behind the camera is taken (--sun RIGHT,{sun.above_deg:.0f}, or --sun-by, says more)"
         )
-        return None
-    north = ", turned from magnetic to true north," if sun.from_magnetic_north else ""
-    guess(
-        f"by the exposure the sun shines, and by time, place and compass{north} in the file it stood at {option}, which is taken; a compass "
-        f"may be wrong by 20 degrees and more (--sun RIGHT,ABOVE, --sun-by TOP:FOOT:TIP)"
-    )
-    return round(sun.right_deg), round(sun.above_deg)
+    else:
+        north = ", turned from magnetic to true north," if sun.from_magnetic_north else ""
+        guess(
+            f"by the exposure the sun shines, and by time, place and compass{north} in the file it stood at {option}, which is taken; a "
+            f"compass may be wrong by 20 degrees and more (--sun RIGHT,ABOVE, --sun-by TOP:FOOT:TIP)"
+        )
+    return degrees
 
 
 def _height_m(text: str | None, plate: Plate, depth_m: float) -> float | None:

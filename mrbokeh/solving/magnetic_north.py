@@ -1,7 +1,8 @@
 """Magnetic north: how far east of true north a compass needle points.
 
-The field of the Earth's core of 2020 by IGRF-14 (IAGA 2024, doi 10.5281/zenodo.14012302) up to degree 4, on a sphere. Between 45 degrees south and
-65 north that is 0.9 degrees off the whole model in the median and 3.2 in 95 of 100 places; the field turns by 0.1 to 0.2 degrees a year.
+The field of the Earth's core of 2020 by IGRF-14 (IAGA 2024, doi 10.5281/zenodo.14012302) up to degree 4, on a sphere. Between 45 degrees
+south and 65 north that is off the whole model by 0.9 degrees in the median, and by less than 3.2 in 95 of 100 places; the field turns by
+0.1 to 0.2 degrees a year.
 """
 
 import math

@@ -1,12 +1,12 @@
 """The sun over a photograph, by the place, the time and the compass direction that phones write into EXIF.
 
-Its place in the sky is that of the low-precision formulas of the Astronomical Almanac (Michalsky, Solar Energy 40, 1988), within 0.01 degrees of
-1950 to 2050, lifted by refraction (Saemundsson 1986). A compass is the weak part: those of phones are off by 10 degrees as a rule, and by much more near
-iron. A direction from magnetic north is turned to true north (`magnetic_north`).
+Its place in the sky is that of the low-precision formulas of the Astronomical Almanac (Michalsky, Solar Energy 40, 1988), within 0.01
+degrees from 1950 to 2050, lifted by refraction (Saemundsson 1986). A compass is the weak part: those of phones are often off by 10
+degrees, and by much more near iron. A direction from magnetic north is turned to true north (`magnetic_north`).
 
-The time is GPS's, which is UTC, or that of the camera's clock with its offset from UTC. A clock without offset tells nothing: a wrong time zone
-turns the sun by 15 degrees an hour. GPS times that contradict the camera's clock by more than time zones do are not believed, nor those
-of old phones that wrote local time for UTC.
+The time is GPS's, which is UTC, or that of the camera's clock with its offset from UTC. A clock without offset tells nothing: a wrong
+time zone turns the sun by 15 degrees an hour. GPS times that contradict the camera's clock by more than time zones do are not believed,
+nor those of old phones that wrote local time for UTC.
 """
 
 import math
@@ -34,7 +34,7 @@ Tags = Mapping[int, Any]
 
 @dataclass(frozen=True)
 class SunOfPhotograph:
-    """Where the sun stood: degrees above the horizon, and to the right of the optical axis, seen from above; None without a compass."""
+    """Place of the sun: degrees above the horizon, and to the right of the optical axis, seen from above; None without a compass."""
 
     above_deg: float
     right_deg: float | None = None
