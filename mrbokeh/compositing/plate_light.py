@@ -31,6 +31,10 @@ _WIDTH_PX = 48
 """The photograph is looked at this small: light is even over many pixels."""
 _WHITE, _GREY = 0.85, 0.25
 """What the brightest parts of a picture reflect, and a picture as a whole."""
+_BRIGHTER = 1.3
+"""By how much white is brighter than these tell, as little in a picture is white: in the median 1.6 times for an object in 320 views of 40
+panoramas, 1.8 times in 16 traced places, and 1.3 times in 19 photographs in the sun whose height their files tell, for which a clear day
+(`clear_day_klx`) was compared with the exposure that shows middle grey (ISO 12232: 54 lx s / S where white would be)."""
 _BRIGHT_PERCENTILE = 97.0
 _NEAR_SHARE = 0.25
 """Width of the surroundings of the foot, in widths of the picture."""
@@ -143,7 +147,7 @@ def white_at(picture: Rgb, x_share: float, y_share: float) -> Triple:
 
     x_share, y_share: the place, in widths and heights of the picture.
     """
-    return float(np.exp(np.log(_whites(picture, x_share, y_share)).mean())) * _cast(picture)
+    return _BRIGHTER * float(np.exp(np.log(_whites(picture, x_share, y_share)).mean())) * _cast(picture)
 
 
 def _whites(picture: Rgb, x_share: float, y_share: float) -> Float[np.ndarray, "2 2"]:

@@ -104,25 +104,26 @@ def _utc(gps: Tags, exif: Tags, longitude_deg: float) -> datetime | None:
 
 
 def _by_gps(gps: Tags, local: datetime | None, longitude_deg: float) -> datetime | None:
-    """Return GPS's time if the clock of the camera, which tells the day where GPS does not, bears it out."""
+    """Return GPS's time if the clock of the camera bears it out.
+
+    The clock's day is taken where GPS tells none: one more or less moves the sun by 0.4 degrees.
+    """
     hours, minutes, seconds = (float(each) for each in gps.get(_TIME) or (math.nan,) * 3)
-    if not (0.0 <= hours < 24.0 and 0.0 <= minutes < 60.0 and 0.0 <= seconds < 62.0):
+    day = _parsed(_text(gps, _DATE), _DAY_FORMAT) or (local and local.replace(hour=0, minute=0, second=0))
+    if day is None or not (0.0 <= hours < 24.0 and 0.0 <= minutes < 60.0 and 0.0 <= seconds < 62.0):
         return None
-    time = timedelta(hours=hours, minutes=minutes, seconds=seconds)
-    day = _parsed(_text(gps, _DATE), _DAY_FORMAT)
-    if local is None:
-        return None if day is None else (day + time).replace(tzinfo=UTC)
-    midnight = local.replace(hour=0, minute=0, second=0)
-    days = [day] if day is not None else [midnight + timedelta(days=each) for each in (-1, 0, 1)]
-
-    def zone_h(at: datetime) -> float:
-        return (local - at) / timedelta(hours=1)
-
-    at = min((each + time for each in days), key=lambda each: abs(zone_h(each) - longitude_deg / 15.0))
-    is_local_time = abs(zone_h(at)) < 0.1 and not _UTC_FROM_DEG < longitude_deg < _UTC_TO_DEG
-    if is_local_time or abs(zone_h(at) - longitude_deg / 15.0) > _MOST_OFF_ZONE_H:
-        return None
+    at = day + timedelta(hours=hours, minutes=minutes, seconds=seconds)
+    if local is not None:
+        zone_h = (local - at) / timedelta(hours=1)
+        is_local_time = abs(_within_a_day(zone_h)) < 0.1 and not _UTC_FROM_DEG < longitude_deg < _UTC_TO_DEG
+        if is_local_time or abs(_within_a_day(zone_h - longitude_deg / 15.0)) > _MOST_OFF_ZONE_H:
+            return None
     return at.replace(tzinfo=UTC)
+
+
+def _within_a_day(hours: float) -> float:
+    """Return a difference of clocks between -12 and 12 hours, whatever their days."""
+    return (hours + 12.0) % 24.0 - 12.0
 
 
 def _degrees(gps: Tags, tag: int, negative: str) -> float | None:

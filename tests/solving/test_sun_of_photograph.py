@@ -69,6 +69,7 @@ def test_without_a_compass_the_height_is_known() -> None:
         (without(29), TAKEN),
         (GPS | {29: "2003:10:290"}, TAKEN),  # the day of the year, as an iPhone 6 wrote it
         (without(7, 29), TAKEN | {0x9011: "-07:00"}),
+        (GPS, {0x9003: "2003:10:16 12:30:30"}),  # a clock whose date is wrong
         (GPS | {1: "N\0", 3: b"W\0"}, TAKEN),
     ],
 )
@@ -83,7 +84,7 @@ def test_the_time_is_known_in_several_ways(gps: dict[int, Any], exif: dict[int, 
     [
         (without(7, 29), TAKEN),  # a clock in no time zone
         (GPS | {7: (12.0, 30.0, 30.0)}, TAKEN),  # local time for UTC, as an iPhone 4 wrote it
-        (GPS | {29: "2003:10:15"}, TAKEN),  # of an old fix
+        (GPS | {7: (9.0, 30.0, 30.0)}, TAKEN),  # of an old fix
         (GPS | {7: (float("nan"), 0.0, 0.0)}, TAKEN),
         (GPS | {7: (25.0, 0.0, 0.0)}, {}),
         (without(29), {}),
