@@ -7,8 +7,6 @@ south and 65 north that is off the whole model by 0.9 degrees in the median, and
 
 import math
 
-from scipy.special import lpmv
-
 _COEFFICIENTS_NT = {
     (1, 0): (-29403.41, 0.0),
     (1, 1): (-1451.37, 4653.35),
@@ -26,7 +24,7 @@ _COEFFICIENTS_NT = {
     (4, 4): (47.44, -350.30),
 }
 """Degree and order to g and h, Schmidt semi-normalised."""
-_STEP_RAD = 1e-4
+_DEGREES, _STEP_RAD = 4, 1e-4
 
 
 def declination_deg(latitude_deg: float, longitude_deg: float) -> float:
@@ -39,10 +37,21 @@ def declination_deg(latitude_deg: float, longitude_deg: float) -> float:
 
 def _potential(latitude_rad: float, longitude_rad: float) -> float:
     """Return the potential of the field on the surface, in nanotesla times the Earth's radius."""
-    total = 0.0
-    for (degree, order), (g, h) in _COEFFICIENTS_NT.items():
-        # SciPy's functions have the sign (-1)^order of Condon and Shortley, which geomagnetism leaves out.
-        norm = (-1) ** order * math.sqrt((2 if order else 1) * math.factorial(degree - order) / math.factorial(degree + order))
-        waves = g * math.cos(order * longitude_rad) + h * math.sin(order * longitude_rad)
-        total += norm * float(lpmv(order, degree, math.sin(latitude_rad))) * waves
-    return total
+    legendre = _legendre(latitude_rad)
+    waves = {order: (math.cos(order * longitude_rad), math.sin(order * longitude_rad)) for order in range(_DEGREES + 1)}
+    return sum(
+        legendre[degree, order] * (g * waves[order][0] + h * waves[order][1]) for (degree, order), (g, h) in _COEFFICIENTS_NT.items()
+    )
+
+
+def _legendre(latitude_rad: float) -> dict[tuple[int, int], float]:
+    """Return Schmidt's semi-normalised Legendre functions of the sine of the latitude by degree and order, by their recurrences."""
+    sine, cosine = math.sin(latitude_rad), math.cos(latitude_rad)
+    values = {(0, 0): 1.0}
+    for order in range(_DEGREES + 1):
+        if order:
+            values[order, order] = cosine * values[order - 1, order - 1] * (math.sqrt(1.0 - 0.5 / order) if order > 1 else 1.0)
+        for degree in range(order + 1, _DEGREES + 1):
+            before = math.sqrt((degree - 1) ** 2 - order**2) * values.get((degree - 2, order), 0.0) if degree > order + 1 else 0.0
+            values[degree, order] = ((2 * degree - 1) * sine * values[degree - 1, order] - before) / math.sqrt(degree**2 - order**2)
+    return values
