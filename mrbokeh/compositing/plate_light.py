@@ -8,9 +8,9 @@ it is relative: a picture twice as bright tells of light twice as bright.
 
 Sunshine shows in the exposure: white surfaces near the foot have more than 40 klx then. Of 88 photographs of all kinds 67 tell it; 16
 had more, 15 of them sunny by eye and one under bright clouds, and none of those taken indoors, at dusk or night, in fog or with flash. Six
-sunny ones had less. Where the file also tells how high the sun stood, half of a clear day's light is enough. Of 30 other photographs, 18 were taken in rooms, in
-shade and smoke, at dusk and under clouds with a low sun: of nine places in each one of 162 was taken for sunlit. Of 12 in the sun 8 tell it
-(6 by the limit alone); the sea, a meadow, dappled ground and haze do not.
+sunny ones had less. Where the file also tells how high the sun stood, half of a clear day's light is enough. Of 30 other photographs, 18
+were taken in rooms, in shade and smoke, at dusk and under clouds with a low sun: of nine places in each one of 162 was taken for sunlit.
+Of 12 in the sun 8 tell it; the sea, a meadow, dappled ground and haze do not.
 
 A main light that is told is the sun of a clear day: the sky gives the share of the light that the daylight of clear days has (`sky_share`),
 bluer than the sun. Seven cast shadows in five photographs of sunny days kept 0.02 to 0.18 of the light, where it gives 0.15 to 0.22 from 30
