@@ -1,4 +1,4 @@
-"""Focus distances that photographs state, in EXIF, Canon, Nikon and Olympus maker notes and XMP, and how far to trust them.
+"""Focus distances that photographs state, in EXIF, Canon, Nikon, Olympus and Apple maker notes and XMP, and how far to trust them.
 
 Cameras count from the film plane, are coarse (Nikon: steps of 5.9 %) and use sentinels: 0 for "unknown", all ones for "infinity", which
 may be anything beyond their last code (`SentinelReading`).
@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
+from mrbokeh.images.apple_notes import apple_notes
 from mrbokeh.optics.lens import MM_PER_M, lens_distance_m
 
 UINT32_MAX = 0xFFFFFFFF
@@ -87,7 +88,15 @@ def at_infinity(source: str) -> FocusReading:
 
 def read_focus(tags: Tags) -> FocusReading | None:
     """Return the focus distance stated by exiv2's tags, from the most to the least trustworthy source; None where unknown."""
-    readers: tuple[Callable[[Tags], FocusReading | None], ...] = (_canon_interval, _subject_distance, _nikon, _olympus, _canon_shot, _adobe)
+    readers: tuple[Callable[[Tags], FocusReading | None], ...] = (
+        _canon_interval,
+        _subject_distance,
+        _nikon,
+        _olympus,
+        _canon_shot,
+        _apple,
+        _adobe,
+    )
     return next((reading for reader in readers if (reading := reader(tags)) is not None), None)
 
 
@@ -104,6 +113,27 @@ def canon_reading(nearest_m: float, farthest_m: float, source: str) -> FocusRead
         return at_infinity(source)
     middle_dioptres = 0.5 * (1.0 / nearest_m + 1.0 / farthest_m)
     return FocusReading.from_film_plane(1.0 / middle_dioptres, nearest_m, farthest_m, source)
+
+
+def _apple(tags: Tags) -> FocusReading | None:
+    """Read the range in which an iPhone was focused; its middle is that of the dioptres."""
+    note = tags.get("Exif.Photo.MakerNote", "")
+    if not note.startswith(_APPLE):
+        return None
+    try:
+        range_m = apple_notes(bytes(int(each) for each in note.split())).focus_m
+    except ValueError:
+        return None
+    if range_m is None:
+        return None
+    nearest_m, farthest_m = range_m
+    distance_m = 2.0 / (1.0 / nearest_m + 1.0 / farthest_m)
+    source = f"Apple's FocusDistanceRange = {nearest_m:.4g} to {farthest_m:.4g} m"
+    return FocusReading(distance_m, nearest_m=nearest_m, farthest_m=farthest_m, origin="lens", source=source)
+
+
+_APPLE = "65 112 112 108 101 "
+"""How exiv2 writes the bytes of a note that begins with "Apple"."""
 
 
 def rational(text: str | None) -> tuple[int, int] | None:

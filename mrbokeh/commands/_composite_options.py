@@ -134,7 +134,9 @@ class ObjectOptions:
     ] = None
     pitch: Annotated[
         float | None,
-        typer.Option(help="How far the camera looks down, in degrees. Default: by the slope of the ground at --at-pixel, else 0."),
+        typer.Option(
+            help="How far the camera looks down, in degrees. Default: as an iPhone tells, or by the ground at --at-pixel, else 0."
+        ),
     ] = None
     camera_height: Annotated[
         float | None,
@@ -166,7 +168,9 @@ class ObjectOptions:
     shadow: Annotated[
         float | None, typer.Option(min=0.0, max=1.0, help="Darkness of the object's shadow; 1, the default, is what its light gives.")
     ] = None
-    plain: Annotated[bool, typer.Option("--plain", help="Guess nothing: even light, no shadow, a level camera, no grain.")] = False
+    plain: Annotated[
+        bool, typer.Option("--plain", help="Guess nothing: even light, no shadow, a level camera if its file tells nothing, no grain.")
+    ] = False
 
     @property
     def files(self) -> tuple[Path | None, ...]:

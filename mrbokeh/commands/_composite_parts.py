@@ -15,9 +15,9 @@ from mrbokeh.compositing.plate import (
     Plate,
     bundle_plate,
     open_plate,
+    read_matte,
     with_blur_in_metres,
     with_depth,
-    with_matte,
     with_own_alpha,
     with_stereo,
 )
@@ -65,7 +65,7 @@ def plate_by(whole: CompositeOptions, bundle: CaptureBundle | None, *, lens: Len
         plate = replace(plate, depth_note="", metres_guessed=plate.metres_guessed and photo.is_dir())
         if own is not None and plate.blur_from and before_m is not None:
             plate = with_blur_in_metres(plate, before_m, focus_m)
-    return plate if options.matte is None else with_matte(plate, options.matte)
+    return plate if options.matte is None else replace(plate, near_alpha=read_matte(options.matte))
 
 
 def _rgb_of(path: Path, colour: ColourOptions) -> Float32[np.ndarray, "height width 3"]:

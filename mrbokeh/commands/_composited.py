@@ -10,7 +10,7 @@ import numpy as np
 from mrbokeh.commands._composite_layers import held_upright, layers_by
 from mrbokeh.commands._composite_options import CompositeOptions, ObjectOptions, typed_shadow
 from mrbokeh.commands._insertion_options import VirtualOptions
-from mrbokeh.commands._level_ground import focused_on_foot, on_level_ground, sun_by_shadow
+from mrbokeh.commands._level_ground import focused_on_foot, held_told, on_level_ground, sun_by_shadow
 from mrbokeh.compositing.choose import best_mode, insertion_of
 from mrbokeh.compositing.ground import with_ground_behind
 from mrbokeh.compositing.near_and_far import nearer_than
@@ -48,6 +48,8 @@ def placed(plate: Plate, options: CompositeOptions, known_height_m: float | None
     if plate.depth_m is not None:
         standing.require_no_depth()
     guess(plate.depth_note)
+    if plate.world_from_camera is not None and standing.object_ and standing.pitch is None and options.virtual.camera is None:
+        guess(f"by the phone's own level the camera {held_told(plate.world_from_camera)} (--pitch DEGREES)")
     if options.guesses_ground and plate.depth_m is None:
         plate, standing = on_level_ground(plate, standing, known_height_m)
     elif options.guesses_ground:

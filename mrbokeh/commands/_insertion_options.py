@@ -24,17 +24,19 @@ OverwriteOption = Annotated[bool, typer.Option("--overwrite", help="Replace what
 
 @dataclass(frozen=True)
 class NearOptions:
-    """Options of what stands in front of virtual things. near_distance: in metres."""
+    """Options of what stands in front of virtual things. near_distance: of what the matte shows, in metres."""
 
     matte: Annotated[
         Path | None,
         typer.Option(
             metavar="MATTE.png",
-            help="White where something real stands in front, sharp, for --mode between; of a clip also matte.%04d.png.",
+            help="White where something real stands in front, as soft as the photograph shows it; transparent where depth is to tell. "
+            "Of a clip also matte.%04d.png.",
         ),
     ] = None
     near_distance: Annotated[
-        float | None, typer.Option(metavar="METRES", help="How far what --matte shows is, where there is no depth.")
+        float | None,
+        typer.Option(metavar="METRES", help="How far what --matte shows is, which is sharp then; the lens blurs it."),
     ] = None
 
 

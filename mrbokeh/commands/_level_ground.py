@@ -198,9 +198,14 @@ def _told(plate: Plate, solved: SolvedCamera) -> str:
     view = (
         "" if plate.view_known or solved.focal_length_source == GUESSED else f" and sees as {solved.focal_length_35mm:.0f} mm on 35-mm film"
     )
-    turned = f", turned by {solved.roll_deg:.1f}" if abs(solved.roll_deg) >= 0.5 else ""
-    way = "up" if solved.pitch_deg > 0.0 else "down"
-    return f"looks {way} by {abs(solved.pitch_deg):.0f} degrees{turned}{view}"
+    return f"{held_told(looking_down(-math.radians(solved.pitch_deg), math.radians(solved.roll_deg)))}{view}"
+
+
+def held_told(world_from_camera: Float[np.ndarray, "3 3"]) -> str:
+    """Return in words how far a camera looks down or up, and is turned."""
+    down_deg, roll_deg = _down_deg(world_from_camera), math.degrees(math.atan2(world_from_camera[1, 0], world_from_camera[1, 1]))
+    turned = f", turned by {roll_deg:.1f}" if abs(roll_deg) >= 0.5 else ""
+    return f"looks {'up' if down_deg < 0.0 else 'down'} by {abs(down_deg):.0f} degrees{turned}"
 
 
 def _seen_by(plate: Plate, solved: SolvedCamera) -> Plate:

@@ -16,7 +16,7 @@ discs reach a pixel that is asked for are followed.
 
 Under a user's matte, without a sharp scene, picture = alpha F + (1 - alpha) B is solved for F and B (Forte, Approximate Fast Foreground
 Colour Estimation, ICIP 2021): both are local means, then the rest of the mixture is given to them; a coarse round finds the colours, a
-fine one their detail.
+fine one their detail. Where nothing tells how far away it is, the matte is taken as the photograph shows it, blurred already.
 
 Rerendered is the simpler way: the all-in-focus picture with its depth and the virtual layers are blurred in one go.
 """
@@ -38,6 +38,7 @@ from mrbokeh.compositing.near_and_far import (
     reach_px,
     shows_anything,
     virtual_depth_m,
+    with_told_depth,
 )
 from mrbokeh.compositing.plate import Inserted, Plate, same_size
 from mrbokeh.compositing.pupil_shares import PupilMeans, Rays, pupil_points
@@ -226,6 +227,8 @@ def _followed(rays: Rays, bright: Highlights, coc_px: Plane, first: tuple[Plane,
 
 
 _ROUNDS_PX = (91, 7)
+COLOURS_REACH_PX = sum(size_px // 2 for size_px in _ROUNDS_PX)
+"""How far around a pixel colours count for those under a matte."""
 _LEAST = np.float32(1e-5)
 
 Picture = Float32[np.ndarray, "height width 3"]
@@ -239,7 +242,8 @@ class Between:
 
     tolerance: share of its depth by which a photographed surface must be nearer to hide the virtual one (see occlusion_matte).
     pupil_points: rays per pixel where near and virtual edges meet. near_depth_m: distance of what a user's matte (Plate.near_alpha)
-    holds, for photographs without depth. refine_edges: move edges of near things to where the photograph shows them
+    holds, which is sharp then; without it and without depth the matte is as the photograph shows it. refine_edges: move edges of near
+    things to where the photograph shows them
     (mrbokeh.compositing.edge_refinement); False if the depth is exact there. Only the kernels' shares of the pupil are taken from the
     opening of the plate's lens.
     """
@@ -256,7 +260,10 @@ class Between:
         sharp = flatten([replace(layer, extra={}) for layer in layers])
         depth_m = virtual_depth_m(sharp)
         blurred = renderer.render(layers, plate.lens)
+        plate = with_told_depth(plate, depth_m, self.tolerance)
         known, matte = plate, self._matte(plate, depth_m)
+        if self.near_depth_m is None and plate.depth_m is None:
+            return _under_shown_matte(plate, matte, blurred)
         if self.refine_edges:
             known, matte = with_refined_edges(plate, matte, renderer, self.tolerance)
         near_m = self._near_depth_m(known, matte)
@@ -271,6 +278,7 @@ class Between:
     def cut(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> NearAndFar:
         """The sharp scene of a plate cut in two by the layers, one of which shows something."""
         depth_m = virtual_depth_m(flatten([replace(layer, extra={}) for layer in layers]))
+        plate = with_told_depth(plate, depth_m, self.tolerance)
         if plate.sharp_rgb is None:
             raise InputError("to cut the scene in two its all-in-focus picture is needed: give a focal stack")
         matte = self._matte(plate, depth_m)
@@ -279,14 +287,15 @@ class Between:
         return self._cut(plate, matte, self._near_depth_m(plate, matte))
 
     def _matte(self, plate: Plate, depth_m: Plane) -> Plane:
-        """Return the sharp matte of what is near: the user's matte, else by depth."""
-        if plate.near_alpha is not None:
-            return plate.near_alpha
-        if plate.depth_m is None:
+        """Return the matte of what is near: the user's, else by depth."""
+        if plate.depth_m is None and plate.near_alpha is None:
             raise InputError(
                 "to put objects between the layers of a photograph it needs depth (a focal stack or --depth) or a matte of what "
                 "is near: give one, or use the mode front"
             )
+        if plate.near_alpha is not None:
+            return np.nan_to_num(plate.near_alpha, nan=0.0)
+        assert plate.depth_m is not None
         return nearer_than(plate.depth_m, depth_m, self.tolerance).astype(np.float32)
 
     def _near_depth_m(self, plate: Plate, matte: Plane) -> Plane:
@@ -294,7 +303,7 @@ class Between:
         if self.near_depth_m is not None:
             return np.full_like(matte, self.near_depth_m)
         if plate.depth_m is None:
-            raise InputError("a matte of what is near needs its distance: give depth, or the distance in metres (near_depth_m)")
+            raise InputError("a matte of what is near needs its distance here: give depth, or the distance in metres (near_depth_m)")
         return continued(plate.depth_m, matte > _HALF)
 
     def _cut(self, plate: Plate, matte: Plane, near_m: Plane) -> NearAndFar:
@@ -354,6 +363,17 @@ def _mean(picture: Picture, weight: Plane, size_px: int) -> Picture:
 
     total = blur(weight, (size_px, size_px))
     return blur(picture * weight[..., None], (size_px, size_px)) / (total + _LEAST)[..., None]
+
+
+def _under_shown_matte(plate: Plate, matte: Plane, blurred: Layer) -> Inserted:
+    """Put blurred layers behind what a matte holds that is as soft as the photograph shows it."""
+    _front, behind = clean_colours(plate.rgb, matte)
+    past, covered = (np.float32(1.0) - matte)[..., None], np.clip(blurred.alpha, 0.0, 1.0)[..., None]
+    # Where the matte is 0 the photograph's own numbers are all far light.
+    far = np.where(past < 1.0, np.clip(past * behind, 0.0, np.maximum(plate.rgb, 0.0)), plate.rgb)
+    extra = {name: values * past for name, values in blurred.extra.items()}
+    virtual = Layer(blurred.rgb * past, blurred.alpha * past[..., 0], blurred.depth_m, extra)
+    return Inserted(plate.rgb - far * covered, virtual)
 
 
 def _without_sharp_picture(plate: Plate, white: Layer, renderer: Renderer) -> tuple[NearAndFar, Layer]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.compositing.between import Between, Rerendered
+from mrbokeh.compositing.between import COLOURS_REACH_PX, Between, Rerendered
 from mrbokeh.compositing.near_and_far import shows
 from mrbokeh.compositing.over import OverPhotograph, SmoothedMatte
 from mrbokeh.compositing.plate import Inserted, Insertion, Plate, same_size
@@ -39,9 +39,8 @@ class InDirtyRectangle:
         lit = _lit_boxes(same_size(plate, layers))
         if not lit:
             return Inserted(plate.rgb, flatten(layers) if layers else clear(*plate.rgb.shape[:2]))
-        if not (is_same_everywhere(plate.lens) and _blurs_by_aperture(renderer)) or (
-            plate.depth_m is None and plate.near_alpha is not None
-        ):
+        blurs_matte = plate.near_alpha is not None and getattr(self.insertion, "near_depth_m", None) is not None
+        if not (is_same_everywhere(plate.lens) and _blurs_by_aperture(renderer)) or (plate.depth_m is None and blurs_matte):
             return self.insertion.insert(plate, layers, renderer)
         box = _dirty_rectangle(plate, lit)
         found = self.insertion.insert(_cut_plate(plate, box), [box.cut_layer(layer) for layer in layers], renderer)
@@ -68,7 +67,9 @@ def _lit_boxes(layers: Sequence[Layer]) -> list[tuple[Layer, Box]]:
 def _dirty_rectangle(plate: Plate, lit: Sequence[tuple[Layer, Box]]) -> Box:
     reached = [_reached(layer, box, plate.lens) for layer, box in lit]
     arrival = Box(min(b.top for b in reached), max(b.bottom for b in reached), min(b.left for b in reached), max(b.right for b in reached))
-    return arrival.within(plate.rgb.shape) if plate.depth_m is None else _with_sources(arrival, plate.depth_m, plate.lens)
+    if plate.depth_m is None:
+        return arrival.grown(0 if plate.near_alpha is None else COLOURS_REACH_PX).within(plate.rgb.shape)
+    return _with_sources(arrival, plate.depth_m, plate.lens)
 
 
 def _reached(layer: Layer, box: Box, lens: Lens) -> Box:

@@ -5,11 +5,12 @@ edges alone: where the virtual surface cuts through a smooth surface (a table th
 separated from the surfaces that they lie on, since each is seen through one point of the pupil at every place of its blur.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
+from mrbokeh.compositing.plate import Plate
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.hidden_background import split_edges
 from mrbokeh.layering.highlights import find_highlights, without_highlights
@@ -60,6 +61,19 @@ class NearAndFar:
         layer = Layer(self.far_rgb.copy(), np.ones_like(self.far_depth_m), self.far_depth_m)
         layer.rgb.reshape(-1, 3)[self.highlights.places] += self.highlights.rgb
         return layer
+
+
+def with_told_depth(plate: Plate, virtual_depth_m: Plane, tolerance: float) -> Plate:
+    """Return a plate whose depth says what a user's matte with gaps tells: before the virtual surface there, or behind it."""
+    if plate.depth_m is None or plate.near_alpha is None or not np.isnan(plate.near_alpha).any():
+        return plate
+    told, beyond = np.nan_to_num(plate.near_alpha, nan=_GAP), np.float32(1.0 + 2.0 * tolerance)
+    depth_m = np.where(told > _HALF, np.minimum(plate.depth_m, virtual_depth_m / beyond), plate.depth_m)
+    depth_m = np.where(told < _HALF, np.maximum(depth_m, virtual_depth_m * beyond), depth_m)
+    return replace(plate, depth_m=depth_m, near_alpha=None)
+
+
+_HALF = _GAP = 0.5
 
 
 def nearer_than(depth_m: Plane, virtual_depth_m: Plane, tolerance: float) -> Mask:

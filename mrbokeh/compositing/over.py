@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float32
 
+from mrbokeh.compositing.near_and_far import with_told_depth
 from mrbokeh.compositing.plate import Inserted, Plate, same_size
 from mrbokeh.images.layer import Layer, clear, flatten
 from mrbokeh.renderers.base import Renderer
@@ -18,9 +19,10 @@ from mrbokeh.system.errors import InputError
 Plane = Float32[np.ndarray, "height width"]
 
 _LEAST = np.float32(1e-6)
+_TOLERANCE = 0.03
 
 
-def occlusion_matte(virtual_depth_m: Plane, photo_depth_m: Plane, tolerance: float = 0.03, softness: float = 0.02) -> Plane:
+def occlusion_matte(virtual_depth_m: Plane, photo_depth_m: Plane, tolerance: float = _TOLERANCE, softness: float = 0.02) -> Plane:
     """Return the share of the virtual surface that the photographed scene leaves visible: 1 in front of it, 0 behind it.
 
     Depths are compared by their ratio. The photographed surface must be nearer by more than `tolerance` (a share of the depth, the size
@@ -41,14 +43,19 @@ def covered_by(layer: Layer, matte: Plane) -> Layer:
 
 @dataclass(frozen=True)
 class OverPhotograph:
-    """Porter and Duff's "over" of the blurred layers. by_depth: hide what lies behind the photographed scene, where depth is known."""
+    """Porter and Duff's "over" of the blurred layers. by_depth: hide what lies behind the photographed scene, by depth or a matte."""
 
     by_depth: bool = True
 
     def insert(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> Inserted:
         visible = same_size(plate, layers)
+        if self.by_depth and layers:
+            plate = with_told_depth(plate, np.minimum.reduce([layer.depth_m for layer in layers]), _TOLERANCE)
         if self.by_depth and plate.depth_m is not None:
             visible = [covered_by(layer, occlusion_matte(layer.depth_m, plate.depth_m)) for layer in layers]
+        if self.by_depth and plate.near_alpha is not None:
+            seen = np.float32(1.0) - np.nan_to_num(plate.near_alpha, nan=0.0)
+            visible = [covered_by(layer, seen) for layer in visible]
         blurred = renderer.render(visible, plate.lens) if any(layer.alpha.any() for layer in visible) else _nothing(plate, visible)
         return Inserted(behind(plate.rgb, blurred), blurred)
 

@@ -25,6 +25,7 @@ from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.depth.phone_photo import PhoneFocus, PhonePhoto
 from mrbokeh.depth.stereo_depth import stereo_depth
 from mrbokeh.images.alpha_io import is_straight, read_alpha
+from mrbokeh.images.apple_notes import held_by_phone
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
 from mrbokeh.images.xmp import jpeg_xmp
@@ -33,7 +34,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.solving.sun_of_photograph import SunOfPhotograph, sun_of_photograph
 from mrbokeh.stacks.capture_bundle import CaptureBundle
-from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
+from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, read_focal_stack
 from mrbokeh.stacks.guessed_metres import is_lens_guessed
 from mrbokeh.stacks.photograph import Photograph, lens_for_photograph, read_photograph
 from mrbokeh.system.channel import guess
@@ -48,7 +49,8 @@ class Plate:
 
     rgb: (H, W, 3) linear, blurred by the real lens. depth_m: (H, W) of the sharp scene or None. lens: as focused for this photograph.
     sharp_rgb: (H, W, 3) the same view all in focus (of a focal stack), in the colours of rgb, or None.
-    near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects, sharp; or None.
+    near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects: sharp where its distance is known
+    (by depth or told), else as the photograph shows it; NaN where depth is to tell; or None.
     alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
     depth_note: what is known and what is guessed of a phone's own depth and focus, in words.
     metres_guessed: of a stack that knows no focus distance, and of a phone's depth without a unit; blur is right in pixels all the same.
@@ -152,7 +154,8 @@ def photograph_plate(photo: Path, photograph: Photograph, phone: PhonePhoto | No
         _require_no_panorama(photo, photograph)
     held = held_lens(photo, photograph, phone, wishes)
     plate = with_own_alpha(plate_of(photograph.rgb, held.lens), photo, read_alpha(photo, photograph.orientation))
-    plate = replace(plate, white_lux=held.white_lux, sun=None if held.white_lux is None else sun_of_photograph(photo))
+    plate = replace(plate, white_lux=held.white_lux, world_from_camera=held_by_phone(photo))
+    plate = replace(plate, sun=None if held.white_lux is None else sun_of_photograph(photo))
     if phone is None:
         return replace(plate, focus_known=held.focus_known, view_known=held.view_known, rough_focus_m=held.rough_focus_m)
     original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
@@ -329,9 +332,16 @@ def with_stereo(
 _HANDS_BREADTH_M = 0.1
 
 
-def with_matte(plate: Plate, path: Path) -> Plate:
-    """The plate with a user's matte of what stands in front, whose numbers are taken as coverage."""
-    return replace(plate, near_alpha=np.ascontiguousarray(read_image(path, "linear")[..., 1]))
+def read_matte(path: Path) -> Float32[np.ndarray, "height width"]:
+    """Read a user's matte of what stands in front: numbers are coverage, NaN where it is transparent; of a cut-out, its alpha."""
+    picture, alpha = read_image(path, "linear"), read_alpha(path)
+    if alpha is None:
+        return np.ascontiguousarray(picture[..., 1])
+    coloured = np.ptp(picture, axis=2)[alpha > _HALF] > _COLOURED
+    return alpha if coloured.any() else np.where(alpha < _HALF, np.float32(np.nan), picture[..., 1])
+
+
+_HALF, _COLOURED = 0.5, 0.02
 
 
 def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus_m: float | None) -> Plate:
@@ -340,15 +350,20 @@ def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus
         raise InputError(
             f"{folder} is a focal stack of {len(stack)} slices: choose one with --slice 0 to {len(stack) - 1}, or --all-slices"
         )
-    focused = stack.registered_lens_of(slice_index) if lens is None else lens.focused_at(stack.lens_of(slice_index).focus_distance_m)
-    focused = focused if focus_m is None else focused.focused_at(focus_m)
+    focused, blur_from = slice_lens(stack, slice_index, lens, focus_m)
     rgb = stack.slice_rgb(slice_index)
     camera = stack.camera or camera_of_lens(stack.lens_of(stack.reference), rgb.shape[1], rgb.shape[0])
     # A stack of a scene knows where its camera stood; objects are placed in camera axes.
     upright = replace(camera, camera_from_world=np.eye(4))
     plate = Plate(rgb=rgb, depth_m=stack.depth_m(), lens=focused, camera=upright, sharp_rgb=stack.all_in_focus())
+    return replace(plate, metres_guessed=not stack.metres_known, blur_from=blur_from)
+
+
+def slice_lens(stack: FocalStack, slice_index: int, lens: Lens | None, focus_m: float | None) -> tuple[Lens, str]:
+    """Return the lens of a slice, and where its blur is from (`Plate.blur_from`). lens, focus_m: in place of its own."""
+    focused = stack.registered_lens_of(slice_index) if lens is None else lens.focused_at(stack.lens_of(slice_index).focus_distance_m)
     guessed = lens is None and is_lens_guessed(stack)
-    return replace(plate, metres_guessed=not stack.metres_known, blur_from="blur as measured in the slices" if guessed else "")
+    return focused if focus_m is None else focused.focused_at(focus_m), "blur as measured in the slices" if guessed else ""
 
 
 @dataclass(frozen=True)

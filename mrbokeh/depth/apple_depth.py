@@ -2,10 +2,11 @@
 
 Apple's depth is an auxiliary picture, in HEIC or behind a JPEG, whose own XMP says what its numbers mean: codes from IntMinValue to
 IntMaxValue are even from FloatMinValue to FloatMaxValue, in 1/m (disparity) or m (depth). Its Accuracy is "absolute", or "relative" where
-the phone knows what is nearer, but not how many metres (AVDepthData, developer.apple.com). The file does not tell where it was focused; the
-depth does, of what takes up much of the subject area. Where Exif calls the picture a portrait (CustomRendered 7 or 8), the phone has
-blurred it, which is taken for the blur of full frame at SimulatedAperture. Of an iPhone 13 Pro's portrait at f/2.8, edges in front of
-the focus have 23 to 32 px where that gives 32, and edges far behind it 43 to 49 px where it gives 24 to 28.
+the phone knows what is nearer, but not how many metres (AVDepthData, developer.apple.com), which the range of its focus tells where its
+maker note has that. The file does not tell at which place it was focused; the depth does, of what takes up much of the subject area.
+Where Exif calls the picture a portrait (CustomRendered 7 or 8), the phone has blurred it, which is taken for the blur of full frame at
+SimulatedAperture. Of an iPhone 13 Pro's portrait at f/2.8, edges in front of the focus have 23 to 32 px where that gives 32, and edges
+far behind it 43 to 49 px where it gives 24 to 28.
 """
 
 import re
@@ -19,6 +20,7 @@ from jaxtyping import Float32
 
 from mrbokeh.depth.depth_map import DepthMap, without_steps
 from mrbokeh.depth.phone_photo import PhoneFocus, PhonePhoto
+from mrbokeh.images.apple_notes import apple_notes
 from mrbokeh.images.exif import (
     AS_STORED,
     exif_and_size,
@@ -98,7 +100,28 @@ def apple_photo(data: bytes, path: Path, near_far_m: tuple[float, float] | None)
         return None
     stored, orientation = apple_depth_map(found, path, near_far_m), AS_STORED if is_heif(path) else stored_orientation(path)
     depth = replace(stored, depth_m=upright(stored.depth_m, orientation), valid=upright(stored.valid, orientation))
-    return PhonePhoto(depth, None, _apple_focus(depth, found, path))
+    focus = _apple_focus(depth, found, path)
+    if focus is not None and near_far_m is None and found.xmp.get(_APPLE + "Accuracy", "") != "absolute":
+        depth, focus = _in_metres(depth, focus, path)
+    return PhonePhoto(depth, None, focus)
+
+
+def _in_metres(depth: DepthMap, focus: PhoneFocus, path: Path) -> tuple[DepthMap, PhoneFocus]:
+    """Return a relative depth in which the focus lies as far away as the phone's maker note tells, and that focus; else both as they are.
+
+    The blur in pixels stays.
+    """
+    note = _facts(path)[0].get(_MAKER_NOTE)
+    range_m = apple_notes(note).focus_m if isinstance(note, bytes) else None
+    if range_m is None:
+        return depth, focus
+    stated_m = 2.0 / (1.0 / range_m[0] + 1.0 / range_m[1])
+    metres = (depth.depth_m * np.float32(stated_m / focus.focus_distance_m)).astype(np.float32)
+    told = f"portrait depth of the phone (metres so that its focus is {stated_m:.2g} m away, as the file tells)"
+    return replace(depth, depth_m=metres, note=told), replace(focus, focus_distance_m=stated_m, note="")
+
+
+_MAKER_NOTE = 0x927C
 
 
 def apple_depth_map(found: AppleDepth, path: Path, near_far_m: tuple[float, float] | None = None) -> DepthMap:

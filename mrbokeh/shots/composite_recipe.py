@@ -79,7 +79,7 @@ class BoxedInsertion:
         self._hidden, self._blurred = Kept(_hidden_layers), Kept(self._blur)
 
     def insert(self, plate: Plate, layers: Sequence[Layer]) -> Part:
-        if not (self._keeps and is_same_everywhere(plate.lens)):
+        if not (self._keeps and is_same_everywhere(plate.lens) and plate.near_alpha is None):
             return Part(None, self._insertion.insert(plate, layers, self._renderer))
         box = self._box(same_size(plate, layers), plate.lens)
         if box.is_empty:

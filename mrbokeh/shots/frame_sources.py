@@ -8,14 +8,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.compositing.plate import Inserted, Plate
+from mrbokeh.compositing.plate import Inserted, Plate, read_matte
 from mrbokeh.compositing.plate_look.colour_match import ColourMatch, triple_of
 from mrbokeh.compositing.plate_look.exposure_match import stated_exposure
 from mrbokeh.compositing.plate_look.finishing import Finishing, LookOptions, finished, finishing_of
 from mrbokeh.depth.depth_filters import TemporalDepthFilter
 from mrbokeh.depth.open_depth import depth_of_file
 from mrbokeh.images.color_management import NamedSpace
-from mrbokeh.images.image_io import read_image
 from mrbokeh.optics.camera import Camera, have_same_shape
 from mrbokeh.shots.inputs import CameraSource, DepthSource, Finisher, FocusSource, Kept, MatteSource, Moment
 from mrbokeh.system.atomic_files import read_json
@@ -138,7 +137,7 @@ class MatteFiles:
 
 class _Mattes:
     def __init__(self, path: Path) -> None:
-        self._path, self._read = path, Kept(lambda name: np.ascontiguousarray(read_image(Path(name), "linear")[..., 1]))
+        self._path, self._read = path, Kept(lambda name: read_matte(Path(name)))
 
     def near_alpha_at(self, moment: Moment) -> Plane:
         return _of_size(self._read(str(numbered(self._path, moment.number))), moment, self._path)

@@ -98,6 +98,20 @@ class SolvedCamera:
         """Return the camera with the width of its sensor along the rows of the picture, None if it is unknown."""
         return replace(self, sensor_width_mm=width_mm)
 
+    def resized(self, width_px: int, height_px: int) -> "SolvedCamera":
+        """Return the camera of the same picture in another size; its sizes in pixels go by the width."""
+        factor, own, own_sd = width_px / self.width_px, self.solved_focal_length_px, self.solved_focal_length_sd_px
+        return replace(
+            self,
+            width_px=width_px,
+            height_px=height_px,
+            focal_length_px=factor * self.focal_length_px,
+            focal_length_sd_px=factor * self.focal_length_sd_px,
+            solved_focal_length_px=None if own is None else factor * own,
+            solved_focal_length_sd_px=None if own_sd is None else factor * own_sd,
+            segments_px=factor * self.segments_px,
+        )
+
     def camera(self) -> Camera:
         """Return the pinhole, which stands camera_height_m above the world's origin."""
         pose = np.eye(4)

@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
 from mrbokeh.compositing.between import Between, clean_colours, virtual_highlights
+from mrbokeh.compositing.choose import insertion_of
 from mrbokeh.compositing.near_and_far import NO_HIGHLIGHTS, NearAndFar, cut_in_two, nearer_than
+from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.compositing.plate import Plate, plate_of
 from mrbokeh.compositing.pupil_shares import Rays, pupil_points, transmission
 from mrbokeh.images.layer import Layer, opaque
@@ -134,8 +137,43 @@ def test_each_setting_matters_and_what_is_missing_is_asked_for() -> None:
     virtual, bare = half_plane(True, VIRTUAL_M, RED), replace(photograph(), depth_m=None, sharp_rgb=None)
     with pytest.raises(InputError, match=r"needs depth .* or a matte"):
         Between().insert(bare, [virtual], ScatterReference())
-    with pytest.raises(InputError, match="needs its distance"):
-        Between().insert(replace(bare, near_alpha=virtual.alpha), [virtual], ScatterReference())
+    with pytest.raises(InputError, match="all-in-focus picture is needed"):
+        Between().cut(replace(bare, near_alpha=virtual.alpha), [virtual], ScatterReference())
+
+
+def test_a_matte_without_distance_is_as_the_photograph_shows_it() -> None:
+    """The green half plane is blurred in the photograph; the matte states that very coverage, and the lens does not blur it again.
+
+    Where no virtual light arrives the photograph stays bit for bit; a part of the frame gives what the whole gives.
+    """
+    near = np.tile(half_share(LENS, NEAR_M).astype(np.float32), (HEIGHT, 1))
+    plate = replace(photograph(), depth_m=None, sharp_rgb=None, near_alpha=near)
+    expected = near[0, 24:-24, None] * GREEN + (1.0 - near[0, 24:-24, None]) * RED
+    # Means of both colours hold some of one another.
+    np.testing.assert_allclose(middle_row(plate, whole_wall(), Between())[0], expected, atol=0.04)
+    near = cv2.resize(near, (8 * WIDTH, HEIGHT), interpolation=cv2.INTER_LINEAR)
+    rgb = np.random.default_rng(3).uniform(0.1, 1.0, (HEIGHT, 8 * WIDTH, 3)).astype(np.float32)
+    plate = replace(plate_of(rgb, LENS.focused_at(VIRTUAL_M)), near_alpha=near)
+    alpha = np.zeros_like(near)
+    alpha[:, 3 * WIDTH : 5 * WIDTH] = 1.0
+    small = Layer(alpha[..., None] * RED, alpha, np.where(alpha > 0, VIRTUAL_M, np.inf).astype(np.float32))
+    whole, part = (insertion.insert(plate, [small], ScatterReference()) for insertion in (Between(), insertion_of("between")))
+    np.testing.assert_allclose(part.rgb, whole.rgb, atol=2e-6)
+    untouched = whole.virtual.alpha == 0.0
+    assert untouched.any() and (part.rgb[untouched] == plate.rgb[untouched]).all()
+
+
+def test_depth_tells_where_a_matte_says_nothing() -> None:
+    """NaN everywhere is as no matte; 1 in the upper half hides what depth would show, 0 in the lower shows what depth would hide."""
+    plate, virtual = photograph(), whole_wall()
+    silent = replace(plate, near_alpha=np.full_like(virtual.alpha, np.nan))
+    for insertion in (Between(), OverPhotograph()):
+        usual = insertion.insert(plate, [virtual], ScatterReference()).rgb
+        assert (insertion.insert(silent, [virtual], ScatterReference()).rgb == usual).all()
+        told = silent.near_alpha.copy()
+        told[: HEIGHT // 2], told[HEIGHT // 2 :, : EDGE - 12] = 1.0, 0.0
+        seen = insertion.insert(replace(plate, near_alpha=told), [virtual], ScatterReference()).virtual.alpha
+        assert seen[10, -8] < 0.02 and seen[-8, 24] > 0.9 and seen[-8, -8] > 0.98
 
 
 def test_the_edge_of_an_object_cuts_the_disc_of_a_light_behind_it() -> None:

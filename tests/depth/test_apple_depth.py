@@ -14,6 +14,7 @@ from mrbokeh.depth.depth_map import DepthSettings
 from mrbokeh.depth.open_depth import open_depth
 from mrbokeh.depth.phone_depth import PhonePhoto, read_phone_photo
 from mrbokeh.refocus import open_sharp
+from tests.support.apple_note import apple_note
 from tests.support.made_heic import Item, auxiliary, nclx, turned, write_heic
 from tests.support.refusals import refused
 
@@ -45,6 +46,8 @@ def exif_of(rendered: int = 8, orientation: int = 1, **more: object) -> bytes:
     exif.get_ifd(0x8769).update({0x920A: IFDRational(57, 10), 0x829D: IFDRational(15, 10), 0xA405: 26, 0xA401: rendered})
     if "subject_area" in more:
         exif.get_ifd(0x8769)[0x9214] = more["subject_area"]
+    if "note" in more:
+        exif.get_ifd(0x8769)[0x927C] = more["note"]
     if "focus_m" in more:
         exif.get_ifd(0x8769)[0x9206] = IFDRational(int(1000 * float(str(more["focus_m"]))), 1000)
     return exif.tobytes()
@@ -144,6 +147,22 @@ def test_a_focus_that_exif_states_is_not_called_guessed(tmp_path: Path) -> None:
     plate = open_plate(heic(tmp_path / "p.heic", xmp_of(), focus_m=0.5))
     assert plate.lens.focus_distance_m == pytest.approx(0.5, rel=0.02)
     assert "focus is guessed" not in plate.depth_note and "full frame at f/2.8" in plate.depth_note
+
+
+def test_the_range_of_the_focus_gives_a_relative_depth_its_metres(tmp_path: Path) -> None:
+    """2 / (1 / 0.8 + 1 / 1.6) = 1.067 m, where the depth has 0.25: all metres grow by that, and the blur in pixels stays."""
+    plain, told = (found(heic(tmp_path / f"{len(note)}.heic", xmp_of(), **({"note": note} if note else {}))) for note in (b"", FOCUSED))
+    assert plain.focus is not None and told.focus is not None
+    stated_m = 2.0 / (1.0 / 0.8 + 1.0 / 1.6)
+    assert told.focus.focus_distance_m == pytest.approx(stated_m) and not told.focus.note and "as the file tells" in told.depth.note
+    np.testing.assert_allclose(told.depth.depth_m, plain.depth.depth_m * stated_m / plain.focus.focus_distance_m, rtol=1e-5)
+    assert told.focus.blur_at_infinity == plain.focus.blur_at_infinity
+    absolute = found(heic(tmp_path / "a.heic", xmp_of(accuracy="absolute"), note=FOCUSED))
+    np.testing.assert_array_equal(absolute.depth.depth_m, plain.depth.depth_m)
+    assert open_plate(tmp_path / f"{len(FOCUSED)}.heic").lens.focus_distance_m == pytest.approx(stated_m, rel=0.02)
+
+
+FOCUSED = apple_note({12: [(8, 10), (16, 10)]})
 
 
 def test_composite_takes_depth_lens_and_blur_from_the_file(tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from capture.stacks.ingest import ingest
 from capture.stacks.slice_files import bounded_focus_records, stated_by_sentinel
 from mrbokeh.optics.lens import Lens, lens_distance_m
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack
+from tests.support.apple_note import apple_note
 from tests.support.made_photographs import LENS, make_shoot, only_stack, sources
 
 
@@ -232,3 +233,13 @@ def test_steps_to_a_sentinel_are_not_judged() -> None:
     assert told.is_even and told.usual_step == pytest.approx(0.2) and told.largest_step == pytest.approx(1.0)
     assert len(told.focus_dioptres) == 6, "charts show all slices"
     assert focus_spacing(distances_m, np.zeros(6, bool)).is_even
+
+
+def test_the_range_of_an_iphone_is_a_focus() -> None:
+    """Between 0.8 and 1.6 m; its middle is that of the dioptres. Other notes and damaged ones tell none."""
+    note = " ".join(map(str, apple_note({12: [(16, 10), (8, 10)]})))
+    found = read_focus({"Exif.Photo.MakerNote": note})
+    assert found is not None and (found.nearest_m, found.farthest_m, found.origin) == (0.8, 1.6, "lens")
+    assert found.distance_m == pytest.approx(1.0667, rel=1e-3) and "FocusDistanceRange" in found.source
+    assert read_focus({"Exif.Photo.MakerNote": "78 105 107"}) is None and read_focus({"Exif.Photo.MakerNote": note[:60]}) is None
+    assert read_focus({"Exif.Photo.MakerNote": "65 112 112 108 101 x"}) is None

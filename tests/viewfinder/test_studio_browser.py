@@ -207,6 +207,60 @@ async def test_two_fingers_scale_and_turn_and_the_wheel_too(tmp_path: Path) -> N
         assert float(made.desk.state.height or 0) == pytest.approx(1.5 * high / np.e, rel=0.06)
 
 
+@pytest.mark.parametrize("size_px", [DESK, UPRIGHT], ids=["desk", "upright"])
+async def test_what_is_in_front_is_painted(tmp_path: Path, size_px: tuple[int, int]) -> None:
+    """A dark tile of the floor is painted over the cake; then a smaller brush says that it is behind, and both are undone."""
+    async with opened(tmp_path, size_px) as (page, made):
+        await placed(page, made)
+        await page.tap("#brush")
+        assert not await page.value("document.getElementById('brush_row').hidden")
+        assert "paint over" in await page.value(MESSAGE)
+        left, top, width, height = await page.box("#stage")
+        await dragged(page, (left + 0.45 * width, top + 0.7 * height), (0.1 * width, 0.0), mouse=size_px == DESK)
+        await page.comes_true("studio.told.state.matte !== null && !studio.isChanging", 30.0)
+        await page.comes_true("!document.getElementById('matte').hidden && document.getElementById('matte').naturalWidth > 0")
+        first = made.desk.state
+        assert first.at_px == (0.5 * WIDTH, 0.8 * HEIGHT) and first.matte is not None, "the object stays"
+        await page.tap("#brush_behind")
+        await page.send("Input.dispatchMouseEvent", type="mouseWheel", x=left + width / 2, y=top + height / 2, deltaX=0, deltaY=200)
+        await page.comes_true("document.getElementById('brush_size').valueAsNumber < 35")
+        await page.tap("#stage", 0.5, 0.7)
+        await page.comes_true(f"studio.told.state.matte !== '{first.matte}'", 30.0)
+        await page.tap("#undo")
+        await page.comes_true(f"studio.told.state.matte === '{first.matte}'")
+        await pressed(page, "Escape")
+        await page.comes_true("document.getElementById('matte').hidden && document.getElementById('brush_row').hidden")
+        await page.comes_true(RESTS, 60.0)
+        assert "--matte" in await page.value("document.getElementById('command').textContent")
+        assert page.errors == []
+
+
+@pytest.mark.parametrize("size_px", [DESK, LEVEL], ids=["desk", "level"])
+async def test_lines_are_drawn_corrected_and_removed(tmp_path: Path, size_px: tuple[int, int]) -> None:
+    """Two edges of tiles ahead and one across: the horizon lies in the middle of the picture, where the tilt had it elsewhere."""
+    async with opened(tmp_path, size_px, StudioState(photo=write_floor(tmp_path / "floor.png"), pitch_deg=9.0)) as (page, made):
+        await page.tap("#draw_lines")
+        edges = [("z", 0.583, 0.611, 0.833, 0.944), ("z", 0.417, 0.611, 0.1, 0.944), ("x", 0.1, 0.83, 0.9, 0.83)]
+        for count, (axis, x1, y1, x2, y2) in enumerate(edges, 1):
+            await page.tap(f"#axis_{axis}")
+            left, top, width, height = await page.box("#stage")
+            await dragged(page, (left + x1 * width, top + y1 * height), ((x2 - x1) * width, (y2 - y1) * height), mouse=size_px == DESK)
+            await page.comes_true(f"studio.told.state.lines.length === {count} && studio.told.busy === '' && !studio.isChanging", 30.0)
+        assert "drawn lines" in await page.value(MESSAGE)
+        await page.tap("#axis_z")
+        # The end of the second line was beside its edge: it is dragged there.
+        await dragged(page, (left + 0.1 * width, top + 0.944 * height), (0.067 * width, 0.0), mouse=size_px == DESK)
+        await page.comes_true(f"studio.told.state.lines[1][2] > {0.15 * WIDTH} && studio.told.busy === '' && !studio.isChanging", 30.0)
+        assert len(made.desk.state.lines) == 3 and made.desk.state.lines[1][2] == pytest.approx(40, abs=WIDTH / 100)
+        assert made.desk.state.camera is not None
+        await page.comes_true("Math.abs(studio.told.photo.pitch_deg) < 1.0")
+        await page.tap("#stage", 0.5, 0.83)
+        await page.comes_true("studio.told.state.lines.length === 2 && studio.told.busy === ''", 30.0)
+        await page.tap("#brush")
+        assert await page.value("document.getElementById('lines_row').hidden && document.getElementById('lines').childElementCount === 0")
+        assert page.errors == []
+
+
 async def test_light_lens_and_before_are_shown(tmp_path: Path) -> None:
     photo = write_floor(tmp_path / "floor.png")
     async with opened(tmp_path, DESK, StudioState(photo=photo, pitch_deg=0.0)) as (page, made):
@@ -224,6 +278,9 @@ async def test_light_lens_and_before_are_shown(tmp_path: Path) -> None:
         await page.value("document.querySelector('#lenses img').parentElement.click()")
         await page.comes_true(f"studio.told.state.lens === '{tmp_path / 'ring.json'}'")
         await page.comes_true("document.querySelector('#lenses img').naturalWidth > 0")
+        await page.comes_true("/^Black [0-9.]+ %, white [0-9.]+ %/.test(document.getElementById('clipped').textContent)")
+        painted = "document.getElementById('histogram').getContext('2d').getImageData(0, 0, 256, 80).data.filter((each) => each).length"
+        assert await page.value(painted) > 1000
         await page.comes_true(RESTS, 60.0)
         left, top, _width, _height = await page.box("#hold_before")
         shown = "!document.getElementById('before').hidden"
@@ -262,6 +319,8 @@ async def test_the_page_is_accessible(tmp_path: Path, size_px: tuple[int, int]) 
     async with opened(tmp_path, size_px) as (page, made):
         await placed(page, made)
         await page.value("document.querySelectorAll('details').forEach((each) => (each.open = true))")
+        await page.tap("#brush")
+        await page.tap("#draw_lines")
         await page.value(AXE.read_text() + "; 0")
         found = await page.value(
             "axe.run(document, {runOnly: ['wcag2a', 'wcag2aa', 'wcag21a', 'wcag21aa']})"
@@ -275,8 +334,37 @@ async def test_the_page_is_accessible(tmp_path: Path, size_px: tuple[int, int]) 
             reached.add(
                 await page.value("document.activeElement.id || document.activeElement.dataset.format || document.activeElement.tagName")
             )
-        wanted = {"stage", "undo", "focus_here", "grid", "hold_before", "magnify", "object", "height", "turn", "focus", "f_number"}
-        wanted |= {"sun_right", "sun_above", "exposure", "shadow", "matched", "pitch", "camera_height", "png", "copy", "open_photo"}
+        wanted = {
+            "stage",
+            "undo",
+            "focus_here",
+            "grid",
+            "hold_before",
+            "magnify",
+            "brush",
+            "draw_lines",
+            "object",
+            "height",
+            "turn",
+            "focus",
+            "f_number",
+        }
+        wanted |= {
+            "height",
+            "turn",
+            "focus",
+            "f_number",
+            "sun_right",
+            "sun_above",
+            "exposure",
+            "shadow",
+            "matched",
+            "pitch",
+            "camera_height",
+            "png",
+            "copy",
+            "open_photo",
+        }
         assert wanted <= reached, wanted - reached
 
 

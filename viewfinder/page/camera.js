@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 0159210b49709554ee65b35c4c49fe48bb470f30ac99bb89b9b3383f8c08c33b
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 7b33c71e8924ed56d143e3de0c368d454d1f309047d06ce72a70b12b909e6975
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 0159210b49709554ee65b35c4c49fe48bb470f30ac99bb89b9b3383f8c08c33b
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 7b33c71e8924ed56d143e3de0c368d454d1f309047d06ce72a70b12b909e6975
 "use strict";
 (() => {
   // src/model.ts
@@ -259,8 +259,45 @@
   };
   var studio = new Studio();
 
-  // src/studio_panel.ts
+  // src/studio_histogram.ts
   var byId = (id) => document.getElementById(id);
+  var COLOURS = ["#ff6b6b", "#5ee078", "#6db3ff"];
+  var LEVELS = 256;
+  var REST_MS = 200;
+  var Histogram = class {
+    later;
+    constructor() {
+      studio.addEventListener("picture", () => {
+        clearTimeout(this.later);
+        this.later = setTimeout(() => this.draw(), REST_MS);
+      });
+    }
+    draw() {
+      const picture = byId("picture");
+      const canvas = byId("histogram");
+      if (!picture.width || !canvas.offsetWidth) return;
+      const { data } = picture.getContext("2d").getImageData(0, 0, picture.width, picture.height);
+      const counts = COLOURS.map(() => new Uint32Array(LEVELS));
+      for (let i = 0; i < data.length; i++) if (i % 4 < 3) counts[i % 4][data[i]]++;
+      const pixels = data.length / 4;
+      const most = Math.max(1, ...counts.flatMap((each) => [...each.subarray(1, LEVELS - 1)]));
+      const context = canvas.getContext("2d");
+      context.clearRect(0, 0, canvas.width, canvas.height);
+      context.globalCompositeOperation = "lighter";
+      counts.forEach((each, channel) => {
+        context.fillStyle = COLOURS[channel] + "90";
+        for (let level = 0; level < LEVELS; level++) {
+          const high = Math.min(1, each[level] / most) * canvas.height;
+          context.fillRect(level, canvas.height - high, 1, high);
+        }
+      });
+      const share = (level) => (100 * Math.max(...counts.map((each) => each[level])) / pixels).toFixed(1);
+      byId("clipped").textContent = `Black ${share(0)} %, white ${share(LEVELS - 1)} % of the pixels.`;
+    }
+  };
+
+  // src/studio_panel.ts
+  var byId2 = (id) => document.getElementById(id);
   var F_NUMBERS = [1, 1.2, 1.4, 1.8, 2, 2.2, 2.4, 2.8, 3.2, 3.5, 4, 4.5, 5, 5.6, 6.3, 7.1, 8, 9, 10, 11, 13, 14, 16, 18, 20, 22, 25, 29, 32];
   var LONG_FORMATS = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers" };
   var DEFAULT_SUN = [-60, 40];
@@ -302,40 +339,41 @@
       for (const each of SLIDERS) this.slider(each);
       for (const each of NUMBERS) this.number(each.id, each.name, each.also ?? {});
       this.height();
+      this.slices();
       this.switches();
       this.dome();
       this.result();
       this.files();
-      const react = (id, changes) => byId(id).addEventListener("click", () => void studio.commit(changes()));
+      const react = (id, changes) => byId2(id).addEventListener("click", () => void studio.commit(changes()));
       react("focus_auto", () => ({ focus_m: null, focus_at_px: null }));
       react("f_number_auto", () => ({ f_number: null }));
       react("camera_found", () => ({ camera: studio.told?.camera?.file ?? null, pitch_deg: null }));
-      byId("object").addEventListener("change", (event) => {
+      byId2("object").addEventListener("change", (event) => {
         const object = event.target.value;
         if (object) void studio.commit({ object, height: null });
         else studio.remove();
       });
-      byId("chosen").addEventListener("change", (event) => void studio.commit(studio.choosing(Number(event.target.value))));
-      byId("add").addEventListener("change", (event) => {
+      byId2("chosen").addEventListener("change", (event) => void studio.commit(studio.choosing(Number(event.target.value))));
+      byId2("add").addEventListener("change", (event) => {
         const select = event.target;
         if (select.value) void studio.add(select.value);
         select.value = "";
       });
-      byId("remove").addEventListener("click", () => studio.remove());
-      for (const [id, by] of [["undo", -1], ["redo", 1]]) byId(id).addEventListener("click", () => void studio.step(by));
+      byId2("remove").addEventListener("click", () => studio.remove());
+      for (const [id, by] of [["undo", -1], ["redo", 1]]) byId2(id).addEventListener("click", () => void studio.step(by));
       studio.addEventListener("told", () => this.told());
       studio.addEventListener("state", () => this.state());
       studio.addEventListener("picture", () => this.shown());
-      studio.addEventListener("sentence", () => byId("message").textContent = studio.sentence);
+      studio.addEventListener("sentence", () => byId2("message").textContent = studio.sentence);
     }
     slider(each) {
-      const input = byId(each.id);
+      const input = byId2(each.id);
       if (each.id === "f_number") input.max = String(F_NUMBERS.length - 1);
       input.addEventListener("input", () => studio.change(each.write(input.valueAsNumber)));
       input.addEventListener("change", () => void studio.commit(each.write(input.valueAsNumber)));
     }
     number(id, name, also) {
-      const input = byId(id);
+      const input = byId2(id);
       input.addEventListener("change", () => {
         const value = input.value === "" ? null : input.valueAsNumber;
         if (value !== null && !(value > 0)) return studio.say("give a number above 0, or nothing for automatic");
@@ -343,20 +381,33 @@
       });
     }
     height() {
-      const input = byId("height");
+      const input = byId2("height");
       input.addEventListener("change", () => void studio.commit({ height: input.value.trim().replace(",", ".") || null }));
     }
+    /** Another picture of the stack is opened once the hand lets the handle go. */
+    slices() {
+      const input = byId2("slice");
+      input.addEventListener("input", () => this.sliceTold(input.valueAsNumber));
+      input.addEventListener("change", () => void studio.commit({ slice: input.valueAsNumber }));
+    }
+    sliceTold(slice) {
+      const photo = studio.told?.photo;
+      const metres = photo?.focus_distances_m?.[slice];
+      const told = `${slice + 1} of ${photo?.slices ?? 1}${metres ? `, focused at ${Number(metres.toPrecision(3))} m` : ""}`;
+      byId2("slice_row").querySelector("output").textContent = told;
+      byId2("slice").setAttribute("aria-valuetext", told);
+    }
     switches() {
-      const auto = byId("sun_auto");
+      const auto = byId2("sun_auto");
       auto.addEventListener("change", () => void studio.commit(auto.checked ? { sun_deg: null } : sun([right(), above()])));
-      const matched = byId("matched");
+      const matched = byId2("matched");
       matched.addEventListener("change", () => void studio.commit({ matched: matched.checked }));
-      const plain = byId("plain");
+      const plain = byId2("plain");
       plain.addEventListener("change", () => void studio.commit(plain.checked ? { plain: true, sun_deg: null } : { plain: false }));
     }
     /** The handle on the dome: the middle is overhead, the rim the horizon, up is ahead. */
     dome() {
-      const dome = byId("dome");
+      const dome = byId2("dome");
       const moved = (event) => {
         const box = dome.getBoundingClientRect();
         const [x, y] = [(event.clientX - box.left) / box.width * 220 - 110, (event.clientY - box.top) / box.height * 220 - 110];
@@ -371,22 +422,22 @@
       dome.addEventListener("pointerup", () => void studio.commit());
     }
     result() {
-      byId("copy").addEventListener("click", () => {
-        const text = byId("command").textContent ?? "";
+      byId2("copy").addEventListener("click", () => {
+        const text = byId2("command").textContent ?? "";
         const done = () => studio.say("the command is copied");
         navigator.clipboard?.writeText(text).then(done, () => studio.say("the browser does not let this page copy: select the command by hand"));
-        if (!navigator.clipboard) getSelection()?.selectAllChildren(byId("command"));
+        if (!navigator.clipboard) getSelection()?.selectAllChildren(byId2("command"));
       });
     }
     files() {
       for (const id of ["open_photo", "open_object"]) {
-        const input = byId(id);
+        const input = byId2(id);
         input.addEventListener("change", () => {
           for (const file of input.files ?? []) void studio.upload(file);
           input.value = "";
         });
       }
-      const drop = byId("drop");
+      const drop = byId2("drop");
       addEventListener("dragover", (event) => {
         event.preventDefault();
         drop.hidden = false;
@@ -401,12 +452,21 @@
     /** What the server tells beside the state. */
     told() {
       const told = studio.told;
-      byId("undo").disabled = !told.can_undo;
-      byId("redo").disabled = !told.can_redo;
-      byId("camera_told").textContent = told.photo?.has_depth ? "The photograph has depth: the ground slopes as that says." : told.camera?.told ?? (told.photo ? "The camera is looked for in the picture's lines." : "");
-      byId("camera_found").disabled = told.camera?.file === void 0;
-      byId("plain").disabled = Boolean(told.photo && !told.photo.has_depth && !told.state.plain);
-      byId("kept").textContent = `Everything is kept in ${told.project}`;
+      byId2("undo").disabled = !told.can_undo;
+      byId2("redo").disabled = !told.can_redo;
+      byId2("camera_told").textContent = told.photo?.has_depth ? "The photograph has depth: the ground slopes as that says." : told.camera?.told ?? (told.photo ? "The camera is looked for in the picture's lines." : "");
+      byId2("camera_found").disabled = told.camera?.file === void 0;
+      byId2("plain").disabled = Boolean(told.photo && !told.photo.has_depth && !told.state.plain);
+      const photo = told.photo;
+      byId2("slice_row").hidden = photo?.slices === void 0;
+      document.querySelectorAll(".of_one").forEach((each) => each.hidden = photo?.slices !== void 0);
+      if (photo?.slices !== void 0) {
+        const input = byId2("slice");
+        input.max = String(photo.slices - 1);
+        input.value = String(told.state.slice ?? 0);
+        this.sliceTold(input.valueAsNumber);
+      }
+      byId2("kept").textContent = `Everything is kept in ${told.project}`;
       this.choices();
       this.saves(told.saves);
       this.state();
@@ -415,13 +475,13 @@
       const told = studio.told;
       offer("object", [["", "choose one"], ...told.objects.map((each) => [each.path, each.name])]);
       offer("add", [["", "choose one"], ...told.objects.map((each) => [each.path, each.name])]);
-      const lenses = byId("lenses");
+      const lenses = byId2("lenses");
       if (lenses.dataset.shown !== JSON.stringify(told.lenses)) {
         lenses.dataset.shown = JSON.stringify(told.lenses);
         lenses.querySelectorAll("label").forEach((each) => each.remove());
         lenses.append(lensChoice("", "as the photograph tells", null), ...told.lenses.map((each, i) => lensChoice(each.path, each.name, i)));
       }
-      const formats = byId("formats");
+      const formats = byId2("formats");
       if (!formats.childElementCount) {
         for (const format of told.formats) {
           const button = document.createElement("button");
@@ -437,13 +497,13 @@
       }
     }
     saves(saves) {
-      byId("saves").replaceChildren(...saves.map(saveLine));
+      byId2("saves").replaceChildren(...saves.map(saveLine));
     }
     state() {
       const state = studio.state;
       if (!state) return;
       for (const each of SLIDERS) {
-        const input = byId(each.id);
+        const input = byId2(each.id);
         const value = each.read(state);
         if (document.activeElement !== input || input.valueAsNumber !== value) input.value = String(value);
         const output = input.closest("label").querySelector("output");
@@ -452,42 +512,42 @@
       }
       for (const { id, name } of NUMBERS) this.fill(id, state[name] === null ? "" : String(state[name]));
       this.fill("height", state.height ?? "");
-      byId("object").value = state.object ?? "";
+      byId2("object").value = state.object ?? "";
       const objects = studio.objects;
       offer("chosen", objects.map((each, number) => [String(number), `${number + 1}: ${nameOf(each.object)}`]));
-      byId("chosen").value = String(state.before.length);
-      byId("chosen_row").hidden = objects.length < 2;
-      byId("add_row").hidden = !objects.length;
-      byId("sun_auto").checked = state.sun_deg === null;
-      byId("matched").checked = state.matched;
-      byId("plain").checked = state.plain;
+      byId2("chosen").value = String(state.before.length);
+      byId2("chosen_row").hidden = objects.length < 2;
+      byId2("add_row").hidden = !objects.length;
+      byId2("sun_auto").checked = state.sun_deg === null;
+      byId2("matched").checked = state.matched;
+      byId2("plain").checked = state.plain;
       document.querySelectorAll("input[name=lens]").forEach((each) => each.checked = each.value === (state.lens ?? ""));
       const [turn, high] = state.sun_deg ?? DEFAULT_SUN;
       const reach = (90 - high) / 0.9;
-      const lamp = byId("lamp");
+      const lamp = byId2("lamp");
       lamp.setAttribute("cx", String(reach * Math.sin(turn * Math.PI / 180)));
       lamp.setAttribute("cy", String(-reach * Math.cos(turn * Math.PI / 180)));
-      byId("dome").classList.toggle("off", state.sun_deg === null);
-      byId("command").textContent = (studio.isChanging ? studio.shown?.command : studio.told?.command) ?? "Place an object first.";
+      byId2("dome").classList.toggle("off", state.sun_deg === null);
+      byId2("command").textContent = (studio.isChanging ? studio.shown?.command : studio.told?.command) ?? "Place an object first.";
       document.querySelectorAll("#formats button").forEach((each) => each.disabled = !studio.isComplete);
-      byId("focus_told").textContent = focusTold(state);
+      byId2("focus_told").textContent = focusTold(state);
     }
     fill(id, text) {
-      const input = byId(id);
+      const input = byId2(id);
       if (document.activeElement !== input) input.value = text;
     }
     shown() {
       const shown = studio.shown;
-      byId("guessed").replaceChildren(
+      byId2("guessed").replaceChildren(
         ...[...shown.guessed, ...shown.warnings].map((sentence) => Object.assign(document.createElement("li"), { textContent: sentence }))
       );
-      if (studio.isChanging) byId("command").textContent = shown.command ?? "";
-      if (studio.state) byId("focus_told").textContent = focusTold(studio.state);
+      if (studio.isChanging) byId2("command").textContent = shown.command ?? "";
+      if (studio.state) byId2("focus_told").textContent = focusTold(studio.state);
     }
   };
   var nameOf = (path) => path.replace(/^.*[\\/]/, "").replace(/\.\w+$/, "");
   function offer(id, choices) {
-    const select = byId(id);
+    const select = byId2(id);
     if (select.dataset.shown === JSON.stringify(choices)) return;
     select.dataset.shown = JSON.stringify(choices);
     select.replaceChildren(...choices.map(([value, name]) => new Option(name, value)));
@@ -495,12 +555,12 @@
   function focusTold(state) {
     const shown = studio.shown;
     if (!shown || !studio.isComplete) return "Click Focus here, then what is to be in focus.";
-    const from = state.focus_m !== null || state.focus_at_px !== null ? "as chosen" : studio.told?.photo?.focus_m ? "as the photograph states" : "on the object";
+    const from = state.focus_m !== null || state.focus_at_px !== null ? "as chosen" : studio.told?.photo?.focus_m ? "as the photograph states" : studio.told?.photo?.slices ? "as the stack tells" : "on the object";
+    if (studio.told?.photo?.focus_distances_m?.length === 0) return `The stack does not know its metres; the object is blurred${blurTold(shown.coc_px)}.`;
     const at = shown.focus_m === null ? "infinity" : `${Number(shown.focus_m.toPrecision(3))} m`;
-    const [least, most] = [shown.coc_px[0], shown.coc_px[1]];
-    const blur = least === void 0 || most === void 0 ? "" : `; the object is blurred by ${least.toFixed(1)} to ${most.toFixed(1)} px of the photograph`;
-    return `Focused at ${at}, ${from}${blur}.`;
+    return `Focused at ${at}, ${from}; the object is blurred${blurTold(shown.coc_px)}.`;
   }
+  var blurTold = ([least, most]) => least === void 0 || most === void 0 ? " by its distance" : ` by ${least.toFixed(1)} to ${most.toFixed(1)} px of the photograph`;
   function lensChoice(path, name, number) {
     const label = document.createElement("label");
     const input = Object.assign(document.createElement("input"), { type: "radio", name: "lens", value: path });
@@ -580,6 +640,176 @@
       gestures.pinch(Math.exp(-event.deltaY / 400), event.clientX, event.clientY, 0, 0, event.deltaX / 8);
     }, { passive: false });
   }
+
+  // src/studio_brush.ts
+  var byId3 = (id) => document.getElementById(id);
+  var MOST_POINTS = 2e3;
+  var Brush = class {
+    size = byId3("brush_size");
+    drawn = byId3("stroke");
+    tint = byId3("matte");
+    points = [];
+    waiting = 0;
+    constructor() {
+      const button = byId3("brush");
+      button.addEventListener("click", () => {
+        button.setAttribute("aria-pressed", String(!this.on));
+        studio.say(this.on ? "paint over what is in front of the object: the edge snaps to the picture's" : "", this.on);
+        this.show();
+      });
+      const behind = byId3("brush_behind");
+      behind.addEventListener("click", () => behind.setAttribute("aria-pressed", String(behind.getAttribute("aria-pressed") !== "true")));
+      byId3("brush_clear").addEventListener("click", () => void studio.commit({ matte: null }));
+      const stage = byId3("stage");
+      stage.addEventListener("pointerleave", () => this.points.length || this.drawn.replaceChildren());
+      studio.addEventListener("state", () => this.show());
+    }
+    get on() {
+      return byId3("brush").getAttribute("aria-pressed") === "true";
+    }
+    get radius_px() {
+      return this.size.valueAsNumber / 1e3 * (studio.told?.photo?.width_px ?? 1e3);
+    }
+    /** Show the brush's settings, and what it has told so far. */
+    show() {
+      const matte = studio.state?.matte ?? null;
+      byId3("stage").classList.toggle("painting", this.on);
+      byId3("brush_row").hidden = !this.on;
+      byId3("brush_clear").disabled = !matte;
+      this.tint.hidden = !this.on || !matte;
+      if (!this.on) this.drawn.replaceChildren();
+      const source = `/matte?of=${encodeURIComponent(matte ?? "")}`;
+      if (matte && this.on && this.tint.getAttribute("src") !== source) this.tint.src = source;
+    }
+    /** A wheel or two fingers change the brush's size. */
+    scale(factor) {
+      this.size.valueAsNumber *= factor;
+    }
+    start(at_px) {
+      this.points = [at_px];
+      this.draw();
+    }
+    move(at_px) {
+      const last = this.points.at(-1);
+      if (!last || Math.hypot(at_px[0] - last[0], at_px[1] - last[1]) < this.radius_px / 6 || this.points.length >= MOST_POINTS) return;
+      this.points.push(at_px);
+      this.draw();
+    }
+    /** The ring of the brush under a pointer that only hovers. */
+    hover(at_px) {
+      if (this.points.length || this.waiting) return;
+      this.points = [at_px];
+      this.draw();
+      this.points = [];
+    }
+    async end() {
+      const photo = studio.told.photo;
+      const within = (value, most) => Number(Math.min(most, Math.max(0, value)).toFixed(1));
+      const points = this.points.map(([x, y]) => [within(x, photo.width_px), within(y, photo.height_px)]);
+      const front = byId3("brush_behind").getAttribute("aria-pressed") !== "true";
+      this.points = [];
+      this.waiting++;
+      studio.say("finding the edge ...", true);
+      const told = await studio.post("/paint", { points, radius: Math.max(1, this.radius_px), front });
+      if (told) studio.take(told);
+      if (--this.waiting) return;
+      this.drawn.replaceChildren();
+      if (told) studio.say("");
+    }
+    draw() {
+      const photo = studio.told?.photo;
+      if (!photo) return;
+      this.drawn.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
+      const line = document.createElementNS(this.drawn.namespaceURI, "path");
+      const data = this.points.map(([x, y], i) => `${i ? "L" : "M"}${x.toFixed(1)} ${y.toFixed(1)}`).join("");
+      line.setAttribute("d", this.points.length > 1 ? data : `${data}l0.01 0`);
+      line.setAttribute("stroke-width", String(2 * this.radius_px));
+      this.drawn.replaceChildren(line);
+    }
+  };
+
+  // src/studio_lines.ts
+  var byId4 = (id) => document.getElementById(id);
+  var AXES = ["y", "x", "z"];
+  var NEAR = 16;
+  var SHORTEST = 12;
+  var Lines = class {
+    drawn = byId4("lines");
+    axis = "y";
+    lines = null;
+    /** The end that is dragged: line, and 0 or 2 for its first coordinate. */
+    end = [0, 2];
+    constructor() {
+      const button = byId4("draw_lines");
+      button.addEventListener("click", () => {
+        button.setAttribute("aria-pressed", String(!this.on));
+        studio.say(this.on ? "draw along two edges of one direction and one of another: the ground follows; tap a line to remove it" : "", this.on);
+        this.draw();
+      });
+      for (const axis of AXES) {
+        byId4(`axis_${axis}`).addEventListener("click", () => {
+          this.axis = axis;
+          for (const each of AXES) byId4(`axis_${each}`).setAttribute("aria-pressed", String(each === axis));
+        });
+      }
+      byId4("lines_clear").addEventListener("click", () => void studio.commit({ lines: [] }));
+      studio.addEventListener("state", () => this.draw());
+      studio.addEventListener("told", () => this.on && studio.state?.lines.length && studio.say(studio.told?.camera?.told ?? "", true));
+    }
+    get on() {
+      return byId4("draw_lines").getAttribute("aria-pressed") === "true";
+    }
+    /** Take the near end of a line of the chosen direction, or begin a new line. px: pixels of the photograph in one of the window. */
+    start(at_px, px) {
+      this.lines = (studio.state?.lines ?? []).map((each) => [...each]);
+      const ends = this.lines.flatMap((each, line) => [0, 2].map((i) => ({ line, i, away: Math.hypot(each[i] - at_px[0], each[i + 1] - at_px[1]) })));
+      const nearest = ends.sort((one, other) => one.away - other.away).find((each) => this.lines[each.line][4] === this.axis);
+      if (nearest && nearest.away < NEAR * px) this.end = [nearest.line, nearest.i];
+      else this.end = [this.lines.push([at_px[0], at_px[1], at_px[0], at_px[1], this.axis]) - 1, 2];
+    }
+    move(at_px) {
+      const photo = studio.told?.photo;
+      const line = this.lines?.[this.end[0]];
+      if (!photo || !line) return;
+      const within = (value, most) => Number(Math.min(most, Math.max(0, value)).toFixed(1));
+      line[this.end[1]] = within(at_px[0], photo.width_px);
+      line[this.end[1] + 1] = within(at_px[1], photo.height_px);
+      this.draw();
+    }
+    stop(px) {
+      const lines = this.lines?.filter((each) => Math.hypot(each[2] - each[0], each[3] - each[1]) > SHORTEST * px);
+      this.lines = null;
+      if (lines) void studio.commit({ lines });
+    }
+    /** Remove the line under a finger. */
+    tap([x, y], px) {
+      const lines = studio.state?.lines ?? [];
+      const away = ([x1, y1, x2, y2]) => {
+        const along = Math.min(1, Math.max(0, ((x - x1) * (x2 - x1) + (y - y1) * (y2 - y1)) / Math.hypot(x2 - x1, y2 - y1) ** 2));
+        return Math.hypot(x1 + along * (x2 - x1) - x, y1 + along * (y2 - y1) - y);
+      };
+      const nearest = [...lines].sort((one, other) => away(one) - away(other))[0];
+      if (nearest && away(nearest) < NEAR * px) void studio.commit({ lines: lines.filter((each) => each !== nearest) });
+    }
+    draw() {
+      const photo = studio.told?.photo;
+      const lines = this.lines ?? studio.state?.lines ?? [];
+      byId4("lines_row").hidden = !this.on;
+      byId4("lines_clear").disabled = !lines.length;
+      this.drawn.replaceChildren();
+      if (!photo || !this.on) return;
+      this.drawn.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
+      const size = photo.width_px / this.drawn.clientWidth;
+      for (const [x1, y1, x2, y2, axis] of lines) {
+        const line = document.createElementNS(this.drawn.namespaceURI, "path");
+        const ring = (x, y) => `M${x - 5 * size} ${y}a${5 * size} ${5 * size} 0 1 0 ${10 * size} 0a${5 * size} ${5 * size} 0 1 0 ${-10 * size} 0`;
+        line.setAttribute("d", `M${x1} ${y1}L${x2} ${y2}${ring(x1, y1)}${ring(x2, y2)}`);
+        line.setAttribute("class", axis);
+        line.setAttribute("vector-effect", "non-scaling-stroke");
+        this.drawn.append(line);
+      }
+    }
+  };
 
   // src/studio_ground.ts
   var ACROSS = 5;
@@ -711,7 +941,7 @@
   var LOUPE_PX = 240;
   var DRAWN_AGAIN_MS = 900;
   var LOOKS_MS = 150;
-  var byId2 = (id) => document.getElementById(id);
+  var byId5 = (id) => document.getElementById(id);
   function scaledHeight(height, factor) {
     if (height === null) return null;
     const unit = height.endsWith("px") ? "px" : "";
@@ -719,11 +949,13 @@
   }
   var within180 = (turn_deg) => ((turn_deg + 180) % 360 + 360) % 360 - 180;
   var PictureStage = class {
-    stage = byId2("stage");
-    picture = byId2("picture");
-    before = byId2("before");
-    ground = byId2("ground");
-    loupe = byId2("loupe");
+    stage = byId5("stage");
+    picture = byId5("picture");
+    before = byId5("before");
+    ground = byId5("ground");
+    loupe = byId5("loupe");
+    brush = new Brush();
+    lines = new Lines();
     photoName = "";
     hint = "";
     from = null;
@@ -732,7 +964,7 @@
     looking;
     quiet;
     constructor() {
-      new ResizeObserver(() => this.fit()).observe(byId2("room"));
+      new ResizeObserver(() => this.fit()).observe(byId5("room"));
       studio.addEventListener("told", () => this.fit());
       studio.addEventListener("state", () => this.mark());
       studio.addEventListener("picture", (event) => this.show(event.detail));
@@ -744,14 +976,14 @@
     fit() {
       const photo = studio.told?.photo ?? null;
       this.stage.hidden = !photo;
-      byId2("welcome").hidden = Boolean(photo);
+      byId5("welcome").hidden = Boolean(photo);
       if (!photo) return;
-      const room = byId2("room").getBoundingClientRect();
+      const room = byId5("room").getBoundingClientRect();
       const scale = Math.min(room.width / photo.width_px, room.height / photo.height_px);
       this.stage.style.width = `${photo.width_px * scale}px`;
       this.stage.style.height = `${photo.height_px * scale}px`;
       studio.pixels = Math.max(4e4, photo.width_px * photo.height_px * (scale * devicePixelRatio) ** 2);
-      const name = `${photo.name} ${studio.told?.state.photo} ${photo.width_px}`;
+      const name = `${photo.name} ${studio.told?.state.photo} ${photo.slice ?? ""} ${photo.width_px}`;
       if (name !== this.photoName) {
         this.photoName = name;
         this.hint = "";
@@ -784,9 +1016,9 @@
     mark() {
       const [photo, state] = [studio.told?.photo ?? null, studio.state];
       const ground = groundOf(photo, state);
-      const wanted = byId2("grid").getAttribute("aria-pressed") === "true";
+      const wanted = byId5("grid").getAttribute("aria-pressed") === "true";
       this.stage.classList.toggle("placed", Boolean(state?.at_px));
-      const badge = byId2("badge");
+      const badge = byId5("badge");
       badge.textContent = this.next();
       badge.hidden = !badge.textContent;
       this.ground.replaceChildren();
@@ -800,7 +1032,7 @@
         this.words(`one square: ${ground.cell_m} m`, photo.width_px * 0.015, photo.height_px * 0.985, photo.width_px / this.stage.clientWidth);
       }
       if (photo && !studio.isComplete && this.before.complete && this.before.naturalWidth) this.showPhotograph();
-      const box = byId2("box");
+      const box = byId5("box");
       const sides = studio.isComplete ? this.boxOf(state.before.length) : null;
       box.hidden = !sides;
       if (sides) {
@@ -829,6 +1061,10 @@
       const box = this.stage.getBoundingClientRect();
       const photo = studio.told.photo;
       return [(x - box.left) / box.width * photo.width_px, (y - box.top) / box.height * photo.height_px];
+    }
+    /** Pixels of the photograph in one of the window. */
+    get px() {
+      return studio.told.photo.width_px / this.stage.clientWidth;
     }
     inside(at_px) {
       const photo = studio.told.photo;
@@ -862,28 +1098,38 @@
         tap: (x, y) => this.tapped(x, y),
         twice: (x, y) => this.tapped(x, y),
         dragStart: (x, y) => {
+          if (this.brush.on) return this.brush.start(this.pixel(x, y));
+          if (this.lines.on) return this.lines.start(this.pixel(x, y), this.px);
           if (this.loupe.hidden) this.chose(x, y);
           this.from = studio.state?.at_px ?? this.inside(this.pixel(x, y));
           this.moved = [0, 0];
           this.stage.classList.add("dragging");
         },
-        drag: (_x, _y, dx, dy) => {
+        drag: (x, y, dx, dy) => {
+          if (this.brush.on) return this.brush.move(this.pixel(x, y));
+          if (this.lines.on) return this.lines.move(this.pixel(x, y));
           if (!this.from || !studio.state?.object || !this.loupe.hidden) return;
-          const scale = studio.told.photo.width_px / this.stage.clientWidth;
-          this.moved = [this.moved[0] + dx * scale, this.moved[1] + dy * scale];
+          this.moved = [this.moved[0] + dx * this.px, this.moved[1] + dy * this.px];
           studio.change({ at_px: this.inside([this.from[0] + this.moved[0], this.from[1] + this.moved[1]]) });
         },
         dragEnd: () => {
+          if (this.brush.on) return void this.brush.end();
+          if (this.lines.on) return this.lines.stop(this.px);
           this.from = null;
           this.stage.classList.remove("dragging");
           void studio.commit();
         },
-        pinch: (factor, _x, _y, _dx, _dy, turn_deg) => this.shape(factor, turn_deg)
+        pinch: (factor, _x, _y, _dx, _dy, turn_deg) => this.brush.on ? this.brush.scale(factor) : this.shape(factor, turn_deg)
       });
     }
     tapped(x, y) {
       this.stage.focus();
       if (!studio.told?.photo) return;
+      if (this.brush.on) {
+        this.brush.start(this.pixel(x, y));
+        return void this.brush.end();
+      }
+      if (this.lines.on) return this.lines.tap(this.pixel(x, y), this.px);
       if (this.stage.classList.contains("focusing")) return this.focusAt(x, y);
       if (this.chose(x, y)) return void studio.commit();
       if (!studio.state?.object) return studio.say("choose an object first: in the list at the right, or drop a GLB file");
@@ -909,7 +1155,7 @@
     focusAt(x, y) {
       const photo = studio.told.photo;
       const at_px = this.inside(this.pixel(x, y));
-      byId2("focus_here").click();
+      byId5("focus_here").click();
       if (photo.has_depth) return void studio.commit({ focus_at_px: at_px, focus_m: null });
       const ground = groundOf(photo, studio.state);
       if (!ground) return studio.say("the plain ground has no distance to focus on: turn Plain off, or type the metres");
@@ -938,7 +1184,8 @@
         event.preventDefault();
       });
       document.addEventListener("keydown", (event) => {
-        if (event.key === "Escape" && this.stage.classList.contains("focusing")) byId2("focus_here").click();
+        const tool = this.brush.on ? "brush" : this.lines.on ? "draw_lines" : this.stage.classList.contains("focusing") ? "focus_here" : null;
+        if (event.key === "Escape" && tool) byId5(tool).click();
         if (!(event.ctrlKey || event.metaKey) || event.target.matches?.("input[type=text], input[type=number]")) return;
         const key = event.key.toLowerCase();
         if (key !== "z" && key !== "y") return;
@@ -948,7 +1195,7 @@
     }
     buttons() {
       const pressed = (id, told) => {
-        const button = byId2(id);
+        const button = byId5(id);
         button.addEventListener("click", () => {
           const on = button.getAttribute("aria-pressed") !== "true";
           button.setAttribute("aria-pressed", String(on));
@@ -956,13 +1203,21 @@
         });
       };
       pressed("grid", () => this.mark());
+      const tools = ["focus_here", "brush", "draw_lines"];
+      const isOn = (id) => byId5(id).getAttribute("aria-pressed") === "true";
+      for (const id of tools) {
+        byId5(id).addEventListener("click", () => isOn(id) || tools.filter((each) => each !== id && isOn(each)).forEach((each) => byId5(each).click()), true);
+      }
       pressed("focus_here", (on) => {
         this.stage.classList.toggle("focusing", on);
         studio.say(on ? "click what is to be in focus: the object, or a place on the ground" : "", on);
       });
       pressed("magnify", (on) => this.loupe.hidden = !on);
-      this.stage.addEventListener("pointermove", (event) => !this.loupe.hidden && this.magnify(event));
-      const hold = byId2("hold_before");
+      this.stage.addEventListener("pointermove", (event) => {
+        if (!this.loupe.hidden) this.magnify(event);
+        if (this.brush.on && studio.told?.photo) this.brush.hover(this.pixel(event.clientX, event.clientY));
+      });
+      const hold = byId5("hold_before");
       const show = (on) => {
         this.before.hidden = !on;
       };
@@ -997,8 +1252,8 @@
   // src/studio.ts
   async function start() {
     await enter();
-    const [picture, panel] = [new PictureStage(), new Panel()];
-    Object.assign(window, { studio, parts: { picture, panel } });
+    const [picture, panel, histogram] = [new PictureStage(), new Panel(), new Histogram()];
+    Object.assign(window, { studio, parts: { picture, panel, histogram } });
     await studio.follow();
   }
   start().catch((problem) => studio.say(problem instanceof Error ? problem.message : "the studio does not answer", true));

@@ -16,7 +16,10 @@ app = typer.Typer(add_completion=False)
 def studio(
     photo: Annotated[
         Path | None,
-        typer.Argument(metavar="PHOTO", help="A photograph (RAW, JPEG, HEIC, TIFF, PNG), or the .json project of an earlier time."),
+        typer.Argument(
+            metavar="PHOTO",
+            help="A photograph (RAW, JPEG, HEIC, TIFF, PNG), the folder of a merged focal stack, or the .json project of an earlier time.",
+        ),
     ] = None,
     object_: Annotated[
         list[Path] | None, typer.Option("--object", help="GLB file to render and put in (repeat: the page offers them).")
@@ -47,6 +50,8 @@ def studio(
     Every state shows the `mrbokeh composite` command that makes the same picture. Without PHOTO the page asks for one.
 
     Example: mrbokeh studio photo.jpg --object cake.glb
+
+    Example: mrbokeh studio SCENE/view_2 --object cake.glb
 
     Example: mrbokeh studio photo.studio.json --lan
     """

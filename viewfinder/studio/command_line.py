@@ -41,7 +41,7 @@ def options_of(state: StudioState) -> CompositeOptions:
     focus_at = None if state.focus_at_px is None else ",".join(str(int(each)) for each in state.focus_at_px)
     return CompositeOptions(
         photo=state.photo,
-        taken=PlateOptions(depth=state.depth),
+        taken=PlateOptions(slice_=state.slice, depth=state.depth, matte=state.matte),
         standing=standing,
         virtual=VirtualOptions(camera=state.camera),
         look=LookGroup() if state.matched else LookGroup(grain="off", match_black="off"),

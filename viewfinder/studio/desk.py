@@ -12,10 +12,11 @@ from mrbokeh.system.channel import apart, say
 from mrbokeh.system.errors import InputError
 from viewfinder.studio.project import Project
 from viewfinder.studio.saving import Saves
-from viewfinder.studio.state import StudioState, state_of
+from viewfinder.studio.state import DrawnLine, Stroke, StudioState, state_of
 
 if TYPE_CHECKING:
     from mrbokeh.solving.solved_camera import SolvedCamera
+    from viewfinder.studio.brush import Brush
     from viewfinder.studio.photograph import OpenedPhotograph
 
 _log = logging.getLogger(__name__)
@@ -23,7 +24,8 @@ _log = logging.getLogger(__name__)
 LARGEST = {"photo": 300 << 20, "object": 200 << 20}
 """Bytes of what is dropped on the page."""
 _OBJECTS = (".glb",)
-_KEPT_PHOTOGRAPHS = 2
+_KEPT_PHOTOGRAPHS = 6
+_TELL_TILT = "set below how far the camera looks down, or draw lines along edges"
 _BESIDE = 0.15
 """How far beside another an object is added, in widths of the photograph."""
 
@@ -38,9 +40,12 @@ class Desk:
         self.busy = ""
         self._number = 0
         self._changed = asyncio.Event()
-        self._opened: dict[tuple[Path | None, Path | None], OpenedPhotograph] = {}
+        self._opened: dict[tuple[Path | None, Path | None, int | None], OpenedPhotograph] = {}
         self._cameras: dict[Path, dict[str, Any]] = {}
+        self._drawn: dict[tuple[DrawnLine, ...], dict[str, Any]] = {}
         self._tasks: set[asyncio.Task[None]] = set()
+        self._strokes = asyncio.Lock()
+        self._brush: tuple[OpenedPhotograph, Brush] | None = None
 
     @property
     def state(self) -> StudioState:
@@ -49,7 +54,7 @@ class Desk:
     @property
     def photograph(self) -> "OpenedPhotograph | None":
         """The opened photograph of the state, None while there is none."""
-        return self._opened.get((self.state.photo, self.state.depth))
+        return self._opened.get((self.state.photo, self.state.depth, self.state.slice))
 
     @property
     def number(self) -> int:
@@ -74,7 +79,7 @@ class Desk:
     def start(self) -> None:
         """Open the photograph of the state, if there is one."""
         if self.state.photo is not None:
-            self._begin(self._open(self.state.photo, self.state.depth))
+            self._begin(self._open())
 
     async def close(self) -> None:
         for task in self._tasks:
@@ -102,14 +107,41 @@ class Desk:
             "lens": [*self.project.lenses],
             "photo": [self.state.photo],
             "depth": [self.state.depth],
+            "matte": [self.state.matte],
             "camera": [self.state.camera, Path(found) if found else None],
         }
 
     async def change(self, changes: Any) -> None:
         """Take changes of a page over, complete what follows from them, and keep the project."""
-        self.project.add(self.changed_state(changes))
+        before, state, opened = self.state.lines, self.changed_state(changes), self.photograph
+        if opened is not None and opened.stack is not None and state.focus_at_px is not None:
+            state = replace(state, slice=opened.slice_in_focus(*state.focus_at_px), focus_at_px=None)
+        self.project.add(state)
         self._keep()
+        if self.state.photo is not None and opened is not None and self.photograph is None:
+            await self._open()
+        if self.state.lines != before:
+            await self._by_hand()
         await self._complete()
+
+    async def _by_hand(self) -> None:
+        """Give the state the camera of its drawn lines, or without any that of the picture's own."""
+        state, opened = self.state, self.photograph
+        if opened is None or state.photo is None:
+            return
+        found = self._cameras.get(state.photo, {})
+        if state.lines:
+            file = _free(self.uploads / f"{state.photo.stem}.drawn.camera.json")
+            self.busy = "looking for the camera of the lines"
+            self.tell_all()
+            try:
+                found = self._drawn[state.lines] = await asyncio.to_thread(_camera_of_lines, opened, state.lines, file)
+            finally:
+                self.busy = ""
+        if self.state == state:
+            camera = Path(found["file"]) if found.get("file") and (state.lines or found.get("is_sure")) else None
+            self.project.amend(lambda state: replace(state, camera=camera, pitch_deg=None))
+        self._keep()
 
     async def add_object(self, path: Any) -> None:
         """Add an object that the page was offered, beside the chosen one. Raises InputError."""
@@ -123,6 +155,24 @@ class Desk:
         self._keep()
         await self._complete()
 
+    async def paint(self, stroke: Stroke) -> None:
+        """Add a stroke of the brush to what is told to be in front; strokes come one after the other. Raises InputError."""
+        from viewfinder.studio.brush import Brush
+
+        async with self._strokes:
+            opened, state = self.photograph, self.state
+            if opened is None:
+                raise InputError("there is no photograph to paint on yet: drop one on the page")
+            if self._brush is None or self._brush[0] is not opened:
+                self._brush = opened, Brush(opened.path, opened.stack, has_depth=opened.has_depth)
+            png = await asyncio.to_thread(self._brush[1].matte, state.matte, stroke)
+            self.uploads.mkdir(parents=True, exist_ok=True)
+            path = _free(self.uploads / f"{opened.path.stem}_in_front.png")
+            await asyncio.to_thread(path.write_bytes, png)
+            if self.photograph is opened:
+                self.project.add(replace(self.state, matte=_short(path)))
+                self._keep()
+
     async def step(self, by: Any) -> None:
         """Undo or redo."""
         if by not in (-1, 1):
@@ -130,7 +180,7 @@ class Desk:
         self.project.step(int(by))
         self._keep()
         if self.state.photo is not None and self.photograph is None:
-            self._begin(self._open(self.state.photo, self.state.depth))
+            self._begin(self._open())
 
     async def upload(self, kind: str, name: str, body: AsyncIterator[bytes]) -> None:
         """Keep a file that was dropped on the page, if it is what it should be. Raises InputError."""
@@ -152,7 +202,7 @@ class Desk:
         else:
             self.project.add(StudioState(photo=path, object=self.state.object, lens=self.state.lens))
             self._keep()
-            self._begin(self._open(path, None))
+            self._begin(self._open())
 
     def _require_photograph(self, path: Path) -> None:
         from viewfinder.studio.photograph import open_photograph
@@ -175,19 +225,27 @@ class Desk:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _open(self, path: Path, depth: Path | None) -> None:
-        """Open a photograph, then look for its camera."""
+    async def _open(self) -> None:
+        """Open the state's photograph, or its slice of a stack, then look for its camera."""
+        state = self.state
+        path, depth = state.photo, state.depth
+        assert path is not None
         self.busy = "opening the photograph"
         self.tell_all()
         try:
-            opened, camera = await asyncio.to_thread(_opened_photograph, path, depth)
+            opened, camera = await asyncio.to_thread(_opened_photograph, path, depth, state.slice)
             while len(self._opened) >= _KEPT_PHOTOGRAPHS:
                 del self._opened[next(iter(self._opened))]
-            self._opened[path, depth] = opened
+            self._opened[path, depth, opened.slice] = opened
+            if opened.stack is not None:
+                _ = self.state == state and self.project.amend(lambda state: replace(state, slice=opened.slice))
+                self._cameras.setdefault(path, {})
             self.busy = "looking for the camera in the picture's lines" if path not in self._cameras else ""
             self.tell_all()
             if path not in self._cameras:
-                self._cameras[path] = await asyncio.to_thread(_camera_found, camera, self.uploads / f"{path.stem}.camera.json")
+                self._cameras[path] = await asyncio.to_thread(
+                    _camera_found, camera, self.uploads / f"{path.stem}.camera.json", "picture's straight", _TELL_TILT
+                )
                 self._take_camera(path)
             await self._complete()
         except InputError as error:
@@ -202,7 +260,13 @@ class Desk:
         """Give the state the camera of the picture's lines, if it is still that photograph's and nobody chose how it was held."""
         state, found = self.state, self._cameras[path]
         opened = self.photograph
-        is_free = state.camera is None and state.pitch_deg is None and opened is not None and not opened.has_depth
+        is_free = (
+            state.camera is None
+            and state.pitch_deg is None
+            and opened is not None
+            and not opened.has_depth
+            and opened.plate.world_from_camera is None
+        )
         if state.photo == path and is_free and found.get("is_sure"):
             self.project.amend(lambda state: replace(state, camera=Path(found["file"])))
             self._keep()
@@ -219,15 +283,19 @@ class Desk:
 
     def camera_told(self) -> dict[str, Any] | None:
         """Return what the picture's lines tell of its camera, or why they do not; None while they are looked at."""
+        if self.state.lines:
+            return self._drawn.get(self.state.lines, {"told": "The camera is that of the drawn lines.", "file": str(self.state.camera)})
         return None if self.state.photo is None else self._cameras.get(self.state.photo)
 
 
-def _opened_photograph(path: Path, depth: Path | None) -> "tuple[OpenedPhotograph, Callable[[], SolvedCamera | str]]":
+def _opened_photograph(
+    path: Path, depth: Path | None, slice_index: int | None
+) -> "tuple[OpenedPhotograph, Callable[[], SolvedCamera | str]]":
     """Return the photograph, and what looks for its camera: it returns the camera, or the sentence why there is none."""
     from viewfinder.studio.photograph import open_photograph, solved
 
     with apart() as words:
-        opened, rgb = open_photograph(path, depth)
+        opened, rgb = open_photograph(path, depth, slice_index)
     for warning in words.warnings:
         say(f"warning: {warning}", err=True)
 
@@ -251,17 +319,33 @@ def placed_state(state: StudioState, opened: "OpenedPhotograph") -> StudioState:
             return state
 
 
-def _camera_found(look: "Callable[[], SolvedCamera | str]", path: Path) -> dict[str, Any]:
-    """Look for a camera; return what is told of it, and its file. is_sure: whether it is taken without being asked for."""
+def _camera_of_lines(opened: "OpenedPhotograph", lines: tuple[DrawnLine, ...], path: Path) -> dict[str, Any]:
+    """Return what is told of the camera of drawn lines, and its file where they tell it."""
+    from viewfinder.studio.photograph import solved_by_hand
+
+    def look() -> "SolvedCamera | str":
+        try:
+            return solved_by_hand(opened, lines)
+        except InputError as error:
+            return str(error)
+
+    return _camera_found(look, path, "drawn", "draw more lines along edges, upright and level ones")
+
+
+def _camera_found(look: "Callable[[], SolvedCamera | str]", path: Path, kind: str, advice: str) -> dict[str, Any]:
+    """Look for a camera; return what is told of it, and its file. is_sure: whether it is taken without being asked for.
+
+    kind: of the lines, in words. advice: what to do where they tell none.
+    """
     from mrbokeh.solving.solved_camera import LOW, write_solved_camera
 
     camera = look()
     if isinstance(camera, str):
-        return {"told": f"{camera.partition(': give ')[0]}: set below how far the camera looks down."}
+        return {"told": f"{camera.partition(': give ')[0]}: {advice}."}
     write_solved_camera(path, camera)
     sd = f" ± {camera.pitch_sd_deg:.1f}" if camera.pitch_sd_deg > 0.05 else ""
     way, rolled = "up" if camera.pitch_deg > 0 else "down", f", turned by {camera.roll_deg:.1f}°" if abs(camera.roll_deg) > 0.5 else ""
-    told = f"By the picture's straight lines the camera looks {way} by {abs(camera.pitch_deg):.1f}{sd}°{rolled}"
+    told = f"By the {kind} lines the camera looks {way} by {abs(camera.pitch_deg):.1f}{sd}°{rolled}"
     told += f", {camera.focal_length_35mm:.0f} mm on full frame ({camera.confidence} confidence)."
     return {"told": told, "file": str(_short(path)), "is_sure": camera.confidence != LOW}
 

@@ -10,7 +10,8 @@ from mrbokeh.commands._composite_kept import KeptParts
 from mrbokeh.commands._composite_layers import objects_of
 from mrbokeh.commands._composite_options import CompositeOptions
 from mrbokeh.commands._composited import composited, placed
-from mrbokeh.compositing.plate import Plate, phone_photo
+from mrbokeh.compositing.between import COLOURS_REACH_PX
+from mrbokeh.compositing.plate import Plate, read_matte
 from mrbokeh.compositing.plate_look.finishing import Finishing
 from mrbokeh.layering.pixel_box import Box, is_same_everywhere
 from mrbokeh.optics.camera import camera_of_lens
@@ -44,7 +45,8 @@ class WholePhotograph:
         path, plate = self.photograph.path, self.photograph.plate
         if plate.rgb.shape[1::-1] != self.photograph.size_px:
             with apart():
-                plate = whole_plate(path, read_photograph(path), phone_photo(path), self.photograph.depth)
+                photograph = None if self.photograph.stack else read_photograph(path)
+                plate = whole_plate(path, photograph, self.photograph.phone, self.photograph.depth, self.photograph.slice)
         return replace(plate, rgb=np.broadcast_to(np.float32(0.0), plate.rgb.shape)), plate.rgb.astype(np.float16)
 
     @property
@@ -65,7 +67,7 @@ def region_of(whole: WholePhotograph, options: CompositeOptions, kept: KeptParts
     with apart():
         plate, renderer, options = _standing(whole, options)
     height_px, width_px = plate.rgb.shape[:2]
-    margin_px = min(_MOST_MARGIN_PX, int(region.blur_px / 2) + _SPARE_PX)
+    margin_px = min(_MOST_MARGIN_PX, int(region.blur_px / 2) + _SPARE_PX) + (0 if plate.near_alpha is None else COLOURS_REACH_PX)
     top, left = (round(each) - region.side_px // 2 for each in (region.y_px, region.x_px))
     seen = Box(top, top + region.side_px, left, left + region.side_px)
     # Cat's eyes and the like depend on the place in the frame.
@@ -79,6 +81,7 @@ def region_of(whole: WholePhotograph, options: CompositeOptions, kept: KeptParts
         rgb=whole.light(box),
         depth_m=None if plate.depth_m is None else np.ascontiguousarray(box.of(plate.depth_m)),
         sharp_rgb=None if plate.sharp_rgb is None else np.ascontiguousarray(box.of(plate.sharp_rgb)),
+        near_alpha=None if plate.near_alpha is None else np.ascontiguousarray(box.of(plate.near_alpha)),
         alpha=None,
         lens=box.lens_of(plate.lens, width_px),
         camera=box.camera_of(plate.camera),
@@ -99,6 +102,7 @@ def _standing(whole: WholePhotograph, options: CompositeOptions) -> tuple[Plate,
         lens=small.lens,
         camera=camera_of_lens(small.lens, *whole.photograph.size_px),
         world_from_camera=small.world_from_camera,
+        near_alpha=None if options.taken.matte is None else read_matte(options.taken.matte),
         focus_known=small.focus_known,
         view_known=small.view_known,
     )

@@ -1,9 +1,11 @@
 """OpenedPhotograph: a photograph read once, made smaller for previews, with the lens of any state and the camera that its lines tell."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Float32
 
@@ -11,7 +13,19 @@ from mrbokeh.commands._composite_layers import held_upright
 from mrbokeh.commands._composite_options import CompositeOptions
 from mrbokeh.commands._insertion_options import focused_at_pixel, require_one_focus
 from mrbokeh.commands._level_ground import HIGH_SHARE, on_level_ground, usual_tilt_rad, with_camera_of_file
-from mrbokeh.compositing.plate import HeldLens, LensWishes, Plate, held_lens, phone_photo, photograph_plate, shrunk, with_depth
+from mrbokeh.compositing.plate import (
+    HeldLens,
+    LensWishes,
+    Plate,
+    held_lens,
+    open_plate,
+    phone_photo,
+    photograph_plate,
+    read_matte,
+    shrunk,
+    slice_lens,
+    with_depth,
+)
 from mrbokeh.compositing.plate_look.finishing import Finishing
 from mrbokeh.depth.depth_map import DepthSettings
 from mrbokeh.depth.phone_depth import PhonePhoto
@@ -21,12 +35,13 @@ from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import lens_and_renderer
 from mrbokeh.scene.staging.scene_description import looking_down
 from mrbokeh.scene.staging.staged_scene import modified_s
-from mrbokeh.solving.solve_camera import solve_camera
+from mrbokeh.solving.solve_camera import Line, solve_camera
 from mrbokeh.solving.solved_camera import SolvedCamera
+from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, read_focal_stack
 from mrbokeh.stacks.photograph import Photograph, read_photograph
 from mrbokeh.system.errors import InputError
 from viewfinder.studio.command_line import options_of, preview_scale
-from viewfinder.studio.state import StudioState
+from viewfinder.studio.state import DrawnLine, StudioState
 
 MOST_PX = 1e6
 """Pixels of the largest preview."""
@@ -37,7 +52,8 @@ _LEAST_TILT_DEG = 1.0
 class OpenedPhotograph:
     """Photograph in memory, at most MOST_PX of it.
 
-    depth: file of its depth, in place of its own. told: what its file states, with the size of the whole but none of its light.
+    path: of its file, or of the focal stack of which it is a slice. depth: file of its depth, in place of its own. told: what its file
+    states, with the size of the whole but none of its light.
     finishings: what was measured of black and grain, by the options and the size.
     """
 
@@ -46,6 +62,8 @@ class OpenedPhotograph:
     told: Photograph
     phone: PhonePhoto | None
     plate: Plate
+    stack: FocalStack | None = None
+    slice: int | None = None
     finishings: dict[object, Finishing] = field(default_factory=dict)
     _smaller: dict[tuple[int, int], Plate] = field(default_factory=dict)
 
@@ -73,13 +91,33 @@ class OpenedPhotograph:
         lens = lens and options.facts.on(lens, renderer)
         stated, guessing = {} if lens else options.facts.given, not options.standing.plain
         small, focus_at = self._at(most_px), options.optics.focus_at
+        if (matte := options.taken.matte) is not None:
+            small = replace(small, near_alpha=_matte_of(matte, modified_s(matte), small.rgb.shape[1::-1]))
         focus_m = options.optics.focus if focus_at is None else 1.0
+        if self.stack is not None:
+            return self._slice_plate(small, options, lens), renderer
         held = held_lens(self.path, self.told, self.phone, LensWishes(lens, focus_m, stated, guessing))
         plate = _with_lens(small, held)
         if focus_at is None:
             return plate, renderer
         focused = focused_at_pixel(plate.lens, plate.depth_m, self.small(options, most_px).optics.focus_at or "")
         return _with_lens(small, replace(held, lens=focused)), renderer
+
+    def _slice_plate(self, small: Plate, options: CompositeOptions, lens: Lens | None) -> Plate:
+        """Return the plate of a slice with the lens that `mrbokeh composite` gives it."""
+        if options.facts.given and lens is None:
+            raise InputError("the focal stack states its lens itself: leave out focal length, f-number and sensor width, or choose one")
+        assert self.stack is not None and self.slice is not None
+        focused, blur_from = slice_lens(self.stack, self.slice, lens, options.optics.focus)
+        return replace(small, lens=focused, blur_from=blur_from)
+
+    def slice_in_focus(self, x_px: float, y_px: float) -> int:
+        """Return the slice of the stack that is focused nearest to what a pixel of the whole shows."""
+        assert self.stack is not None
+        scale = self.plate.rgb.shape[1] / self.size_px[0]
+        depth_m = self.plate.depth_at_m(scale * x_px, scale * y_px)
+        focused_m = [self.stack.lens_of(each).focus_distance_m for each in range(len(self.stack))]
+        return int(np.argmin([abs(1.0 / each - 1.0 / depth_m) for each in focused_m]))
 
     def upright(self, options: CompositeOptions, most_px: float) -> tuple[Plate, Renderer, float | None]:
         """Return `plate_for` with how the camera was held, which is never looked for in lines, and its height where a file tells it.
@@ -117,22 +155,36 @@ class OpenedPhotograph:
         return self._smaller[width_px, height_px]
 
 
-def open_photograph(path: Path, depth: Path | None = None) -> tuple[OpenedPhotograph, Float32[np.ndarray, "height width 3"]]:
-    """Read a photograph; return it, and the light of the whole. Raises InputError where it is none."""
-    if path.is_dir():
-        raise InputError(f"{path} is a folder, but the studio takes one photograph: put an object into a stack by `mrbokeh composite`")
-    photograph, phone = read_photograph(path), phone_photo(path)
-    height_px, width_px = photograph.rgb.shape[:2]
-    whole = whole_plate(path, photograph, phone, depth)
+def open_photograph(
+    path: Path, depth: Path | None = None, slice_index: int | None = None
+) -> tuple[OpenedPhotograph, Float32[np.ndarray, "height width 3"]]:
+    """Read a photograph, or a slice of a focal stack, its reference by default; return it, and the light of the whole.
+
+    Raises InputError where it is none.
+    """
+    stack = read_focal_stack(path) if (path / FILE_NAME).is_file() else None
+    slice_index = None if stack is None else stack.reference if slice_index is None else slice_index
+    photograph = None if stack or path.is_dir() else read_photograph(path)
+    phone = phone_photo(path) if photograph else None
+    whole = whole_plate(path, photograph, phone, depth, slice_index)
+    height_px, width_px = whole.rgb.shape[:2]
     scale = preview_scale(width_px, height_px, MOST_PX)
     small = whole if scale == 1.0 else shrunk(whole, round(scale * width_px), round(scale * height_px))
-    dark = np.broadcast_to(np.float32(0.0), photograph.rgb.shape)
-    return OpenedPhotograph(path=path, depth=depth, told=replace(photograph, rgb=dark), phone=phone, plate=small), photograph.rgb
+    dark = np.broadcast_to(np.float32(0.0), whole.rgb.shape)
+    told = replace(photograph, rgb=dark) if photograph else Photograph(rgb=dark)
+    opened = OpenedPhotograph(path=path, depth=depth, told=told, phone=phone, plate=small, stack=stack, slice=slice_index)
+    return opened, whole.rgb
 
 
-def whole_plate(path: Path, photograph: Photograph, phone: PhonePhoto | None, depth: Path | None) -> Plate:
-    """Return the plate of a photograph in all its pixels, with its own depth or that of a file; its lens means nothing yet."""
-    whole = photograph_plate(path, photograph, phone, LensWishes(lens=Lens.default()))
+def whole_plate(
+    path: Path, photograph: Photograph | None, phone: PhonePhoto | None, depth: Path | None, slice_index: int | None = None
+) -> Plate:
+    """Return the plate of a photograph in all its pixels, with its own depth or that of a file; its lens means nothing yet.
+
+    photograph: None of a slice of a focal stack.
+    """
+    lens = LensWishes(lens=Lens.default())
+    whole = open_plate(path, slice_index) if photograph is None else photograph_plate(path, photograph, phone, lens)
     return whole if depth is None else replace(with_depth(whole, depth, DepthSettings()), depth_note="")
 
 
@@ -148,14 +200,31 @@ def _lens_of(path: Path | None, _changed_s: float) -> tuple[Lens | None, Rendere
     return lens_and_renderer(path, None)
 
 
-def solved(photograph: Photograph) -> SolvedCamera:
-    """Return the camera that a photograph's lines tell, with the focal length that it states. Raises InputError if they do not tell."""
+@lru_cache(maxsize=4)
+def _matte_of(path: Path, _changed_s: float, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
+    """Return a matte of some size, read again when it changed."""
+    return np.asarray(cv2.resize(read_matte(path), size_px, interpolation=cv2.INTER_AREA), np.float32)
+
+
+def solved(photograph: Photograph, lines: Sequence[DrawnLine] = ()) -> SolvedCamera:
+    """Return the camera that a photograph's lines tell, with the focal length that it states; drawn ones decide. Raises InputError if
+    they do not tell.
+    """
     height_px, width_px = photograph.rgb.shape[:2]
     focal_px = None
     if photograph.focal_length_mm is not None and photograph.sensor_width_mm is not None:
         stated_px = photograph.focal_length_mm / photograph.sensor_width_mm * width_px
         focal_px = stated_px if 0.3 < stated_px / max(height_px, width_px) < 30.0 else None
-    return solve_camera(photograph.rgb, focal_px).of_sensor(photograph.sensor_width_mm)
+    told = [Line((x1, y1, x2, y2), axis) for x1, y1, x2, y2, axis in lines]
+    return solve_camera(photograph.rgb, focal_px, told).of_sensor(photograph.sensor_width_mm)
+
+
+def solved_by_hand(opened: OpenedPhotograph, lines: Sequence[DrawnLine]) -> SolvedCamera:
+    """Return the camera by lines that are drawn on a photograph, in its pixels. Raises InputError if they do not tell."""
+    width_px, _height_px = opened.size_px
+    scale = opened.plate.rgb.shape[1] / width_px
+    small = [(*(scale * each for each in (x1, y1, x2, y2)), axis) for x1, y1, x2, y2, axis in lines]
+    return solved(replace(opened.told, rgb=opened.plate.rgb), small).resized(*opened.size_px)
 
 
 def placed(state: StudioState, opened: OpenedPhotograph) -> StudioState:
@@ -165,7 +234,7 @@ def placed(state: StudioState, opened: OpenedPhotograph) -> StudioState:
     """
     if opened.has_depth and state.camera_height_m is not None:
         state = replace(state, camera_height_m=None)
-    is_told = state.camera is not None or state.pitch_deg is not None
+    is_told = state.camera is not None or state.pitch_deg is not None or opened.plate.world_from_camera is not None
     whole = state.height is not None and (opened.has_depth or (state.camera_height_m is not None and is_told))
     if not state.is_complete or state.plain or whole:
         return state

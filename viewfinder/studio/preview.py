@@ -81,8 +81,8 @@ def _finishing(photograph: OpenedPhotograph, plate: Plate, options: CompositeOpt
     if key not in photograph.finishings:
         if len(photograph.finishings) > _MOST_FINISHINGS:
             photograph.finishings.clear()
-        if options.standing.plain:
-            photograph.finishings[key] = finishing_of(wanted, plate.rgb, path)
+        if options.standing.plain or photograph.stack:
+            photograph.finishings[key] = finishing_of(wanted, plate.rgb, None if photograph.stack else path)
         else:
             is_smaller = plate.rgb.shape[1::-1] != photograph.size_px
             photograph.finishings[key] = matched_finishing(wanted, plate.rgb, path, uncompressed=is_smaller)[0]

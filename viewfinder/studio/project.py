@@ -14,7 +14,7 @@ FORMAT, VERSION = "mrbokeh studio", 1
 _EXPECTED = "a project file of `mrbokeh studio`"
 _MOST_STORED = 500
 """States of the history that a file keeps: half a megabyte; while the studio runs there is no limit."""
-_PATHS = ("photo", "depth", "object", "lens", "camera")
+_PATHS = ("photo", "depth", "matte", "object", "lens", "camera")
 
 
 @dataclass
@@ -89,7 +89,7 @@ def read_project(path: Path) -> Project:
         project.amend(lambda state: replace(state, camera=None))
     named = [(name, getattr(project.state, name)) for name in _PATHS]
     for name, file in (*named, *(("object", each.object) for each in project.state.objects)):
-        if file is not None and not file.is_file():
+        if file is not None and not (file.is_file() or (name == "photo" and file.is_dir())):
             raise InputError(f"{path} has the {name} {file}, which is not there any more: put it back, or begin anew without the project")
     return project
 

@@ -18,7 +18,7 @@ from viewfinder.server.site import page_routes
 from viewfinder.studio.command_line import command_line, options_of
 from viewfinder.studio.desk import LARGEST, Desk, placed_state
 from viewfinder.studio.saving import FORMATS
-from viewfinder.studio.state import StudioState
+from viewfinder.studio.state import StudioState, stroke_of
 
 if TYPE_CHECKING:
     from viewfinder.studio.loupe import Region
@@ -30,7 +30,7 @@ PAGE = {
     "/studio.js": ("studio.js", "text/javascript"),
     "/studio.css": ("studio.css", "text/css"),
 }
-_LARGEST_MESSAGE = 8192
+_LARGEST_MESSAGE = 65536
 _NEWS_WAIT_S = 20.0
 _LARGEST_SCREEN_PX = 1e6
 _FEW_PX = 1e4
@@ -53,9 +53,15 @@ class StudioSite:
         """Return all routes behind the rules of access."""
         app = web.Application(middlewares=[self.access.middleware])
         app.add_routes(page_routes(PAGE))
-        get = {"/state": self._state, "/photo": self._photo, "/lens/{number}": self._lens, "/saved/{number}": self._saved}
+        get = {
+            "/state": self._state,
+            "/photo": self._photo,
+            "/matte": self._matte,
+            "/lens/{number}": self._lens,
+            "/saved/{number}": self._saved,
+        }
         post = {"/state": self._change, "/add": self._add, "/history": self._history, "/preview": self._preview, "/upload": self._upload}
-        post |= {"/save": self._save, "/cancel": self._cancel}
+        post |= {"/save": self._save, "/cancel": self._cancel, "/paint": self._paint}
         app.add_routes([web.post("/enter", self.access.enter)])
         app.add_routes([web.get(path, _refusing(handler)) for path, handler in get.items()])
         app.add_routes([web.post(path, _refusing(handler)) for path, handler in post.items()])
@@ -137,6 +143,20 @@ class StudioSite:
         await self.desk.add_object((await _message(request)).get("object"))
         return web.json_response(self._told())
 
+    async def _matte(self, _request: web.Request) -> web.Response:
+        """Handle GET /matte: what the brush has told of the photograph, as a tint as large as the largest preview."""
+        from viewfinder.studio.brush import tinted
+
+        if (matte := self.desk.state.matte) is None:
+            raise InputError("the brush has told nothing yet: paint over what is in front")
+        png = await asyncio.to_thread(tinted, matte, self._opened().plate.rgb.shape[1::-1])
+        return web.Response(body=png, content_type="image/png")
+
+    async def _paint(self, request: web.Request) -> web.Response:
+        """Handle POST /paint: {"points": [[x, y], ...], "radius", "front"} in pixels of the photograph."""
+        await self.desk.paint(stroke_of(await _message(request)))
+        return web.json_response(self._told())
+
     async def _history(self, request: web.Request) -> web.Response:
         """Handle POST /history: {"step": -1 or 1}."""
         await self.desk.step((await _message(request)).get("step"))
@@ -209,6 +229,12 @@ def _photo_told(opened: "OpenedPhotograph", state: StudioState) -> dict[str, Any
     width_px, height_px = opened.size_px
     told = opened.told
     shown: dict[str, Any] = {"name": opened.path.name, "width_px": width_px, "height_px": height_px, "has_depth": opened.has_depth}
+    if (stack := opened.stack) is not None:
+        shown |= {
+            "slice": opened.slice,
+            "slices": len(stack),
+            "focus_distances_m": list(stack.focus_distances_m) if stack.metres_known else [],
+        }
     shown |= {"f_number": told.f_number, "focus_m": told.focus_distance_m, "focal_length_mm": told.focal_length_mm}
     try:
         with apart():

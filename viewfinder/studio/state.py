@@ -9,6 +9,8 @@ from typing import Any
 from mrbokeh.system.errors import InputError
 
 Pair = tuple[float, float]
+DrawnLine = tuple[float, float, float, float, str]
+"""Both ends of an edge in pixels, and its direction in the world: "y" upright, "x" and "z" the two level ones."""
 
 _DIGITS = 6
 """Significant digits of numbers: the command line shows them all, so that it makes the very same picture."""
@@ -32,18 +34,23 @@ class Placed:
 class StudioState:
     """State of the studio; None leaves a thing to the command's own default.
 
-    object, at_px, height, turn_deg: of the chosen object; before, after: those that come before and after it in the command line.
-    at_px: where it stands, in pixels of the whole photograph. height: metres such as "0.3", or pixels such as "120px". focus_at_px: the
-    pixel that is in focus, where the photograph has depth; focus_m otherwise. sun_deg: where the main light comes from, degrees to the
-    right of the view and above the horizon. camera: file of `mrbokeh capture solve`; pitch_deg comes before it. matched: black and grain
-    of the objects are those of the photograph. plain: guess neither light nor ground.
+    photo: a photograph, or the folder of a focal stack, of which slice counts the pictures from 0. matte: what of the photograph the brush
+    says is in front. object, at_px, height, turn_deg: of the chosen object; before, after: those that come before and after it in the
+    command line. at_px: where it stands, in pixels of the whole photograph. height: metres such as "0.3", or pixels such as "120px".
+    focus_at_px: the pixel that is in focus, where the photograph has depth; focus_m otherwise. sun_deg: where the main light comes from,
+    degrees to the right of the view and above the horizon. camera: file of `mrbokeh capture solve`; pitch_deg comes before it. lines:
+    drawn ones, by which it was solved. matched: black and grain of the objects are those of the photograph. plain: guess neither light
+    nor ground.
     """
 
     photo: Path | None = None
+    slice: int | None = None
     depth: Path | None = None
+    matte: Path | None = None
     object: Path | None = None
     lens: Path | None = None
     camera: Path | None = None
+    lines: tuple[DrawnLine, ...] = ()
     at_px: Pair | None = None
     height: str | None = None
     turn_deg: float = 0.0
@@ -115,6 +122,25 @@ def state_of(document: Any) -> StudioState:
     return state
 
 
+@dataclass(frozen=True)
+class Stroke:
+    """Line of a brush. points_px: x, y in pixels of the photograph. radius_px: of the brush. is_front: what it marks is in front."""
+
+    points_px: tuple[Pair, ...]
+    radius_px: float
+    is_front: bool
+
+
+def stroke_of(document: Mapping[str, Any]) -> Stroke:
+    """Return the stroke of a page's message. Raises InputError that names the first value that cannot be meant."""
+    points = document.get("points")
+    if not isinstance(points, list) or not 0 < len(points) <= _MOST_POINTS:
+        raise InputError(f"expected the points of a stroke as a list of 1 to {_MOST_POINTS}, got {_shown(points)}")
+    within = _pair(_PIXELS, _PIXELS)
+    line = tuple(within(f"points[{number}]", each) for number, each in enumerate(points))
+    return Stroke(line, _number(1.0, _PIXELS[1])("radius", document.get("radius")), _flag("front", document.get("front")))
+
+
 def _path(name: str, value: Any) -> Path:
     if not isinstance(value, str) or not value or "\0" in value or len(value) > 4096:
         raise InputError(f"expected {name} to be the name of a file, got {_shown(value)}")
@@ -128,6 +154,17 @@ def _number(low: float, high: float) -> Callable[[str, Any], float]:
         if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and low <= value <= high):
             raise InputError(f"expected {name} to be a number from {low:g} to {high:g}, got {_shown(value)}")
         return _rounded(float(value))
+
+    return checked
+
+
+def _whole(least: int, most: int) -> Callable[[str, Any], int]:
+    """Return a check for whole numbers from least up to most."""
+
+    def checked(name: str, value: Any) -> int:
+        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
+            raise InputError(f"expected {name} to be a whole number from {least} to {most}, got {_shown(value)}")
+        return value
 
     return checked
 
@@ -154,6 +191,21 @@ def _placed(name: str, value: Any) -> tuple[Placed, ...]:
             raise InputError(f"expected each of {name} to have object, at_px, height and turn_deg, got {_shown(each)}")
         placed.append(Placed(**{key: _CHECKS[key](f"{name}.{key}", one) for key, one in each.items() if one is not None}))
     return tuple(placed)
+
+
+def _lines(name: str, value: Any) -> tuple[DrawnLine, ...]:
+    """Return lines that are drawn on the photograph."""
+    if not isinstance(value, list | tuple) or len(value) > _MOST_LINES:
+        raise InputError(f"expected {name} to be a list of at most {_MOST_LINES} lines, got {_shown(value)}")
+    pixel, lines = _number(*_PIXELS), []
+    for each in value:
+        if not isinstance(each, list | tuple) or len(each) != 5 or each[4] not in ("x", "y", "z"):
+            raise InputError(f"expected each of {name} as x1, y1, x2, y2 and its direction x, y or z, got {_shown(each)}")
+        x1, y1, x2, y2 = (pixel(name, one) for one in each[:4])
+        if math.hypot(x2 - x1, y2 - y1) < 1.0:
+            raise InputError(f"expected each of {name} between two pixels, got {_shown(each)}: draw along an edge")
+        lines.append((x1, y1, x2, y2, each[4]))
+    return tuple(lines)
 
 
 def _flag(name: str, value: Any) -> bool:
@@ -183,13 +235,16 @@ def _shown(value: Any) -> str:
     return repr(value)[:60]
 
 
-_PIXELS, _MOST_OBJECTS = (0.0, 200_000.0), 50
+_PIXELS, _MOST_OBJECTS, _MOST_POINTS, _MOST_LINES = (0.0, 200_000.0), 50, 2000, 60
 _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "photo": _path,
+    "slice": _whole(0, 100_000),
     "depth": _path,
+    "matte": _path,
     "object": _path,
     "lens": _path,
     "camera": _path,
+    "lines": _lines,
     "at_px": _pair(_PIXELS, _PIXELS),
     "height": _height,
     "turn_deg": _number(-100_000.0, 100_000.0),

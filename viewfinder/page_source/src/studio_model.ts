@@ -4,6 +4,9 @@ import { sentenceOf } from "./server";
 
 export type Pair = [number, number];
 
+/** Both ends of an edge in pixels, and its direction in the world: y upright, x and z the two level ones. */
+export type DrawnLine = [number, number, number, number, "x" | "y" | "z"];
+
 /** An object that stands in the photograph. */
 export interface Placed {
   object: string;
@@ -15,9 +18,12 @@ export interface Placed {
 /** The state as the server keeps it; null leaves a thing to the command's own default. Object, place, height and turn are the chosen one's. */
 export interface State {
   photo: string | null;
+  slice: number | null;
+  matte: string | null;
   object: string | null;
   lens: string | null;
   camera: string | null;
+  lines: DrawnLine[];
   at_px: Pair | null;
   height: string | null;
   turn_deg: number;
@@ -50,6 +56,10 @@ export interface Photo {
   world_from_camera: Matrix3 | null;
   pitch_deg: number | null;
   lens_f_number: number | null;
+  /** Of a focal stack: which picture this is, how many there are, and where each is focused. */
+  slice?: number;
+  slices?: number;
+  focus_distances_m?: (number | null)[];
   problem?: string;
 }
 

@@ -56,6 +56,7 @@ export class Panel {
     for (const each of SLIDERS) this.slider(each);
     for (const each of NUMBERS) this.number(each.id, each.name, each.also ?? {});
     this.height();
+    this.slices();
     this.switches();
     this.dome();
     this.result();
@@ -102,6 +103,21 @@ export class Panel {
   private height(): void {
     const input = byId<HTMLInputElement>("height");
     input.addEventListener("change", () => void studio.commit({ height: input.value.trim().replace(",", ".") || null }));
+  }
+
+  /** Another picture of the stack is opened once the hand lets the handle go. */
+  private slices(): void {
+    const input = byId<HTMLInputElement>("slice");
+    input.addEventListener("input", () => this.sliceTold(input.valueAsNumber));
+    input.addEventListener("change", () => void studio.commit({ slice: input.valueAsNumber }));
+  }
+
+  private sliceTold(slice: number): void {
+    const photo = studio.told?.photo;
+    const metres = photo?.focus_distances_m?.[slice];
+    const told = `${slice + 1} of ${photo?.slices ?? 1}${metres ? `, focused at ${Number(metres.toPrecision(3))} m` : ""}`;
+    byId("slice_row").querySelector("output")!.textContent = told;
+    byId("slice").setAttribute("aria-valuetext", told);
   }
 
   private switches(): void {
@@ -170,6 +186,15 @@ export class Panel {
       : told.camera?.told ?? (told.photo ? "The camera is looked for in the picture's lines." : "");
     byId<HTMLButtonElement>("camera_found").disabled = told.camera?.file === undefined;
     byId<HTMLInputElement>("plain").disabled = Boolean(told.photo && !told.photo.has_depth && !told.state.plain);
+    const photo = told.photo;
+    byId<HTMLElement>("slice_row").hidden = photo?.slices === undefined;
+    document.querySelectorAll<HTMLElement>(".of_one").forEach((each) => (each.hidden = photo?.slices !== undefined));
+    if (photo?.slices !== undefined) {
+      const input = byId<HTMLInputElement>("slice");
+      input.max = String(photo.slices - 1);
+      input.value = String(told.state.slice ?? 0);
+      this.sliceTold(input.valueAsNumber);
+    }
     byId("kept").textContent = `Everything is kept in ${told.project}`;
     this.choices();
     this.saves(told.saves);
@@ -269,12 +294,13 @@ function offer(id: string, choices: [string, string][]): void {
 function focusTold(state: State): string {
   const shown = studio.shown;
   if (!shown || !studio.isComplete) return "Click Focus here, then what is to be in focus.";
-  const from = state.focus_m !== null || state.focus_at_px !== null ? "as chosen" : studio.told?.photo?.focus_m ? "as the photograph states" : "on the object";
+  const from = state.focus_m !== null || state.focus_at_px !== null ? "as chosen" : studio.told?.photo?.focus_m ? "as the photograph states" : studio.told?.photo?.slices ? "as the stack tells" : "on the object";
+  if (studio.told?.photo?.focus_distances_m?.length === 0) return `The stack does not know its metres; the object is blurred${blurTold(shown.coc_px)}.`;
   const at = shown.focus_m === null ? "infinity" : `${Number(shown.focus_m.toPrecision(3))} m`;
-  const [least, most] = [shown.coc_px[0], shown.coc_px[1]];
-  const blur = least === undefined || most === undefined ? "" : `; the object is blurred by ${least.toFixed(1)} to ${most.toFixed(1)} px of the photograph`;
-  return `Focused at ${at}, ${from}${blur}.`;
+  return `Focused at ${at}, ${from}; the object is blurred${blurTold(shown.coc_px)}.`;
 }
+
+const blurTold = ([least, most]: number[]): string => (least === undefined || most === undefined ? " by its distance" : ` by ${least.toFixed(1)} to ${most.toFixed(1)} px of the photograph`);
 
 function lensChoice(path: string, name: string, number: number | null): HTMLLabelElement {
   const label = document.createElement("label");

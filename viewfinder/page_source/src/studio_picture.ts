@@ -1,5 +1,7 @@
 // The picture: fitted to the window, with the ground over it, and everything that hands do on it.
 import { listen } from "./gestures";
+import { Brush } from "./studio_brush";
+import { Lines } from "./studio_lines";
 import { groundOf } from "./studio_ground";
 import { type Box, type Pair, studio } from "./studio_model";
 
@@ -26,6 +28,8 @@ export class PictureStage {
   private readonly before = byId<HTMLImageElement>("before");
   private readonly ground = byId<SVGSVGElement>("ground");
   private readonly loupe = byId<HTMLCanvasElement>("loupe");
+  private readonly brush = new Brush();
+  private readonly lines = new Lines();
   private photoName = "";
   private hint = "";
   private from: Pair | null = null;
@@ -55,7 +59,7 @@ export class PictureStage {
     this.stage.style.width = `${photo.width_px * scale}px`;
     this.stage.style.height = `${photo.height_px * scale}px`;
     studio.pixels = Math.max(4e4, photo.width_px * photo.height_px * (scale * devicePixelRatio) ** 2);
-    const name = `${photo.name} ${studio.told?.state.photo} ${photo.width_px}`;
+    const name = `${photo.name} ${studio.told?.state.photo} ${photo.slice ?? ""} ${photo.width_px}`;
     if (name !== this.photoName) {
       this.photoName = name;
       this.hint = "";
@@ -142,6 +146,11 @@ export class PictureStage {
     return [((x - box.left) / box.width) * photo.width_px, ((y - box.top) / box.height) * photo.height_px];
   }
 
+  /** Pixels of the photograph in one of the window. */
+  private get px(): number {
+    return studio.told!.photo!.width_px / this.stage.clientWidth;
+  }
+
   private inside(at_px: Pair): Pair {
     const photo = studio.told!.photo!;
     const ground = groundOf(photo, studio.state);
@@ -177,30 +186,40 @@ export class PictureStage {
       tap: (x, y) => this.tapped(x, y),
       twice: (x, y) => this.tapped(x, y),
       dragStart: (x, y) => {
+        if (this.brush.on) return this.brush.start(this.pixel(x, y));
+        if (this.lines.on) return this.lines.start(this.pixel(x, y), this.px);
         if (this.loupe.hidden) this.chose(x, y);
         this.from = studio.state?.at_px ?? this.inside(this.pixel(x, y));
         this.moved = [0, 0];
         this.stage.classList.add("dragging");
       },
-      drag: (_x, _y, dx, dy) => {
+      drag: (x, y, dx, dy) => {
+        if (this.brush.on) return this.brush.move(this.pixel(x, y));
+        if (this.lines.on) return this.lines.move(this.pixel(x, y));
         // Under the loupe a finger looks, and moves nothing.
         if (!this.from || !studio.state?.object || !this.loupe.hidden) return;
-        const scale = studio.told!.photo!.width_px / this.stage.clientWidth;
-        this.moved = [this.moved[0] + dx * scale, this.moved[1] + dy * scale];
+        this.moved = [this.moved[0] + dx * this.px, this.moved[1] + dy * this.px];
         studio.change({ at_px: this.inside([this.from[0] + this.moved[0], this.from[1] + this.moved[1]]) });
       },
       dragEnd: () => {
+        if (this.brush.on) return void this.brush.end();
+        if (this.lines.on) return this.lines.stop(this.px);
         this.from = null;
         this.stage.classList.remove("dragging");
         void studio.commit();
       },
-      pinch: (factor, _x, _y, _dx, _dy, turn_deg) => this.shape(factor, turn_deg),
+      pinch: (factor, _x, _y, _dx, _dy, turn_deg) => (this.brush.on ? this.brush.scale(factor) : this.shape(factor, turn_deg)),
     });
   }
 
   private tapped(x: number, y: number): void {
     this.stage.focus();
     if (!studio.told?.photo) return;
+    if (this.brush.on) {
+      this.brush.start(this.pixel(x, y));
+      return void this.brush.end();
+    }
+    if (this.lines.on) return this.lines.tap(this.pixel(x, y), this.px);
     if (this.stage.classList.contains("focusing")) return this.focusAt(x, y);
     if (this.chose(x, y)) return void studio.commit();
     if (!studio.state?.object) return studio.say("choose an object first: in the list at the right, or drop a GLB file");
@@ -259,7 +278,8 @@ export class PictureStage {
       event.preventDefault();
     });
     document.addEventListener("keydown", (event) => {
-      if (event.key === "Escape" && this.stage.classList.contains("focusing")) byId<HTMLElement>("focus_here").click();
+      const tool = this.brush.on ? "brush" : this.lines.on ? "draw_lines" : this.stage.classList.contains("focusing") ? "focus_here" : null;
+      if (event.key === "Escape" && tool) byId<HTMLElement>(tool).click();
       if (!(event.ctrlKey || event.metaKey) || (event.target as Element).matches?.("input[type=text], input[type=number]")) return;
       const key = event.key.toLowerCase();
       if (key !== "z" && key !== "y") return;
@@ -278,12 +298,21 @@ export class PictureStage {
       });
     };
     pressed("grid", () => this.mark());
+    const tools = ["focus_here", "brush", "draw_lines"];
+    const isOn = (id: string): boolean => byId(id).getAttribute("aria-pressed") === "true";
+    for (const id of tools) {
+      // Before the tool itself is told: the others fall silent, then it speaks.
+      byId(id).addEventListener("click", () => isOn(id) || tools.filter((each) => each !== id && isOn(each)).forEach((each) => byId<HTMLElement>(each).click()), true);
+    }
     pressed("focus_here", (on) => {
       this.stage.classList.toggle("focusing", on);
       studio.say(on ? "click what is to be in focus: the object, or a place on the ground" : "", on);
     });
     pressed("magnify", (on) => (this.loupe.hidden = !on));
-    this.stage.addEventListener("pointermove", (event) => !this.loupe.hidden && this.magnify(event));
+    this.stage.addEventListener("pointermove", (event) => {
+      if (!this.loupe.hidden) this.magnify(event);
+      if (this.brush.on && studio.told?.photo) this.brush.hover(this.pixel(event.clientX, event.clientY));
+    });
     const hold = byId<HTMLElement>("hold_before");
     const show = (on: boolean): void => {
       this.before.hidden = !on;

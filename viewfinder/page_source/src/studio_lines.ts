@@ -1,0 +1,92 @@
+// Lines drawn along edges of the photograph, upright and level ones, by which the server solves the camera.
+import { type DrawnLine, type Pair, studio } from "./studio_model";
+
+const byId = <T extends Element>(id: string): T => document.getElementById(id) as unknown as T;
+const AXES = ["y", "x", "z"] as const;
+const NEAR = 16;
+const SHORTEST = 12;
+
+export class Lines {
+  private readonly drawn = byId<SVGSVGElement>("lines");
+  private axis: DrawnLine[4] = "y";
+  private lines: DrawnLine[] | null = null;
+  /** The end that is dragged: line, and 0 or 2 for its first coordinate. */
+  private end: [number, 0 | 2] = [0, 2];
+
+  constructor() {
+    const button = byId<HTMLElement>("draw_lines");
+    button.addEventListener("click", () => {
+      button.setAttribute("aria-pressed", String(!this.on));
+      studio.say(this.on ? "draw along two edges of one direction and one of another: the ground follows; tap a line to remove it" : "", this.on);
+      this.draw();
+    });
+    for (const axis of AXES) {
+      byId(`axis_${axis}`).addEventListener("click", () => {
+        this.axis = axis;
+        for (const each of AXES) byId(`axis_${each}`).setAttribute("aria-pressed", String(each === axis));
+      });
+    }
+    byId("lines_clear").addEventListener("click", () => void studio.commit({ lines: [] }));
+    studio.addEventListener("state", () => this.draw());
+    studio.addEventListener("told", () => this.on && studio.state?.lines.length && studio.say(studio.told?.camera?.told ?? "", true));
+  }
+
+  get on(): boolean {
+    return byId<HTMLElement>("draw_lines").getAttribute("aria-pressed") === "true";
+  }
+
+  /** Take the near end of a line of the chosen direction, or begin a new line. px: pixels of the photograph in one of the window. */
+  start(at_px: Pair, px: number): void {
+    this.lines = (studio.state?.lines ?? []).map((each): DrawnLine => [...each]);
+    const ends = this.lines.flatMap((each, line) => ([0, 2] as const).map((i) => ({ line, i, away: Math.hypot(each[i] - at_px[0], each[i + 1 as 1 | 3] - at_px[1]) })));
+    const nearest = ends.sort((one, other) => one.away - other.away).find((each) => this.lines![each.line]![4] === this.axis);
+    if (nearest && nearest.away < NEAR * px) this.end = [nearest.line, nearest.i];
+    else this.end = [this.lines.push([at_px[0], at_px[1], at_px[0], at_px[1], this.axis]) - 1, 2];
+  }
+
+  move(at_px: Pair): void {
+    const photo = studio.told?.photo;
+    const line = this.lines?.[this.end[0]];
+    if (!photo || !line) return;
+    const within = (value: number, most: number): number => Number(Math.min(most, Math.max(0, value)).toFixed(1));
+    line[this.end[1]] = within(at_px[0], photo.width_px);
+    line[(this.end[1] + 1) as 1 | 3] = within(at_px[1], photo.height_px);
+    this.draw();
+  }
+
+  stop(px: number): void {
+    const lines = this.lines?.filter((each) => Math.hypot(each[2] - each[0], each[3] - each[1]) > SHORTEST * px);
+    this.lines = null;
+    if (lines) void studio.commit({ lines });
+  }
+
+  /** Remove the line under a finger. */
+  tap([x, y]: Pair, px: number): void {
+    const lines = studio.state?.lines ?? [];
+    const away = ([x1, y1, x2, y2]: DrawnLine): number => {
+      const along = Math.min(1, Math.max(0, ((x - x1) * (x2 - x1) + (y - y1) * (y2 - y1)) / Math.hypot(x2 - x1, y2 - y1) ** 2));
+      return Math.hypot(x1 + along * (x2 - x1) - x, y1 + along * (y2 - y1) - y);
+    };
+    const nearest = [...lines].sort((one, other) => away(one) - away(other))[0];
+    if (nearest && away(nearest) < NEAR * px) void studio.commit({ lines: lines.filter((each) => each !== nearest) });
+  }
+
+  private draw(): void {
+    const photo = studio.told?.photo;
+    const lines = this.lines ?? studio.state?.lines ?? [];
+    byId<HTMLElement>("lines_row").hidden = !this.on;
+    byId<HTMLButtonElement>("lines_clear").disabled = !lines.length;
+    this.drawn.replaceChildren();
+    if (!photo || !this.on) return;
+    this.drawn.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
+    const size = photo.width_px / this.drawn.clientWidth;
+    for (const [x1, y1, x2, y2, axis] of lines) {
+      const line = document.createElementNS(this.drawn.namespaceURI, "path");
+      const ring = (x: number, y: number): string => `M${x - 5 * size} ${y}a${5 * size} ${5 * size} 0 1 0 ${10 * size} 0a${5 * size} ${5 * size} 0 1 0 ${-10 * size} 0`;
+      line.setAttribute("d", `M${x1} ${y1}L${x2} ${y2}${ring(x1, y1)}${ring(x2, y2)}`);
+      line.setAttribute("class", axis);
+      line.setAttribute("vector-effect", "non-scaling-stroke");
+      this.drawn.append(line);
+    }
+  }
+}
