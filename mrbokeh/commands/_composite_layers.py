@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from mrbokeh.commands._composite_kept import KeptParts
     from mrbokeh.scene.staging.filming import Filming
     from mrbokeh.scene.staging.scene_description import Lighting, OneObject
+    from mrbokeh.solving.sun_of_photograph import SunOfPhotograph
     from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples
 
 _COVERED = 0.5
@@ -217,14 +218,37 @@ def _light(options: ObjectOptions, plate: Plate, foot_px: tuple[float, float], k
         return Lighting(options.environment, exposure=options.exposure)
     lit = picture_light if kept is None else kept.light
     world_from_camera = np.eye(3) if plate.world_from_camera is None else plate.world_from_camera
-    made = lit(plate, foot_px, world_from_camera, None if options.sun is None else typed_sun(options.sun))
-    if options.sun is None and is_sunlit(plate, foot_px):
-        guess("by the exposure the sun shines: a soft light from behind the camera is taken (--sun RIGHT,ABOVE says where it is)")
-    elif options.sun is None:
-        guess("the object's light is guessed from the photograph (else --exposure, --sun RIGHT,ABOVE, --environment or --plain)")
-    else:
+    if options.sun is not None:
+        sun_degrees: tuple[float, float] | None = typed_sun(options.sun)
         guess("--sun is as strong beside the sky as on a clear day; how bright both are is guessed from the photograph (--exposure)")
+    else:
+        sun_degrees = _sun_by_file(plate.sun, shines=is_sunlit(plate, foot_px))
+    made = lit(plate, foot_px, world_from_camera, sun_degrees)
     return Lighting(exposure=options.exposure, made=made)
+
+
+def _sun_by_file(sun: "SunOfPhotograph | None", *, shines: bool) -> tuple[float, float] | None:
+    """Return degrees to the right of the view and above the horizon as the file tells them, if the sun shines, and say what is taken."""
+    degrees = None if sun is None or sun.right_deg is None or not sun.is_up else (round(sun.right_deg), round(sun.above_deg))
+    option = "--sun RIGHT,ABOVE" if degrees is None else f"--sun {degrees[0]},{degrees[1]}"
+    if not shines:
+        there = "" if degrees is None else ", where the sun would be by the file"
+        guess(f"the object's light is guessed from the photograph (else --exposure, {option}{there}, --environment or --plain)")
+        return None
+    if sun is None:
+        guess("by the exposure the sun shines: a soft light from behind the camera is taken (--sun RIGHT,ABOVE says where it is)")
+    elif degrees is None:
+        guess(
+            f"by the exposure the sun shines, and by time and place in the file it stood {sun.above_deg:.0f} degrees high; no compass "
+            f"tells on which side: a soft light from behind the camera is taken (--sun RIGHT,{sun.above_deg:.0f}, or --sun-by, says more)"
+        )
+    else:
+        north = ", turned from magnetic to true north," if sun.from_magnetic_north else ""
+        guess(
+            f"by the exposure the sun shines, and by time, place and compass{north} in the file it stood at {option}, which is taken; a "
+            f"compass may be wrong by 20 degrees and more (--sun RIGHT,ABOVE, --sun-by TOP:FOOT:TIP)"
+        )
+    return degrees
 
 
 def _height_m(text: str | None, plate: Plate, depth_m: float) -> float | None:

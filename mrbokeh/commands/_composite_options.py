@@ -153,7 +153,7 @@ class ObjectOptions:
         typer.Option(
             metavar="RIGHT,ABOVE",
             help="Where the main light comes from: degrees to the right of the view (180: from behind the camera) and above the horizon, "
-            "such as -60,40.",
+            "such as -60,40. Default: where place, time and compass in the file tell, if the exposure tells of sunshine.",
         ),
     ] = None
     sun_by: Annotated[

@@ -32,6 +32,7 @@ from mrbokeh.images.xmp import jpeg_xmp
 from mrbokeh.optics.camera import Camera, camera_of_lens
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
+from mrbokeh.solving.sun_of_photograph import SunOfPhotograph, sun_of_photograph
 from mrbokeh.stacks.capture_bundle import CaptureBundle
 from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, read_focal_stack
 from mrbokeh.stacks.guessed_metres import is_lens_guessed
@@ -58,6 +59,7 @@ class Plate:
     rough_focus_m: nearest and farthest distance that the focus in the photograph's file may mean, where that is a wide range.
     world_from_camera: (3, 3) turns camera axes into upright ones, where that is known.
     white_lux: illuminance under which a white surface shows 1.0, by the exposure of the photograph (`Photograph.white_lux`).
+    sun: where the sun stood, by the file, whether it shone or not; None also where the exposure is unknown.
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -75,6 +77,7 @@ class Plate:
     depth_note: str = ""
     rough_focus_m: tuple[float, float] | None = None
     white_lux: float | None = None
+    sun: SunOfPhotograph | None = None
 
     def __post_init__(self) -> None:
         size = self.rgb.shape[:2]
@@ -152,6 +155,7 @@ def photograph_plate(photo: Path, photograph: Photograph, phone: PhonePhoto | No
     held = held_lens(photo, photograph, phone, wishes)
     plate = with_own_alpha(plate_of(photograph.rgb, held.lens), photo, read_alpha(photo, photograph.orientation))
     plate = replace(plate, white_lux=held.white_lux, world_from_camera=held_by_phone(photo))
+    plate = replace(plate, sun=None if held.white_lux is None else sun_of_photograph(photo))
     if phone is None:
         return replace(plate, focus_known=held.focus_known, view_known=held.view_known, rough_focus_m=held.rough_focus_m)
     original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
