@@ -121,15 +121,14 @@ def _apple(tags: Tags) -> FocusReading | None:
     if not note.startswith(_APPLE):
         return None
     try:
-        range_m = apple_notes(bytes(int(each) for each in note.split())).focus_m
+        notes = apple_notes(bytes(int(each) for each in note.split()))
     except ValueError:
         return None
-    if range_m is None:
+    if notes.focus_m is None or notes.focus_distance_m is None:
         return None
-    nearest_m, farthest_m = range_m
-    distance_m = 2.0 / (1.0 / nearest_m + 1.0 / farthest_m)
+    nearest_m, farthest_m = notes.focus_m
     source = f"Apple's FocusDistanceRange = {nearest_m:.4g} to {farthest_m:.4g} m"
-    return FocusReading(distance_m, nearest_m=nearest_m, farthest_m=farthest_m, origin="lens", source=source)
+    return FocusReading(notes.focus_distance_m, nearest_m=nearest_m, farthest_m=farthest_m, origin="lens", source=source)
 
 
 _APPLE = "65 112 112 108 101 "

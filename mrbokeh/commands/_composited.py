@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from mrbokeh.commands._composite_kept import KeptParts
 
 _NEARER, _MUCH_HIDDEN = 0.03, 0.4
+_WITHOUT_MATTE = ("front", "matte")
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ def placed(plate: Plate, options: CompositeOptions, known_height_m: float | None
     if plate.depth_m is not None:
         standing.require_no_depth()
     guess(plate.depth_note)
-    if plate.world_from_camera is not None and standing.object_ and standing.pitch is None and options.virtual.camera is None:
+    if plate.phone_level and plate.world_from_camera is not None and standing.object_ and standing.pitch is None:
         guess(f"by the phone's own level the camera {held_told(plate.world_from_camera)} (--pitch DEGREES)")
     if options.guesses_ground and plate.depth_m is None:
         plate, standing = on_level_ground(plate, standing, known_height_m)
@@ -92,6 +93,8 @@ def composited(
 def insertion_by(options: CompositeOptions, plate: Plate) -> tuple[str, Insertion]:
     """Return the mode of the options, or the best that what is known of the plate allows, and its insertion."""
     mode = options.virtual.mode or best_mode(plate)
+    if options.taken.matte is not None and mode in _WITHOUT_MATTE:
+        raise InputError(f"--matte says what stands in front, which the mode {mode} does not look at: leave --mode out, or --matte")
     return mode, insertion_of(mode, options.taken.near_distance, exact_depth=options.taken.exact_depth)
 
 

@@ -210,7 +210,8 @@ def held_told(world_from_camera: Float[np.ndarray, "3 3"]) -> str:
 
 def _seen_by(plate: Plate, solved: SolvedCamera) -> Plate:
     """Return the plate held as that camera, and with its field of view where its file tells none."""
-    plate = replace(plate, world_from_camera=looking_down(-math.radians(solved.pitch_deg), math.radians(solved.roll_deg)))
+    turn = looking_down(-math.radians(solved.pitch_deg), math.radians(solved.roll_deg))
+    plate = replace(plate, world_from_camera=turn, phone_level=False)
     if plate.view_known or solved.focal_length_source == GUESSED:
         return plate
     factor = solved.focal_length_px / solved.width_px * plate.camera.width_px / plate.camera.focal_px[0]

@@ -30,6 +30,7 @@ from jaxtyping import Bool, Float32, Float64, Int64
 from mrbokeh.compositing.edge_refinement import with_refined_edges
 from mrbokeh.compositing.near_and_far import (
     NO_HIGHLIGHTS,
+    TOLERANCE,
     Highlights,
     NearAndFar,
     continued,
@@ -248,7 +249,7 @@ class Between:
     opening of the plate's lens.
     """
 
-    tolerance: float = 0.03
+    tolerance: float = TOLERANCE
     pupil_points: int = 64
     near_depth_m: float | None = None
     refine_edges: bool = True
@@ -260,7 +261,7 @@ class Between:
         sharp = flatten([replace(layer, extra={}) for layer in layers])
         depth_m = virtual_depth_m(sharp)
         blurred = renderer.render(layers, plate.lens)
-        plate = with_told_depth(plate, depth_m, self.tolerance)
+        plate = with_told_depth(plate, layers)
         known, matte = plate, self._matte(plate, depth_m)
         if self.near_depth_m is None and plate.depth_m is None:
             return _under_shown_matte(plate, matte, blurred)
@@ -278,7 +279,7 @@ class Between:
     def cut(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> NearAndFar:
         """The sharp scene of a plate cut in two by the layers, one of which shows something."""
         depth_m = virtual_depth_m(flatten([replace(layer, extra={}) for layer in layers]))
-        plate = with_told_depth(plate, depth_m, self.tolerance)
+        plate = with_told_depth(plate, layers)
         if plate.sharp_rgb is None:
             raise InputError("to cut the scene in two its all-in-focus picture is needed: give a focal stack")
         matte = self._matte(plate, depth_m)
@@ -288,14 +289,13 @@ class Between:
 
     def _matte(self, plate: Plate, depth_m: Plane) -> Plane:
         """Return the matte of what is near: the user's, else by depth."""
-        if plate.depth_m is None and plate.near_alpha is None:
+        if plate.near_alpha is not None:
+            return np.nan_to_num(plate.near_alpha, nan=0.0)
+        if plate.depth_m is None:
             raise InputError(
                 "to put objects between the layers of a photograph it needs depth (a focal stack or --depth) or a matte of what "
                 "is near: give one, or use the mode front"
             )
-        if plate.near_alpha is not None:
-            return np.nan_to_num(plate.near_alpha, nan=0.0)
-        assert plate.depth_m is not None
         return nearer_than(plate.depth_m, depth_m, self.tolerance).astype(np.float32)
 
     def _near_depth_m(self, plate: Plate, matte: Plane) -> Plane:
@@ -325,7 +325,7 @@ class Rerendered:
     near and virtual edges are multiplied. tolerance, refine_edges: see `Between`.
     """
 
-    tolerance: float = 0.03
+    tolerance: float = TOLERANCE
     refine_edges: bool = True
 
     def insert(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> Inserted:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.compositing.between import COLOURS_REACH_PX, Between, Rerendered
-from mrbokeh.compositing.near_and_far import shows
+from mrbokeh.compositing.near_and_far import shows, with_told_depth
 from mrbokeh.compositing.over import OverPhotograph, SmoothedMatte
 from mrbokeh.compositing.plate import Inserted, Insertion, Plate, same_size
 from mrbokeh.images.layer import Layer, clear, flatten
@@ -46,6 +46,7 @@ class InDirtyRectangle:
         lit = _lit_boxes(same_size(plate, layers))
         if not lit:
             return Inserted(plate.rgb, flatten(layers) if layers else clear(*plate.rgb.shape[:2]))
+        plate = with_told_depth(plate, layers)
         known_reach = hasattr(renderer, "layering") and (bank is None or tables is not None)
         blurs_matte = plate.near_alpha is not None and getattr(self.insertion, "near_depth_m", None) is not None
         if not (is_same_everywhere(plate.lens) and known_reach) or (plate.depth_m is None and blurs_matte):

@@ -5,13 +5,14 @@ edges alone: where the virtual surface cuts through a smooth surface (a table th
 separated from the surfaces that they lie on, since each is seen through one point of the pupil at every place of its blur.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int64
 
 from mrbokeh.compositing.plate import Plate
-from mrbokeh.images.layer import Layer
+from mrbokeh.images.layer import Layer, flatten
 from mrbokeh.layering.hidden_background import split_edges
 from mrbokeh.layering.highlights import find_highlights, without_highlights
 from mrbokeh.layering.padded_layers import PaddedLayer
@@ -27,6 +28,8 @@ _NEIGHBOURS = [(dy, dx) for dy in range(-2, 3) for dx in range(-2, 3)]
 Plane = Float32[np.ndarray, "height width"]
 Picture = Float32[np.ndarray, "height width 3"]
 Mask = Bool[np.ndarray, "height width"]
+TOLERANCE = 0.03
+"""Share of its depth by which a photographed surface must be nearer to hide a virtual one: the size of the error of depth from focus."""
 
 
 @dataclass(frozen=True)
@@ -63,17 +66,14 @@ class NearAndFar:
         return layer
 
 
-def with_told_depth(plate: Plate, virtual_depth_m: Plane, tolerance: float) -> Plate:
+def with_told_depth(plate: Plate, layers: Sequence[Layer]) -> Plate:
     """Return a plate whose depth says what a user's matte with gaps tells: before the virtual surface there, or behind it."""
-    if plate.depth_m is None or plate.near_alpha is None or not np.isnan(plate.near_alpha).any():
+    if plate.depth_m is None or plate.near_alpha is None or not layers or not np.isnan(plate.near_alpha).any():
         return plate
-    told, beyond = np.nan_to_num(plate.near_alpha, nan=_GAP), np.float32(1.0 + 2.0 * tolerance)
-    depth_m = np.where(told > _HALF, np.minimum(plate.depth_m, virtual_depth_m / beyond), plate.depth_m)
-    depth_m = np.where(told < _HALF, np.maximum(depth_m, virtual_depth_m * beyond), depth_m)
+    virtual_m, beyond = virtual_depth_m(flatten([replace(layer, extra={}) for layer in layers])), np.float32(1.0 + 2.0 * TOLERANCE)
+    depth_m = np.where(plate.near_alpha > 0.5, np.minimum(plate.depth_m, virtual_m / beyond), plate.depth_m)
+    depth_m = np.where(plate.near_alpha <= 0.5, np.maximum(depth_m, virtual_m * beyond), depth_m)
     return replace(plate, depth_m=depth_m, near_alpha=None)
-
-
-_HALF = _GAP = 0.5
 
 
 def nearer_than(depth_m: Plane, virtual_depth_m: Plane, tolerance: float) -> Mask:

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float32
 
-from mrbokeh.compositing.near_and_far import with_told_depth
+from mrbokeh.compositing.near_and_far import TOLERANCE, with_told_depth
 from mrbokeh.compositing.plate import Inserted, Plate, same_size
 from mrbokeh.images.layer import Layer, clear, flatten
 from mrbokeh.renderers.base import Renderer
@@ -19,10 +19,9 @@ from mrbokeh.system.errors import InputError
 Plane = Float32[np.ndarray, "height width"]
 
 _LEAST = np.float32(1e-6)
-_TOLERANCE = 0.03
 
 
-def occlusion_matte(virtual_depth_m: Plane, photo_depth_m: Plane, tolerance: float = _TOLERANCE, softness: float = 0.02) -> Plane:
+def occlusion_matte(virtual_depth_m: Plane, photo_depth_m: Plane, tolerance: float = TOLERANCE, softness: float = 0.02) -> Plane:
     """Return the share of the virtual surface that the photographed scene leaves visible: 1 in front of it, 0 behind it.
 
     Depths are compared by their ratio. The photographed surface must be nearer by more than `tolerance` (a share of the depth, the size
@@ -49,8 +48,8 @@ class OverPhotograph:
 
     def insert(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> Inserted:
         visible = same_size(plate, layers)
-        if self.by_depth and layers:
-            plate = with_told_depth(plate, np.minimum.reduce([layer.depth_m for layer in layers]), _TOLERANCE)
+        if self.by_depth:
+            plate = with_told_depth(plate, layers)
         if self.by_depth and plate.depth_m is not None:
             visible = [covered_by(layer, occlusion_matte(layer.depth_m, plate.depth_m)) for layer in layers]
         if self.by_depth and plate.near_alpha is not None:

@@ -26,6 +26,7 @@ from mrbokeh.depth.phone_photo import PhoneFocus, PhonePhoto
 from mrbokeh.depth.stereo_depth import stereo_depth
 from mrbokeh.images.alpha_io import is_straight, read_alpha
 from mrbokeh.images.apple_notes import held_by_phone
+from mrbokeh.images.exif import TIFF_SUFFIXES, header_of
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
 from mrbokeh.images.xmp import jpeg_xmp
@@ -57,7 +58,7 @@ class Plate:
     blur_from: where the lens has its blur from, in words, if its focal length and f-number are made up.
     focus_known, view_known: False where nothing tells the focus, and where the field of view is guessed.
     rough_focus_m: nearest and farthest distance that the focus in the photograph's file may mean, where that is a wide range.
-    world_from_camera: (3, 3) turns camera axes into upright ones, where that is known.
+    world_from_camera: (3, 3) turns camera axes into upright ones, where that is known; phone_level: by the level of the phone itself.
     white_lux: illuminance under which a white surface shows 1.0, by the exposure of the photograph (`Photograph.white_lux`).
     sun: where the sun stood, by the file, whether it shone or not; None also where the exposure is unknown.
     """
@@ -74,6 +75,7 @@ class Plate:
     focus_known: bool = True
     view_known: bool = True
     world_from_camera: Float[np.ndarray, "3 3"] | None = None
+    phone_level: bool = False
     depth_note: str = ""
     rough_focus_m: tuple[float, float] | None = None
     white_lux: float | None = None
@@ -154,7 +156,8 @@ def photograph_plate(photo: Path, photograph: Photograph, phone: PhonePhoto | No
         _require_no_panorama(photo, photograph)
     held = held_lens(photo, photograph, phone, wishes)
     plate = with_own_alpha(plate_of(photograph.rgb, held.lens), photo, read_alpha(photo, photograph.orientation))
-    plate = replace(plate, white_lux=held.white_lux, world_from_camera=held_by_phone(photo))
+    turn = held_by_phone(photo)
+    plate = replace(plate, white_lux=held.white_lux, world_from_camera=turn, phone_level=turn is not None)
     plate = replace(plate, sun=None if held.white_lux is None else sun_of_photograph(photo))
     if phone is None:
         return replace(plate, focus_known=held.focus_known, view_known=held.view_known, rough_focus_m=held.rough_focus_m)
@@ -288,7 +291,7 @@ def shrunk(plate: Plate, width_px: int, height_px: int) -> Plate:
         depth_m=picked(plate.depth_m),
         camera=plate.camera.resized(*size_px),
         sharp_rgb=mean(plate.sharp_rgb),
-        near_alpha=mean(plate.near_alpha),
+        near_alpha=None if plate.near_alpha is None else shrunk_matte(plate.near_alpha, size_px),
         alpha=mean(plate.alpha),
     )
 
@@ -333,15 +336,30 @@ _HANDS_BREADTH_M = 0.1
 
 
 def read_matte(path: Path) -> Float32[np.ndarray, "height width"]:
-    """Read a user's matte of what stands in front: numbers are coverage, NaN where it is transparent; of a cut-out, its alpha."""
-    picture, alpha = read_image(path, "linear"), read_alpha(path)
+    """Read a user's matte of what stands in front: its numbers are coverage; of a cut-out, its alpha.
+
+    A grey picture with alpha (PNG, TIFF) has gaps, where it is transparent: NaN.
+    """
+    alpha = read_alpha(path)
     if alpha is None:
-        return np.ascontiguousarray(picture[..., 1])
-    coloured = np.ptp(picture, axis=2)[alpha > _HALF] > _COLOURED
-    return alpha if coloured.any() else np.where(alpha < _HALF, np.float32(np.nan), picture[..., 1])
+        return np.ascontiguousarray(read_image(path, "linear")[..., 1])
+    if path.suffix.lower() not in _GREY_WITH_ALPHA:
+        return alpha
+    with header_of(path) as picture:
+        has_gaps = picture.mode == "LA"
+    return np.where(alpha < 0.5, np.float32(np.nan), read_image(path, "linear")[..., 1]) if has_gaps else alpha
 
 
-_HALF, _COLOURED = 0.5, 0.02
+_GREY_WITH_ALPHA = (".png", *TIFF_SUFFIXES)
+
+
+def shrunk_matte(matte: Float32[np.ndarray, "height width"], size_px: tuple[int, int]) -> Float32[np.ndarray, "new_height new_width"]:
+    """Return a matte with fewer pixels, width and height: the mean of what it tells; a gap where it tells less than half."""
+    import cv2
+
+    told = 1.0 - np.isnan(matte).astype(np.float32)
+    held, share = (cv2.resize(each, size_px, interpolation=cv2.INTER_AREA) for each in (np.nan_to_num(matte, nan=0.0), told))
+    return np.where(share < 0.5, np.float32(np.nan), held / np.maximum(share, 0.5)).astype(np.float32)
 
 
 def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus_m: float | None) -> Plate:

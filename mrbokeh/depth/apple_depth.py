@@ -112,10 +112,9 @@ def _in_metres(depth: DepthMap, focus: PhoneFocus, path: Path) -> tuple[DepthMap
     The blur in pixels stays.
     """
     note = _facts(path)[0].get(_MAKER_NOTE)
-    range_m = apple_notes(note).focus_m if isinstance(note, bytes) else None
-    if range_m is None:
+    stated_m = apple_notes(note).focus_distance_m if isinstance(note, bytes) else None
+    if stated_m is None:
         return depth, focus
-    stated_m = 2.0 / (1.0 / range_m[0] + 1.0 / range_m[1])
     metres = (depth.depth_m * np.float32(stated_m / focus.focus_distance_m)).astype(np.float32)
     told = f"portrait depth of the phone (metres so that its focus is {stated_m:.2g} m away, as the file tells)"
     return replace(depth, depth_m=metres, note=told), replace(focus, focus_distance_m=stated_m, note="")

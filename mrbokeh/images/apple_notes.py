@@ -29,6 +29,11 @@ class AppleNotes:
     gravity: tuple[float, float, float] | None = None
     focus_m: tuple[float, float] | None = None
 
+    @property
+    def focus_distance_m(self) -> float | None:
+        """Return the middle of the range of the focus, in dioptres."""
+        return None if self.focus_m is None else 2.0 / (1.0 / self.focus_m[0] + 1.0 / self.focus_m[1])
+
 
 def apple_notes(note: bytes) -> AppleNotes:
     """Read a maker note; what is not Apple's, or is damaged, tells nothing."""

@@ -126,6 +126,23 @@ def test_where_rays_see_one_far_colour_the_pupil_is_shared_as_in_over(monkeypatc
     np.testing.assert_allclose(short.virtual.alpha, whole.virtual.alpha, atol=1e-5)
 
 
+@pytest.mark.parametrize("has_sharp", [False, True])
+def test_what_a_matte_with_gaps_tells_counts_in_the_part_of_the_frame_too(has_sharp: bool) -> None:
+    """A far wall, whose left part is told to be in front: its light reaches farther than the wall's would, and the part is as large."""
+    size, edge = (160, 320), 160
+    rgb = np.random.default_rng(4).uniform(0.1, 1.0, (*size, 3)).astype(np.float32)
+    told = np.full(size, np.nan, np.float32)
+    told[:, :edge] = 1.0
+    lens = replace(LENS, f_number=2.0)  # 22 px of blur for virtual things
+    plate = replace(plate_of(rgb, lens, np.full(size, FAR_M, np.float32)), near_alpha=told, sharp_rgb=rgb if has_sharp else None)
+    alpha = np.zeros(size, np.float32)
+    alpha[70:90, edge - 8 : edge + 20] = 1.0
+    virtual = Layer(alpha[..., None] * RED, alpha, np.where(alpha > 0, VIRTUAL_M, np.inf).astype(np.float32))
+    whole, part = (insertion.insert(plate, [virtual], ScatterReference()) for insertion in (Between(), insertion_of("between")))
+    np.testing.assert_allclose(part.rgb, whole.rgb, atol=0.01)
+    assert whole.virtual.alpha[80, edge - 8] < 0.2 < whole.virtual.alpha[80, edge + 10]
+
+
 def test_each_setting_matters_and_what_is_missing_is_asked_for() -> None:
     plate, virtual = photograph(), half_plane(False, VIRTUAL_M, RED)
     usual = Between().insert(plate, [virtual], ScatterReference()).rgb

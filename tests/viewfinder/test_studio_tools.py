@@ -4,7 +4,9 @@ Brush: strokes snap to edges of the picture, mattes are as soft as that, and pre
 follows them.
 """
 
+import asyncio
 from io import BytesIO
+from itertools import pairwise
 from pathlib import Path
 
 import cv2
@@ -13,7 +15,7 @@ import pytest
 from PIL import Image
 
 from mrbokeh.commands._composite_kept import KeptParts
-from mrbokeh.compositing.plate import read_matte
+from mrbokeh.compositing.plate import read_matte, shrunk_matte
 from mrbokeh.images.color import srgb_codes
 from mrbokeh.images.image_io import write_image
 from mrbokeh.solving.solved_camera import read_solved_camera
@@ -22,6 +24,7 @@ from tests.support.command_line import mrbokeh
 from tests.support.made_studio import ALIEN, CAKE, HEIGHT, WIDTH, made_studio, write_floor
 from viewfinder.studio.brush import Brush, as_shown, snapped, tinted
 from viewfinder.studio.command_line import options_of, words_of
+from viewfinder.studio.desk import Desk
 from viewfinder.studio.loupe import Region, WholePhotograph, region_of
 from viewfinder.studio.photograph import open_photograph, solved_by_hand
 from viewfinder.studio.preview import preview_of
@@ -29,6 +32,10 @@ from viewfinder.studio.project import read_project
 from viewfinder.studio.state import Stroke, StudioState, state_of, stroke_of
 
 SIZE, MIDDLE, RADIUS = 300, (150, 150), 60.0
+
+
+FLOOR_LINES = [[140, 110, 200, 170, "z"], [100, 110, 40, 170, "z"], [20, 150, 220, 150, "x"]]
+"""Edges of the floor's tiles: those ahead meet at the middle of the level horizon."""
 
 
 def disc_in_noise(blur_px: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
@@ -86,9 +93,9 @@ def photo_of_disc(path: Path) -> Path:
 def test_strokes_add_up_in_a_matte_of_the_command(tmp_path: Path, has_depth: bool) -> None:
     """With depth a matte is hard, and transparent where no stroke came; without, what no stroke reached is behind."""
     brush, file = Brush(photo_of_disc(tmp_path / "disc.png"), has_depth=has_depth), tmp_path / "matte.png"
-    file.write_bytes(brush.matte(None, Stroke(((130.0, 145.0), (165.0, 152.0)), 50.0, is_front=True)))
+    brush.paint(None, Stroke(((130.0, 145.0), (165.0, 152.0)), 50.0, is_front=True), file)
     first = read_matte(file)
-    file.write_bytes(brush.matte(file, Stroke(((150.0, 100.0), (150.0, 110.0)), 12.0, is_front=False)))
+    brush.paint(file, Stroke(((150.0, 100.0), (150.0, 110.0)), 12.0, is_front=False), file)
     second = read_matte(file)
     assert first[150, 150] == 1.0 and first[105, 150] == 1.0 and second[150, 150] == 1.0 and second[105, 150] == 0.0
     assert np.isnan(second[5, 5]) if has_depth else second[5, 5] == 0.0
@@ -99,15 +106,41 @@ def test_strokes_add_up_in_a_matte_of_the_command(tmp_path: Path, has_depth: boo
     assert (tint[52, 75].tolist() == [40, 120, 255, 127]) if has_depth else tint[52, 75, 3] == 0
     Image.fromarray(np.zeros((9, 9), np.uint8)).save(file)
     with pytest.raises(InputError, match="9x9 px, but the photograph 300x300"):
-        brush.matte(file, Stroke(((1.0, 1.0),), 5.0, is_front=True))
+        Brush(tmp_path / "disc.png", has_depth=has_depth).paint(file, Stroke(((1.0, 1.0),), 5.0, is_front=True), tmp_path / "out.png")
+    assert not (tmp_path / "out.png").exists()
 
 
 def test_a_cut_out_is_a_matte_too(tmp_path: Path) -> None:
-    """Of a picture with colours its alpha counts; of a grey one its numbers, where it is opaque."""
+    """Of a picture in RGB its alpha counts, also where it is white; of a grey one its numbers, where it is opaque."""
     cut = np.zeros((8, 8, 4), np.uint8)
-    cut[2:6, 2:6] = (200, 40, 10, 255)
+    cut[2:6, 2:6] = (255, 255, 255, 80)
     Image.fromarray(cut).save(tmp_path / "cut.png")
-    assert (read_matte(tmp_path / "cut.png") == (cut[..., 3] > 0)).all()
+    np.testing.assert_allclose(read_matte(tmp_path / "cut.png"), cut[..., 3] / 255.0, atol=1e-6)
+    grey = Image.merge("LA", [Image.fromarray(cut[..., 3]), Image.fromarray(np.where(cut[..., 3] > 0, 255, 0).astype(np.uint8))])
+    grey.save(tmp_path / "grey.png")
+    held = read_matte(tmp_path / "grey.png")
+    np.testing.assert_allclose(held[2:6, 2:6], 80 / 255.0, atol=1e-6)
+    assert np.isnan(held[0]).all()
+
+
+def test_a_thin_stroke_stays_in_a_smaller_matte() -> None:
+    held = np.full((60, 60), np.nan, np.float32)
+    held[:, 27:34] = 1.0
+    small = shrunk_matte(held, (12, 12))
+    assert (~np.isnan(small)).any(axis=1).all() and np.nanmin(small) == 1.0
+
+
+def test_many_strokes_do_not_wear_a_matte_away(tmp_path: Path) -> None:
+    """Bars of 3 px, softened by every stroke: another stroke far away leaves them as the first one had them."""
+    photo = np.full((120, 240, 3), 60, np.uint8)
+    photo[20:100, 20:100:12] = photo[20:100, 21:100:12] = photo[20:100, 22:100:12] = 220
+    Image.fromarray(cv2.GaussianBlur(photo, (0, 0), 1.5)).save(tmp_path / "bars.png")
+    brush, files = Brush(tmp_path / "bars.png", has_depth=False), [tmp_path / f"{number}.png" for number in range(5)]
+    brush.paint(None, Stroke(((20.0, 60.0), (100.0, 60.0)), 30.0, is_front=True), files[0])
+    for before, after in pairwise(files):
+        brush.paint(before, Stroke(((200.0, 60.0),), 6.0, is_front=True), after)
+    first, last = (read_matte(each)[:, :150] for each in (files[1], files[-1]))
+    assert abs(first.sum() - last.sum()) < 0.002 * first.sum()
 
 
 def state_with_matte(folder: Path) -> StudioState:
@@ -134,6 +167,36 @@ def test_preview_loupe_and_command_show_what_is_behind_a_matte(tmp_path: Path) -
     shown = region_of(WholePhotograph(opened), options, kept, Region(120.0, 110.0, 48))
     # But for grain, as the loupe says.
     np.testing.assert_allclose(shown, preview[86:134, 96:144], atol=0.02)
+
+
+async def opened_desk(desk: Desk) -> None:
+    while desk.photograph is None or desk.busy:
+        await desk.news_after(desk.number, 1.0)
+
+
+async def test_what_changes_while_a_tool_works_is_kept(tmp_path: Path) -> None:
+    """A cleared matte stays cleared under a stroke that was under way, and a camera of lines is taken whatever else changed."""
+    async with made_studio(tmp_path, StudioState(photo=photo_of_disc(tmp_path / "disc.png"), object=CAKE)) as made:
+        desk = made.desk
+        await opened_desk(desk)
+        await desk.paint(stroke_of({"points": [[150, 150]], "radius": 50, "front": True}))
+        under_way = asyncio.create_task(desk.paint(stroke_of({"points": [[20, 20]], "radius": 10, "front": True})))
+        await asyncio.sleep(0)
+        await desk.change({"matte": None})
+        await under_way
+        held = read_matte(desk.state.matte)  # type: ignore[arg-type]
+        assert held[20, 20] > 0.5 and held[150, 150] == 0.0
+        with pytest.raises(InputError, match="no picture 3 of a focal stack"):
+            await desk.change({"slice": 3})
+    (tmp_path / "floor").mkdir()
+    async with made_studio(tmp_path / "floor", StudioState(photo=write_floor(tmp_path / "floor.png"), object=CAKE)) as made:
+        desk = made.desk
+        await opened_desk(desk)
+        under_way = asyncio.create_task(desk.change({"lines": FLOOR_LINES}))
+        await asyncio.sleep(0.01)
+        await desk.change({"exposure": 1.5})
+        await under_way
+        assert desk.state.camera is not None and desk.state.exposure == 1.5 and len(desk.state.lines) == 3
 
 
 async def test_pages_paint_and_see_it(tmp_path: Path) -> None:
@@ -169,10 +232,6 @@ def test_strokes_that_cannot_be_meant_are_refused(message: dict[str, object], wh
         stroke_of(message)
 
 
-FLOOR_LINES = [[140, 110, 200, 170, "z"], [100, 110, 40, 170, "z"], [20, 150, 220, 150, "x"]]
-"""Edges of the floor's tiles: those ahead meet at the middle of the level horizon."""
-
-
 async def test_drawn_lines_give_the_camera_until_they_are_taken_away(tmp_path: Path) -> None:
     async with made_studio(tmp_path, StudioState(photo=write_floor(tmp_path / "floor.png"), object=CAKE, pitch_deg=12.0)) as made:
         desk = made.desk
@@ -193,7 +252,9 @@ async def test_drawn_lines_give_the_camera_until_they_are_taken_away(tmp_path: P
         kept = read_project(desk.project.path)
         assert kept.state.lines == tuple(tuple(each) for each in FLOOR_LINES)
         await desk.change({"lines": []})
-        assert desk.state.lines == () and desk.state.camera != first.camera
+        found = desk._cameras[desk.state.photo]
+        expected = Path(found["file"]) if found.get("is_sure") else None
+        assert desk.state.lines == () and desk.state.camera == expected != first.camera
 
 
 def test_drawn_lines_count_in_pixels_of_the_whole_photograph(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 7b33c71e8924ed56d143e3de0c368d454d1f309047d06ce72a70b12b909e6975
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: e7658eed83a10358655ce987d909abd8f0a4e83f49c23bce4ea7cfb3d1a2e6b7
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 7b33c71e8924ed56d143e3de0c368d454d1f309047d06ce72a70b12b909e6975
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: e7658eed83a10358655ce987d909abd8f0a4e83f49c23bce4ea7cfb3d1a2e6b7
 "use strict";
 (() => {
   // src/model.ts
@@ -454,7 +454,7 @@
       const told = studio.told;
       byId2("undo").disabled = !told.can_undo;
       byId2("redo").disabled = !told.can_redo;
-      byId2("camera_told").textContent = told.photo?.has_depth ? "The photograph has depth: the ground slopes as that says." : told.camera?.told ?? (told.photo ? "The camera is looked for in the picture's lines." : "");
+      byId2("camera_told").textContent = told.photo?.has_depth && !told.state.lines.length ? "The photograph has depth: the ground slopes as that says." : told.camera?.told ?? (told.photo ? "The camera is looked for in the picture's lines." : "");
       byId2("camera_found").disabled = told.camera?.file === void 0;
       byId2("plain").disabled = Boolean(told.photo && !told.photo.has_depth && !told.state.plain);
       const photo = told.photo;
@@ -677,7 +677,10 @@
       byId3("brush_row").hidden = !this.on;
       byId3("brush_clear").disabled = !matte;
       this.tint.hidden = !this.on || !matte;
-      if (!this.on) this.drawn.replaceChildren();
+      if (!this.on) {
+        this.points = [];
+        this.drawn.replaceChildren();
+      }
       const source = `/matte?of=${encodeURIComponent(matte ?? "")}`;
       if (matte && this.on && this.tint.getAttribute("src") !== source) this.tint.src = source;
     }
@@ -709,6 +712,7 @@
       const front = byId3("brush_behind").getAttribute("aria-pressed") !== "true";
       this.points = [];
       this.waiting++;
+      await studio.commit();
       studio.say("finding the edge ...", true);
       const told = await studio.post("/paint", { points, radius: Math.max(1, this.radius_px), front });
       if (told) studio.take(told);
@@ -1119,7 +1123,7 @@
           this.stage.classList.remove("dragging");
           void studio.commit();
         },
-        pinch: (factor, _x, _y, _dx, _dy, turn_deg) => this.brush.on ? this.brush.scale(factor) : this.shape(factor, turn_deg)
+        pinch: (factor, _x, _y, _dx, _dy, turn_deg) => this.brush.on ? this.brush.scale(factor) : this.lines.on || this.shape(factor, turn_deg)
       });
     }
     tapped(x, y) {

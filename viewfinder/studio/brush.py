@@ -15,11 +15,12 @@ import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 from PIL import Image
 
-from mrbokeh.compositing.plate import read_matte
+from mrbokeh.compositing.plate import read_matte, shrunk_matte
 from mrbokeh.depth.depth_filters import guided_upsampling
 from mrbokeh.images.color import srgb_codes
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.stacks.photograph import read_photograph
+from mrbokeh.system.atomic_files import atomic_path
 from mrbokeh.system.channel import apart
 from mrbokeh.system.errors import InputError
 from viewfinder.studio.state import Stroke
@@ -77,7 +78,7 @@ def _cut(codes: Codes, before: Mask, line_px: np.ndarray, radius_px: float) -> M
 def _away_px(shape: tuple[int, int], line_px: np.ndarray) -> Plane:
     """Return every pixel's distance from a line through points."""
     drawn = np.ones(shape, np.uint8)
-    line = np.round(line_px).astype(np.int32)
+    line = np.clip(np.floor(line_px), 0, [shape[1] - 1, shape[0] - 1]).astype(np.int32)
     cv2.polylines(drawn, [line], isClosed=False, color=0)
     cv2.circle(drawn, line[0].tolist(), 0, 0)  # a single point is no line
     return np.asarray(cv2.distanceTransform(drawn, cv2.DIST_L2, 5), np.float32)
@@ -139,39 +140,49 @@ class Brush:
 
     def __init__(self, path: Path, stack: FocalStack | None = None, *, has_depth: bool) -> None:
         self._path, self._stack, self._has_depth = path, stack, has_depth
+        self._painted: dict[Path | None, tuple[Mask, Mask]] = {}
 
     @cached_property
     def _codes(self) -> Codes:
         with apart():
             return srgb_codes(self._stack.all_in_focus() if self._stack else read_photograph(self._path).rgb, np.uint8)
 
-    def matte(self, before: Path | None, stroke: Stroke) -> bytes:
-        """Return a matte as a PNG for `mrbokeh composite --matte`: an earlier one with a stroke. Raises InputError for another size."""
+    def paint(self, before: Path | None, stroke: Stroke, out: Path) -> None:
+        """Write a matte (PNG) for `mrbokeh composite --matte`: an earlier one with a stroke. Raises InputError for another size."""
         codes = self._codes
-        held = read_matte(before) if before is not None else np.full(codes.shape[:2], np.nan, np.float32)
-        if held.shape != codes.shape[:2]:
-            raise InputError(f"{before} is {held.shape[1]}x{held.shape[0]} px, but the photograph {codes.shape[1]}x{codes.shape[0]}")
-        told, front = ~np.isnan(held) if self._has_depth else np.ones(held.shape, bool), np.nan_to_num(held, nan=0.0) > 0.5
-        cut = snapped(codes, front if stroke.is_front else told & ~front if self._has_depth else ~front, stroke.points_px, stroke.radius_px)
+        front, told = self._marked(before)
+        if front.shape != codes.shape[:2]:
+            raise InputError(f"{before} is {front.shape[1]}x{front.shape[0]} px, but the photograph {codes.shape[1]}x{codes.shape[0]}")
+        same = front if stroke.is_front else told & ~front
+        cut = snapped(codes, same, stroke.points_px, stroke.radius_px)
         front, told = (front | cut if stroke.is_front else front & ~cut), told | cut
-        grey = Image.fromarray(np.rint(255.0 * (front if self._has_depth else as_shown(codes, front))).astype(np.uint8))
-        whole = Image.merge("LA", (grey, Image.fromarray(told.astype(np.uint8) * 255))) if self._has_depth else grey
-        kept = BytesIO()
-        whole.save(kept, "PNG", compress_level=3)
-        return kept.getvalue()
+        # A soft edge read back and cut at its half would move with every stroke.
+        self._painted = {**dict(list(self._painted.items())[-1:]), out: (front, told)}
+        planes = [front, told] if self._has_depth else [as_shown(codes, front)]
+        pictures = [Image.fromarray(np.rint(255.0 * each).astype(np.uint8)) for each in planes]
+        with atomic_path(out) as written:
+            (Image.merge("LA", pictures) if self._has_depth else pictures[0]).save(written, "PNG", compress_level=3)
+
+    def _marked(self, before: Path | None) -> tuple[Mask, Mask]:
+        """Return what an earlier matte says is in front, and of what it tells anything."""
+        if before in self._painted:
+            return self._painted[before]
+        held = np.full(self._codes.shape[:2], np.nan, np.float32) if before is None else read_matte(before)
+        return held > 0.5, ~np.isnan(held) if self._has_depth else np.ones(held.shape, bool)
 
 
 def tinted(path: Path, size_px: tuple[int, int]) -> bytes:
     """Return a matte as a PNG of some size that lies over the picture: what is in front in orange, what is told to be behind in blue."""
-    held = read_matte(path)
-    told = ~np.isnan(held) if np.isnan(held).any() else held > 0.0
+    whole = read_matte(path)
+    held, has_gaps = shrunk_matte(whole, size_px), bool(np.isnan(whole).any())
     front = np.nan_to_num(held, nan=0.0)
-    colours = np.where(front[..., None] > 0.0, _FRONT, _BEHIND)
-    cover = np.where(told, np.maximum(front, np.float32(np.isnan(held).any())), 0.0) * _TINT
-    shown = np.dstack([colours, 255.0 * cover]).astype(np.uint8)
+    shown = np.empty((*held.shape, 4), np.uint8)
+    shown[..., :3] = _FRONT
+    shown[..., :3][(front < 0.5) & has_gaps] = _BEHIND
+    shown[..., 3] = 255.0 * _TINT * (~np.isnan(held) if has_gaps else front)
     kept = BytesIO()
-    Image.fromarray(cv2.resize(shown, size_px, interpolation=cv2.INTER_AREA)).save(kept, "PNG", compress_level=1)
+    Image.fromarray(shown).save(kept, "PNG", compress_level=1)
     return kept.getvalue()
 
 
-_FRONT, _BEHIND, _TINT = np.array([255, 140, 0]), np.array([40, 120, 255]), 0.5
+_FRONT, _BEHIND, _TINT = (255, 140, 0), (40, 120, 255), 0.5

@@ -42,10 +42,10 @@ class Desk:
         self._changed = asyncio.Event()
         self._opened: dict[tuple[Path | None, Path | None, int | None], OpenedPhotograph] = {}
         self._cameras: dict[Path, dict[str, Any]] = {}
-        self._drawn: dict[tuple[DrawnLine, ...], dict[str, Any]] = {}
+        self._drawn: tuple[object, dict[str, Any]] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
-        self._strokes = asyncio.Lock()
-        self._brush: tuple[OpenedPhotograph, Brush] | None = None
+        self._tools = asyncio.Lock()
+        self._brush: tuple[Path, Brush] | None = None
 
     @property
     def state(self) -> StudioState:
@@ -93,6 +93,9 @@ class Desk:
         document = self.state.document() | {str(name): value for name, value in changes.items()}
         state = state_of(document)
         known = self._known_files()
+        stack = None if self.photograph is None else self.photograph.stack
+        if state.slice is not None and state.slice != self.state.slice and (stack is None or state.slice >= len(stack)):
+            raise InputError(f"there is no picture {state.slice} of a focal stack here: load the page again")
         named = [(name, getattr(state, name)) for name in known]
         for name, path in (*named, *(("object", each.object) for each in state.objects)):
             if path is not None and path not in known[name]:
@@ -113,35 +116,38 @@ class Desk:
 
     async def change(self, changes: Any) -> None:
         """Take changes of a page over, complete what follows from them, and keep the project."""
-        before, state, opened = self.state.lines, self.changed_state(changes), self.photograph
+        before, state, opened = self.state, self.changed_state(changes), self.photograph
         if opened is not None and opened.stack is not None and state.focus_at_px is not None:
             state = replace(state, slice=opened.slice_in_focus(*state.focus_at_px), focus_at_px=None)
         self.project.add(state)
         self._keep()
-        if self.state.photo is not None and opened is not None and self.photograph is None:
+        if state.slice != before.slice and self.photograph is None:
             await self._open()
-        if self.state.lines != before:
+        if state.lines != before.lines:
             await self._by_hand()
         await self._complete()
 
     async def _by_hand(self) -> None:
         """Give the state the camera of its drawn lines, or without any that of the picture's own."""
-        state, opened = self.state, self.photograph
-        if opened is None or state.photo is None:
-            return
-        found = self._cameras.get(state.photo, {})
-        if state.lines:
-            file = _free(self.uploads / f"{state.photo.stem}.drawn.camera.json")
-            self.busy = "looking for the camera of the lines"
-            self.tell_all()
-            try:
-                found = self._drawn[state.lines] = await asyncio.to_thread(_camera_of_lines, opened, state.lines, file)
-            finally:
-                self.busy = ""
-        if self.state == state:
-            camera = Path(found["file"]) if found.get("file") and (state.lines or found.get("is_sure")) else None
-            self.project.amend(lambda state: replace(state, camera=camera, pitch_deg=None))
-        self._keep()
+        async with self._tools:
+            state, opened = self.state, self.photograph
+            if opened is None or state.photo is None:
+                return
+            found = self._cameras.get(state.photo, {})
+            if state.lines:
+                self.busy = "looking for the camera of the lines"
+                self.tell_all()
+                file = _free(self.uploads / f"{state.photo.stem}.drawn.camera.json")
+                try:
+                    found = await asyncio.to_thread(_camera_of_lines, opened, state.lines, file)
+                finally:
+                    self.busy = ""
+                    self.tell_all()
+                self._drawn = (state.photo, state.lines), found
+            if (self.state.photo, self.state.lines) == (state.photo, state.lines):
+                camera = Path(found["file"]) if found.get("file") and (state.lines or found.get("is_sure")) else None
+                self.project.amend(lambda state: replace(state, camera=camera, pitch_deg=None))
+            self._keep()
 
     async def add_object(self, path: Any) -> None:
         """Add an object that the page was offered, beside the chosen one. Raises InputError."""
@@ -159,19 +165,21 @@ class Desk:
         """Add a stroke of the brush to what is told to be in front; strokes come one after the other. Raises InputError."""
         from viewfinder.studio.brush import Brush
 
-        async with self._strokes:
-            opened, state = self.photograph, self.state
+        async with self._tools:
+            opened = self.photograph
             if opened is None:
                 raise InputError("there is no photograph to paint on yet: drop one on the page")
-            if self._brush is None or self._brush[0] is not opened:
-                self._brush = opened, Brush(opened.path, opened.stack, has_depth=opened.has_depth)
-            png = await asyncio.to_thread(self._brush[1].matte, state.matte, stroke)
+            if self._brush is None or self._brush[0] != opened.path:
+                self._brush = opened.path, Brush(opened.path, opened.stack, has_depth=opened.has_depth)
             self.uploads.mkdir(parents=True, exist_ok=True)
-            path = _free(self.uploads / f"{opened.path.stem}_in_front.png")
-            await asyncio.to_thread(path.write_bytes, png)
-            if self.photograph is opened:
-                self.project.add(replace(self.state, matte=_short(path)))
-                self._keep()
+            while self.state.photo == opened.path:
+                before, path = self.state.matte, _free(self.uploads / f"{opened.path.stem}_in_front.png")
+                await asyncio.to_thread(self._brush[1].paint, before, stroke, path)
+                # What was cleared or undone meanwhile stays so.
+                if self.state.photo == opened.path and self.state.matte == before:
+                    self.project.add(replace(self.state, matte=_short(path)))
+                    self._keep()
+                    return
 
     async def step(self, by: Any) -> None:
         """Undo or redo."""
@@ -236,11 +244,12 @@ class Desk:
             opened, camera = await asyncio.to_thread(_opened_photograph, path, depth, state.slice)
             while len(self._opened) >= _KEPT_PHOTOGRAPHS:
                 del self._opened[next(iter(self._opened))]
-            self._opened[path, depth, opened.slice] = opened
+            self._opened[path, depth, opened.slice if opened.stack else state.slice] = opened
             if opened.stack is not None:
                 self._cameras.setdefault(path, {})
-                if self.state == state:
+                if (self.state.photo, self.state.depth, self.state.slice) == (path, depth, state.slice):
                     self.project.amend(lambda state: replace(state, slice=opened.slice))
+                    self._keep()
             self.busy = "looking for the camera in the picture's lines" if path not in self._cameras else ""
             self.tell_all()
             if path not in self._cameras:
@@ -285,7 +294,10 @@ class Desk:
     def camera_told(self) -> dict[str, Any] | None:
         """Return what the picture's lines tell of its camera, or why they do not; None while they are looked at."""
         if self.state.lines:
-            return self._drawn.get(self.state.lines, {"told": "The camera is that of the drawn lines.", "file": str(self.state.camera)})
+            if self._drawn is not None and self._drawn[0] == (self.state.photo, self.state.lines):
+                return self._drawn[1]
+            told = "The camera is that of the drawn lines." if self.state.camera else "The drawn lines tell no camera: draw more."
+            return {"told": told} | ({"file": str(self.state.camera)} if self.state.camera else {})
         return None if self.state.photo is None else self._cameras.get(self.state.photo)
 
 

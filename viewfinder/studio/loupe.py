@@ -11,7 +11,7 @@ from mrbokeh.commands._composite_layers import objects_of
 from mrbokeh.commands._composite_options import CompositeOptions
 from mrbokeh.commands._composited import composited, placed
 from mrbokeh.compositing.between import COLOURS_REACH_PX
-from mrbokeh.compositing.plate import Plate, read_matte
+from mrbokeh.compositing.plate import Plate
 from mrbokeh.compositing.plate_look.finishing import Finishing
 from mrbokeh.layering.pixel_box import Box, is_same_everywhere
 from mrbokeh.optics.camera import camera_of_lens
@@ -102,7 +102,7 @@ def _standing(whole: WholePhotograph, options: CompositeOptions) -> tuple[Plate,
         lens=small.lens,
         camera=camera_of_lens(small.lens, *whole.photograph.size_px),
         world_from_camera=small.world_from_camera,
-        near_alpha=None if options.taken.matte is None else read_matte(options.taken.matte),
+        near_alpha=None if options.taken.matte is None else whole.photograph.whole_matte(options.taken.matte),
         focus_known=small.focus_known,
         view_known=small.view_known,
     )

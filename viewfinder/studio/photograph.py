@@ -5,7 +5,6 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from pathlib import Path
 
-import cv2
 import numpy as np
 from jaxtyping import Float32
 
@@ -23,6 +22,7 @@ from mrbokeh.compositing.plate import (
     photograph_plate,
     read_matte,
     shrunk,
+    shrunk_matte,
     slice_lens,
     with_depth,
 )
@@ -92,7 +92,7 @@ class OpenedPhotograph:
         stated, guessing = {} if lens else options.facts.given, not options.standing.plain
         small, focus_at = self._at(most_px), options.optics.focus_at
         if (matte := options.taken.matte) is not None:
-            small = replace(small, near_alpha=_matte_of(matte, modified_s(matte), small.rgb.shape[1::-1]))
+            small = replace(small, near_alpha=shrunk_matte(self.whole_matte(matte), small.rgb.shape[1::-1]))
         focus_m = options.optics.focus if focus_at is None else 1.0
         if self.stack is not None:
             return self._slice_plate(small, options, lens), renderer
@@ -102,6 +102,15 @@ class OpenedPhotograph:
             return plate, renderer
         focused = focused_at_pixel(plate.lens, plate.depth_m, self.small(options, most_px).optics.focus_at or "")
         return _with_lens(small, replace(held, lens=focused)), renderer
+
+    def whole_matte(self, path: Path) -> Float32[np.ndarray, "height width"]:
+        """Return a matte of the photograph. Raises InputError for one of another size."""
+        matte = _matte_of(path, modified_s(path))
+        if matte.shape[::-1] != self.size_px:
+            raise InputError(
+                f"the matte {path} is {matte.shape[1]}x{matte.shape[0]} px, but the photograph {self.size_px[0]}x{self.size_px[1]}"
+            )
+        return matte
 
     def _slice_plate(self, small: Plate, options: CompositeOptions, lens: Lens | None) -> Plate:
         """Return the plate of a slice with the lens that `mrbokeh composite` gives it."""
@@ -200,10 +209,10 @@ def _lens_of(path: Path | None, _changed_s: float) -> tuple[Lens | None, Rendere
     return lens_and_renderer(path, None)
 
 
-@lru_cache(maxsize=4)
-def _matte_of(path: Path, _changed_s: float, size_px: tuple[int, int]) -> Float32[np.ndarray, "height width"]:
-    """Return a matte of some size, read again when it changed."""
-    return np.asarray(cv2.resize(read_matte(path), size_px, interpolation=cv2.INTER_AREA), np.float32)
+@lru_cache(maxsize=2)
+def _matte_of(path: Path, _changed_s: float) -> Float32[np.ndarray, "height width"]:
+    """Return a matte, read again when it changed."""
+    return read_matte(path)
 
 
 def solved(photograph: Photograph, lines: Sequence[DrawnLine] = ()) -> SolvedCamera:

@@ -85,8 +85,9 @@ def read_project(path: Path) -> Project:
         raise InputError(f"expected {_EXPECTED} at {path}, but: {error}") from None
     there = {name: [each for each in files if each.exists()] for name, files in (("objects", objects), ("lenses", lenses))}
     project = Project(path, history, place, **there)
-    if project.state.camera is not None and not project.state.camera.is_file():
-        project.amend(lambda state: replace(state, camera=None))
+    for name in ("camera", "matte"):
+        if (made := getattr(project.state, name)) is not None and not made.is_file():
+            project.history[project.place] = replace(project.state, **{name: None})  # type: ignore[arg-type]
     named = [(name, getattr(project.state, name)) for name in _PATHS]
     for name, file in (*named, *(("object", each.object) for each in project.state.objects)):
         if file is not None and not (file.is_file() or (name in ("photo", "lens") and file.is_dir())):

@@ -41,8 +41,8 @@ def project_of(options: StudioOptions) -> Project:
         if path is not None:
             raise InputError(f"{photo} and --project {path} are both projects: give one of them")
         path, photo = _there(photo, "a project file of `mrbokeh studio`"), None
-    elif photo is not None:
-        _ = photo.is_dir() or _there(photo, "a photograph")
+    elif photo is not None and not photo.is_dir():
+        _there(photo, "a photograph")
     path = path or options.pictures / f"{photo.stem if photo else 'untitled'}{_SUFFIX}"
     project = read_project(path) if path.exists() else Project(path)
     if photo is not None and project.state.photo != photo:

@@ -238,7 +238,7 @@ def _photo_told(opened: "OpenedPhotograph", state: StudioState) -> dict[str, Any
     shown |= {"f_number": told.f_number, "focus_m": told.focus_distance_m, "focal_length_mm": told.focal_length_mm}
     try:
         with apart():
-            whole = state if state.is_complete else _anywhere(state, opened)
+            whole = replace(state if state.is_complete else _anywhere(state, opened), matte=None)
             plate, _renderer, known_height_m = opened.upright(options_of(whole), _FEW_PX)
             eyes_m = placed_state(whole, opened).camera_height_m or known_height_m
         held = plate.world_from_camera

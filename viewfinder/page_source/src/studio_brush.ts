@@ -41,7 +41,10 @@ export class Brush {
     byId<HTMLElement>("brush_row").hidden = !this.on;
     byId<HTMLButtonElement>("brush_clear").disabled = !matte;
     this.tint.hidden = !this.on || !matte;
-    if (!this.on) this.drawn.replaceChildren();
+    if (!this.on) {
+      this.points = [];
+      this.drawn.replaceChildren();
+    }
     const source = `/matte?of=${encodeURIComponent(matte ?? "")}`;
     if (matte && this.on && this.tint.getAttribute("src") !== source) this.tint.src = source;
   }
@@ -78,6 +81,7 @@ export class Brush {
     const front = byId<HTMLElement>("brush_behind").getAttribute("aria-pressed") !== "true";
     this.points = [];
     this.waiting++;
+    await studio.commit();
     studio.say("finding the edge ...", true);
     const told = await studio.post("/paint", { points, radius: Math.max(1, this.radius_px), front });
     if (told) studio.take(told);

@@ -181,7 +181,7 @@ export class Panel {
     const told = studio.told!;
     byId<HTMLButtonElement>("undo").disabled = !told.can_undo;
     byId<HTMLButtonElement>("redo").disabled = !told.can_redo;
-    byId("camera_told").textContent = told.photo?.has_depth
+    byId("camera_told").textContent = told.photo?.has_depth && !told.state.lines.length
       ? "The photograph has depth: the ground slopes as that says."
       : told.camera?.told ?? (told.photo ? "The camera is looked for in the picture's lines." : "");
     byId<HTMLButtonElement>("camera_found").disabled = told.camera?.file === undefined;

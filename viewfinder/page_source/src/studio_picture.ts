@@ -208,7 +208,7 @@ export class PictureStage {
         this.stage.classList.remove("dragging");
         void studio.commit();
       },
-      pinch: (factor, _x, _y, _dx, _dy, turn_deg) => (this.brush.on ? this.brush.scale(factor) : this.shape(factor, turn_deg)),
+      pinch: (factor, _x, _y, _dx, _dy, turn_deg) => (this.brush.on ? this.brush.scale(factor) : this.lines.on || this.shape(factor, turn_deg)),
     });
   }
 
