@@ -16,6 +16,7 @@ from mrbokeh.compositing.ground import with_ground_behind
 from mrbokeh.compositing.near_and_far import nearer_than
 from mrbokeh.compositing.plate import Inserted, Insertion, Plate
 from mrbokeh.compositing.plate_look.finishing import Finishing, finished
+from mrbokeh.images.color import luminance
 from mrbokeh.images.layer import Layer
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.stacks.capture_bundle import CaptureBundle
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from mrbokeh.commands._composite_kept import KeptParts
 
 _NEARER, _MUCH_HIDDEN = 0.03, 0.4
+_RASTER, _COLOURLESS = 200, 0.004
 _WITHOUT_MATTE = ("front", "matte")
 
 
@@ -86,8 +88,19 @@ def composited(
     if asked is not None and asked.object_ and (warning := placing_warning(sharp, plate, mode, " ".join(asked.height or ()))):
         warn(warning)
     with nullcontext() if kept else working("blurring"):
-        inserted = finished(insertion.insert(plate, sharp, renderer), plate, finishing)
+        inserted = insertion.insert(plate, sharp, renderer)
+        if options.standing.object_ and not options.standing.plain and is_monochrome(plate):
+            guess("the photograph is black and white, and so is the object (--plain leaves its colours)" if asked else "")
+            grey = np.repeat(luminance(inserted.virtual.rgb)[..., None], 3, axis=2).astype(np.float32)
+            inserted = replace(inserted, virtual=replace(inserted.virtual, rgb=grey))
+        inserted = finished(inserted, plate, finishing)
     return Composited(inserted, plate, sharp, mode)
+
+
+def is_monochrome(plate: Plate) -> bool:
+    """Return whether a photograph is black and white: no pixel of a fine raster has a colour."""
+    seen = plate.rgb[:: max(1, plate.rgb.shape[0] // _RASTER), :: max(1, plate.rgb.shape[1] // _RASTER)]
+    return bool((np.ptp(seen, axis=2) <= _COLOURLESS * np.abs(seen).max(axis=2) + 1e-6).all())
 
 
 def insertion_by(options: CompositeOptions, plate: Plate) -> tuple[str, Insertion]:

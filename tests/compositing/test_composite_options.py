@@ -380,3 +380,16 @@ def test_panoramas_are_refused_or_told(tmp_path: Path, caplog: pytest.LogCapture
     (tmp_path / "gpano.jpg").write_bytes(plain[:2] + b"\xff\xe1" + (len(packet) + 2).to_bytes(2, "big") + packet + plain[2:])
     refused("is a panorama, as its XMP tells", open_plate, tmp_path / "gpano.jpg", focus_m=1.0, guessing=True)
     assert open_plate(tmp_path / "gpano.jpg", lens=LENS).lens == LENS, "which somebody states"
+
+
+def test_an_object_in_a_black_and_white_photograph_has_no_colours(tmp_path: Path) -> None:
+    grey = np.repeat(np.linspace(0.1, 0.6, 96 * 64, dtype=np.float32).reshape(64, 96, 1), 3, axis=2)
+    write_image(tmp_path / "grey.png", grey)
+    write_lens(tmp_path / "lens.json", Lens(35.0, 8.0, 1.5, 36.0))
+    words = (tmp_path / "grey.png", "--lens", tmp_path / "lens.json", "--object", CAKE, "--at", "0,0.3,1.5", "--height", "0.4")
+    for name, more in (("grey", ()), ("plain", ("--plain",))):
+        done = mrbokeh("composite", *words, *more, "--out", tmp_path / f"{name}_out.png")
+        assert done.returncode == 0, done.stderr
+        assert ("black and white" in done.stdout) == (name == "grey")
+    apart = {name: np.ptp(cv2.imread(str(tmp_path / f"{name}_out.png")), axis=2).max() for name in ("grey", "plain")}
+    assert apart["grey"] <= 1 and apart["plain"] > 20

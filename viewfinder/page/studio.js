@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: e7658eed83a10358655ce987d909abd8f0a4e83f49c23bce4ea7cfb3d1a2e6b7
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 7c73696997138dc7a5dfee10ccd2cda25af10543de47b5e275f7a7136c990a14
 "use strict";
 (() => {
   // src/model.ts
@@ -393,7 +393,7 @@
     sliceTold(slice) {
       const photo = studio.told?.photo;
       const metres = photo?.focus_distances_m?.[slice];
-      const told = `${slice + 1} of ${photo?.slices ?? 1}${metres ? `, focused at ${Number(metres.toPrecision(3))} m` : ""}`;
+      const told = `slice ${slice} of 0 to ${(photo?.slices ?? 1) - 1}${metres ? `, focused at ${Number(metres.toPrecision(3))} m` : ""}`;
       byId2("slice_row").querySelector("output").textContent = told;
       byId2("slice").setAttribute("aria-valuetext", told);
     }
@@ -539,12 +539,18 @@
     shown() {
       const shown = studio.shown;
       byId2("guessed").replaceChildren(
-        ...[...shown.guessed, ...shown.warnings].map((sentence) => Object.assign(document.createElement("li"), { textContent: sentence }))
+        ...[...groundTold(), ...shown.guessed, ...shown.warnings].map((sentence) => Object.assign(document.createElement("li"), { textContent: sentence }))
       );
       if (studio.isChanging) byId2("command").textContent = shown.command ?? "";
       if (studio.state) byId2("focus_told").textContent = focusTold(studio.state);
     }
   };
+  function groundTold() {
+    const [told, state] = [studio.told, studio.state];
+    if (!told?.photo || told.photo.has_depth || !state?.camera_height_m) return [];
+    const tilt = state.camera === null && state.pitch_deg !== null ? [`The camera looks down by ${state.pitch_deg}°, which nothing in the picture tells: see Camera and ground, or draw Lines.`] : [];
+    return [...tilt, `The camera is ${state.camera_height_m} m above the ground; all metres hang on that.`];
+  }
   var nameOf = (path) => path.replace(/^.*[\\/]/, "").replace(/\.\w+$/, "");
   function offer(id, choices) {
     const select = byId2(id);
@@ -654,6 +660,7 @@
       const button = byId3("brush");
       button.addEventListener("click", () => {
         button.setAttribute("aria-pressed", String(!this.on));
+        byId3("brush_behind").setAttribute("aria-pressed", "false");
         studio.say(this.on ? "paint over what is in front of the object: the edge snaps to the picture's" : "", this.on);
         this.show();
       });

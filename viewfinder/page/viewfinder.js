@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: e7658eed83a10358655ce987d909abd8f0a4e83f49c23bce4ea7cfb3d1a2e6b7
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 7c73696997138dc7a5dfee10ccd2cda25af10543de47b5e275f7a7136c990a14
 "use strict";
 (() => {
   // src/model.ts

@@ -144,8 +144,9 @@ class Desk:
                     self.busy = ""
                     self.tell_all()
                 self._drawn = (state.photo, state.lines), found
-            if (self.state.photo, self.state.lines) == (state.photo, state.lines):
-                camera = Path(found["file"]) if found.get("file") and (state.lines or found.get("is_sure")) else None
+            # Lines that tell no camera yet leave the one that is there.
+            if (self.state.photo, self.state.lines) == (state.photo, state.lines) and (found.get("file") or not state.lines):
+                camera = Path(found["file"]) if state.lines or found.get("is_sure") else None
                 self.project.amend(lambda state: replace(state, camera=camera, pitch_deg=None))
             self._keep()
 

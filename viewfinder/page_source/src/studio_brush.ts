@@ -15,6 +15,7 @@ export class Brush {
     const button = byId<HTMLElement>("brush");
     button.addEventListener("click", () => {
       button.setAttribute("aria-pressed", String(!this.on));
+      byId("brush_behind").setAttribute("aria-pressed", "false");
       studio.say(this.on ? "paint over what is in front of the object: the edge snaps to the picture's" : "", this.on);
       this.show();
     });

@@ -115,7 +115,7 @@ export class Panel {
   private sliceTold(slice: number): void {
     const photo = studio.told?.photo;
     const metres = photo?.focus_distances_m?.[slice];
-    const told = `${slice + 1} of ${photo?.slices ?? 1}${metres ? `, focused at ${Number(metres.toPrecision(3))} m` : ""}`;
+    const told = `slice ${slice} of 0 to ${(photo?.slices ?? 1) - 1}${metres ? `, focused at ${Number(metres.toPrecision(3))} m` : ""}`;
     byId("slice_row").querySelector("output")!.textContent = told;
     byId("slice").setAttribute("aria-valuetext", told);
   }
@@ -273,11 +273,19 @@ export class Panel {
   private shown(): void {
     const shown = studio.shown!;
     byId("guessed").replaceChildren(
-      ...[...shown.guessed, ...shown.warnings].map((sentence) => Object.assign(document.createElement("li"), { textContent: sentence })),
+      ...[...groundTold(), ...shown.guessed, ...shown.warnings].map((sentence) => Object.assign(document.createElement("li"), { textContent: sentence })),
     );
     if (studio.isChanging) byId("command").textContent = shown.command ?? "";
     if (studio.state) byId("focus_told").textContent = focusTold(studio.state);
   }
+}
+
+/** What the ground is taken for, where no depth tells it: all metres hang on that. */
+function groundTold(): string[] {
+  const [told, state] = [studio.told, studio.state];
+  if (!told?.photo || told.photo.has_depth || !state?.camera_height_m) return [];
+  const tilt = state.camera === null && state.pitch_deg !== null ? [`The camera looks down by ${state.pitch_deg}°, which nothing in the picture tells: see Camera and ground, or draw Lines.`] : [];
+  return [...tilt, `The camera is ${state.camera_height_m} m above the ground; all metres hang on that.`];
 }
 
 const nameOf = (path: string): string => path.replace(/^.*[\\/]/, "").replace(/\.\w+$/, "");
