@@ -350,6 +350,9 @@ class ResultOptions:
             )
 
 
+_WITHOUT_MATTE = ("front", "matte")
+
+
 @dataclass(frozen=True)
 class CompositeOptions:
     """Options of one run of `mrbokeh composite`, in its groups."""
@@ -385,6 +388,10 @@ class CompositeOptions:
         taken.require_meant(self.photo)
         standing.require_meant(self.photo, taken.depth or taken.stereo, self.rendering.catch)
         shared.require_one_focus(focus=self.optics.focus, focus_at=self.optics.focus_at)
+        if taken.matte is not None and virtual.mode in _WITHOUT_MATTE:
+            raise InputError(
+                f"--matte says what stands in front, which the mode {virtual.mode} does not look at: leave --mode out, or --matte"
+            )
         for glb in standing.object_ or ():
             require_file(glb, "a GLB file")
         self.result.require_meant(out, only_object=bool(standing.object_) and not virtual.layer, all_slices=taken.all_slices)

@@ -27,9 +27,8 @@ from mrbokeh.system.errors import InputError
 if TYPE_CHECKING:
     from mrbokeh.commands._composite_kept import KeptParts
 
-_NEARER, _MUCH_HIDDEN = 0.03, 0.4
+_NEARER, _MUCH_HIDDEN, _ALL_HIDDEN = 0.03, 0.4, 0.99
 _RASTER, _COLOURLESS = 200, 0.004
-_WITHOUT_MATTE = ("front", "matte")
 
 
 @dataclass(frozen=True)
@@ -106,8 +105,6 @@ def is_monochrome(plate: Plate) -> bool:
 def insertion_by(options: CompositeOptions, plate: Plate) -> tuple[str, Insertion]:
     """Return the mode of the options, or the best that what is known of the plate allows, and its insertion."""
     mode = options.virtual.mode or best_mode(plate)
-    if options.taken.matte is not None and mode in _WITHOUT_MATTE:
-        raise InputError(f"--matte says what stands in front, which the mode {mode} does not look at: leave --mode out, or --matte")
     return mode, insertion_of(mode, options.taken.near_distance, exact_depth=options.taken.exact_depth)
 
 
@@ -141,6 +138,8 @@ def placing_warning(sharp: Sequence[Layer], plate: Plate, mode: str, height: str
     whole = len(rows) and (np.ptp(rows) + 1, np.ptp(columns) + 1) == alpha.shape
     if whole:
         return f"what is put in reaches across the whole picture; {mend}"
+    if plate.near_alpha is not None and float(alpha[plate.near_alpha > 0.5].sum()) > _ALL_HIDDEN * float(alpha.sum()):
+        return "all of it lies behind what --matte shows in front: white is in front, black is behind"
     if plate.depth_m is None or mode == "front":
         return None
     depth_m = np.minimum.reduce([np.where(layer.alpha > 0.5, layer.depth_m, np.inf) for layer in sharp])

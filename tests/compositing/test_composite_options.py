@@ -393,3 +393,14 @@ def test_an_object_in_a_black_and_white_photograph_has_no_colours(tmp_path: Path
         assert ("black and white" in done.stdout) == (name == "grey")
     apart = {name: np.ptp(cv2.imread(str(tmp_path / f"{name}_out.png")), axis=2).max() for name in ("grey", "plain")}
     assert apart["grey"] <= 1 and apart["plain"] > 20
+
+
+def test_a_matte_that_cannot_be_meant_is_told(files: Path) -> None:
+    """One that hides all is warned of, and one that the mode does not look at is refused before anything is read."""
+    write_image(files / "white.png", np.ones((96, 144, 3), np.float32), "linear")
+    words = (files / "photo.exr", "--lens", files / "lens.json", "--object", CAKE, "--at", "0,0.15,1.5", "--matte", files / "white.png")
+    done = mrbokeh("composite", *words, "--out", files / "hidden.exr")
+    assert done.returncode == 0 and "all of it lies behind what --matte shows" in done.stderr, done.stderr
+    for mode in ("front", "matte"):
+        done = mrbokeh("composite", *words, "--mode", mode, "--out", files / f"{mode}.exr")
+        assert done.returncode == 2 and f"the mode {mode} does not look at" in done.stderr and len(done.stderr.splitlines()) == 1

@@ -275,6 +275,7 @@ def test_files_that_are_no_projects_are_refused(tmp_path: Path, text: str) -> No
 def test_options_of_the_command_are_checked_before_anything_listens(photo: Path, tmp_path: Path) -> None:
     for words, why in (
         (["gone.jpg"], "no such file"),
+        ([tmp_path], "without a merged focal stack"),
         ([photo, "--object", "gone.glb"], "GLB file"),
         ([photo, "--object", photo], "to be a .glb file"),
         ([photo, "--lens", photo], "lens file"),

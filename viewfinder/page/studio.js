@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 7c73696997138dc7a5dfee10ccd2cda25af10543de47b5e275f7a7136c990a14
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 71938761315c5a39b0e60ffec813835e1a1b24f80911880b22c39c36147ae43f
 "use strict";
 (() => {
   // src/model.ts
@@ -62,6 +62,7 @@
   }
 
   // src/studio_model.ts
+  var byId = (id) => document.getElementById(id);
   var RESTS_MS = 250;
   var SENTENCE_MS = 8e3;
   var pageName = `p${Math.random().toString(36).slice(2)}`;
@@ -258,9 +259,12 @@
     }
   };
   var studio = new Studio();
+  function inPhoto([x, y]) {
+    const within = (value, most) => Number(Math.min(most, Math.max(0, value)).toFixed(1));
+    return [within(x, studio.told?.photo?.width_px ?? 0), within(y, studio.told?.photo?.height_px ?? 0)];
+  }
 
   // src/studio_histogram.ts
-  var byId = (id) => document.getElementById(id);
   var COLOURS = ["#ff6b6b", "#5ee078", "#6db3ff"];
   var LEVELS = 256;
   var REST_MS = 200;
@@ -297,7 +301,6 @@
   };
 
   // src/studio_panel.ts
-  var byId2 = (id) => document.getElementById(id);
   var F_NUMBERS = [1, 1.2, 1.4, 1.8, 2, 2.2, 2.4, 2.8, 3.2, 3.5, 4, 4.5, 5, 5.6, 6.3, 7.1, 8, 9, 10, 11, 13, 14, 16, 18, 20, 22, 25, 29, 32];
   var LONG_FORMATS = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers" };
   var DEFAULT_SUN = [-60, 40];
@@ -344,36 +347,36 @@
       this.dome();
       this.result();
       this.files();
-      const react = (id, changes) => byId2(id).addEventListener("click", () => void studio.commit(changes()));
+      const react = (id, changes) => byId(id).addEventListener("click", () => void studio.commit(changes()));
       react("focus_auto", () => ({ focus_m: null, focus_at_px: null }));
       react("f_number_auto", () => ({ f_number: null }));
       react("camera_found", () => ({ camera: studio.told?.camera?.file ?? null, pitch_deg: null }));
-      byId2("object").addEventListener("change", (event) => {
+      byId("object").addEventListener("change", (event) => {
         const object = event.target.value;
         if (object) void studio.commit({ object, height: null });
         else studio.remove();
       });
-      byId2("chosen").addEventListener("change", (event) => void studio.commit(studio.choosing(Number(event.target.value))));
-      byId2("add").addEventListener("change", (event) => {
+      byId("chosen").addEventListener("change", (event) => void studio.commit(studio.choosing(Number(event.target.value))));
+      byId("add").addEventListener("change", (event) => {
         const select = event.target;
         if (select.value) void studio.add(select.value);
         select.value = "";
       });
-      byId2("remove").addEventListener("click", () => studio.remove());
-      for (const [id, by] of [["undo", -1], ["redo", 1]]) byId2(id).addEventListener("click", () => void studio.step(by));
+      byId("remove").addEventListener("click", () => studio.remove());
+      for (const [id, by] of [["undo", -1], ["redo", 1]]) byId(id).addEventListener("click", () => void studio.step(by));
       studio.addEventListener("told", () => this.told());
       studio.addEventListener("state", () => this.state());
       studio.addEventListener("picture", () => this.shown());
-      studio.addEventListener("sentence", () => byId2("message").textContent = studio.sentence);
+      studio.addEventListener("sentence", () => byId("message").textContent = studio.sentence);
     }
     slider(each) {
-      const input = byId2(each.id);
+      const input = byId(each.id);
       if (each.id === "f_number") input.max = String(F_NUMBERS.length - 1);
       input.addEventListener("input", () => studio.change(each.write(input.valueAsNumber)));
       input.addEventListener("change", () => void studio.commit(each.write(input.valueAsNumber)));
     }
     number(id, name, also) {
-      const input = byId2(id);
+      const input = byId(id);
       input.addEventListener("change", () => {
         const value = input.value === "" ? null : input.valueAsNumber;
         if (value !== null && !(value > 0)) return studio.say("give a number above 0, or nothing for automatic");
@@ -381,12 +384,12 @@
       });
     }
     height() {
-      const input = byId2("height");
+      const input = byId("height");
       input.addEventListener("change", () => void studio.commit({ height: input.value.trim().replace(",", ".") || null }));
     }
     /** Another picture of the stack is opened once the hand lets the handle go. */
     slices() {
-      const input = byId2("slice");
+      const input = byId("slice");
       input.addEventListener("input", () => this.sliceTold(input.valueAsNumber));
       input.addEventListener("change", () => void studio.commit({ slice: input.valueAsNumber }));
     }
@@ -394,20 +397,20 @@
       const photo = studio.told?.photo;
       const metres = photo?.focus_distances_m?.[slice];
       const told = `slice ${slice} of 0 to ${(photo?.slices ?? 1) - 1}${metres ? `, focused at ${Number(metres.toPrecision(3))} m` : ""}`;
-      byId2("slice_row").querySelector("output").textContent = told;
-      byId2("slice").setAttribute("aria-valuetext", told);
+      byId("slice_row").querySelector("output").textContent = told;
+      byId("slice").setAttribute("aria-valuetext", told);
     }
     switches() {
-      const auto = byId2("sun_auto");
+      const auto = byId("sun_auto");
       auto.addEventListener("change", () => void studio.commit(auto.checked ? { sun_deg: null } : sun([right(), above()])));
-      const matched = byId2("matched");
+      const matched = byId("matched");
       matched.addEventListener("change", () => void studio.commit({ matched: matched.checked }));
-      const plain = byId2("plain");
+      const plain = byId("plain");
       plain.addEventListener("change", () => void studio.commit(plain.checked ? { plain: true, sun_deg: null } : { plain: false }));
     }
     /** The handle on the dome: the middle is overhead, the rim the horizon, up is ahead. */
     dome() {
-      const dome = byId2("dome");
+      const dome = byId("dome");
       const moved = (event) => {
         const box = dome.getBoundingClientRect();
         const [x, y] = [(event.clientX - box.left) / box.width * 220 - 110, (event.clientY - box.top) / box.height * 220 - 110];
@@ -422,22 +425,22 @@
       dome.addEventListener("pointerup", () => void studio.commit());
     }
     result() {
-      byId2("copy").addEventListener("click", () => {
-        const text = byId2("command").textContent ?? "";
+      byId("copy").addEventListener("click", () => {
+        const text = byId("command").textContent ?? "";
         const done = () => studio.say("the command is copied");
         navigator.clipboard?.writeText(text).then(done, () => studio.say("the browser does not let this page copy: select the command by hand"));
-        if (!navigator.clipboard) getSelection()?.selectAllChildren(byId2("command"));
+        if (!navigator.clipboard) getSelection()?.selectAllChildren(byId("command"));
       });
     }
     files() {
       for (const id of ["open_photo", "open_object"]) {
-        const input = byId2(id);
+        const input = byId(id);
         input.addEventListener("change", () => {
           for (const file of input.files ?? []) void studio.upload(file);
           input.value = "";
         });
       }
-      const drop = byId2("drop");
+      const drop = byId("drop");
       addEventListener("dragover", (event) => {
         event.preventDefault();
         drop.hidden = false;
@@ -452,21 +455,21 @@
     /** What the server tells beside the state. */
     told() {
       const told = studio.told;
-      byId2("undo").disabled = !told.can_undo;
-      byId2("redo").disabled = !told.can_redo;
-      byId2("camera_told").textContent = told.photo?.has_depth && !told.state.lines.length ? "The photograph has depth: the ground slopes as that says." : told.camera?.told ?? (told.photo ? "The camera is looked for in the picture's lines." : "");
-      byId2("camera_found").disabled = told.camera?.file === void 0;
-      byId2("plain").disabled = Boolean(told.photo && !told.photo.has_depth && !told.state.plain);
+      byId("undo").disabled = !told.can_undo;
+      byId("redo").disabled = !told.can_redo;
+      byId("camera_told").textContent = told.photo?.has_depth && !told.state.lines.length ? "The photograph has depth: the ground slopes as that says." : told.camera?.told ?? (told.photo ? "The camera is looked for in the picture's lines." : "");
+      byId("camera_found").disabled = told.camera?.file === void 0;
+      byId("plain").disabled = Boolean(told.photo && !told.photo.has_depth && !told.state.plain);
       const photo = told.photo;
-      byId2("slice_row").hidden = photo?.slices === void 0;
+      byId("slice_row").hidden = photo?.slices === void 0;
       document.querySelectorAll(".of_one").forEach((each) => each.hidden = photo?.slices !== void 0);
       if (photo?.slices !== void 0) {
-        const input = byId2("slice");
+        const input = byId("slice");
         input.max = String(photo.slices - 1);
         input.value = String(told.state.slice ?? 0);
         this.sliceTold(input.valueAsNumber);
       }
-      byId2("kept").textContent = `Everything is kept in ${told.project}`;
+      byId("kept").textContent = `Everything is kept in ${told.project}`;
       this.choices();
       this.saves(told.saves);
       this.state();
@@ -475,13 +478,13 @@
       const told = studio.told;
       offer("object", [["", "choose one"], ...told.objects.map((each) => [each.path, each.name])]);
       offer("add", [["", "choose one"], ...told.objects.map((each) => [each.path, each.name])]);
-      const lenses = byId2("lenses");
+      const lenses = byId("lenses");
       if (lenses.dataset.shown !== JSON.stringify(told.lenses)) {
         lenses.dataset.shown = JSON.stringify(told.lenses);
         lenses.querySelectorAll("label").forEach((each) => each.remove());
         lenses.append(lensChoice("", "as the photograph tells", null), ...told.lenses.map((each, i) => lensChoice(each.path, each.name, i)));
       }
-      const formats = byId2("formats");
+      const formats = byId("formats");
       if (!formats.childElementCount) {
         for (const format of told.formats) {
           const button = document.createElement("button");
@@ -497,13 +500,13 @@
       }
     }
     saves(saves) {
-      byId2("saves").replaceChildren(...saves.map(saveLine));
+      byId("saves").replaceChildren(...saves.map(saveLine));
     }
     state() {
       const state = studio.state;
       if (!state) return;
       for (const each of SLIDERS) {
-        const input = byId2(each.id);
+        const input = byId(each.id);
         const value = each.read(state);
         if (document.activeElement !== input || input.valueAsNumber !== value) input.value = String(value);
         const output = input.closest("label").querySelector("output");
@@ -512,37 +515,37 @@
       }
       for (const { id, name } of NUMBERS) this.fill(id, state[name] === null ? "" : String(state[name]));
       this.fill("height", state.height ?? "");
-      byId2("object").value = state.object ?? "";
+      byId("object").value = state.object ?? "";
       const objects = studio.objects;
       offer("chosen", objects.map((each, number) => [String(number), `${number + 1}: ${nameOf(each.object)}`]));
-      byId2("chosen").value = String(state.before.length);
-      byId2("chosen_row").hidden = objects.length < 2;
-      byId2("add_row").hidden = !objects.length;
-      byId2("sun_auto").checked = state.sun_deg === null;
-      byId2("matched").checked = state.matched;
-      byId2("plain").checked = state.plain;
+      byId("chosen").value = String(state.before.length);
+      byId("chosen_row").hidden = objects.length < 2;
+      byId("add_row").hidden = !objects.length;
+      byId("sun_auto").checked = state.sun_deg === null;
+      byId("matched").checked = state.matched;
+      byId("plain").checked = state.plain;
       document.querySelectorAll("input[name=lens]").forEach((each) => each.checked = each.value === (state.lens ?? ""));
       const [turn, high] = state.sun_deg ?? DEFAULT_SUN;
       const reach = (90 - high) / 0.9;
-      const lamp = byId2("lamp");
+      const lamp = byId("lamp");
       lamp.setAttribute("cx", String(reach * Math.sin(turn * Math.PI / 180)));
       lamp.setAttribute("cy", String(-reach * Math.cos(turn * Math.PI / 180)));
-      byId2("dome").classList.toggle("off", state.sun_deg === null);
-      byId2("command").textContent = (studio.isChanging ? studio.shown?.command : studio.told?.command) ?? "Place an object first.";
+      byId("dome").classList.toggle("off", state.sun_deg === null);
+      byId("command").textContent = (studio.isChanging ? studio.shown?.command : studio.told?.command) ?? "Place an object first.";
       document.querySelectorAll("#formats button").forEach((each) => each.disabled = !studio.isComplete);
-      byId2("focus_told").textContent = focusTold(state);
+      byId("focus_told").textContent = focusTold(state);
     }
     fill(id, text) {
-      const input = byId2(id);
+      const input = byId(id);
       if (document.activeElement !== input) input.value = text;
     }
     shown() {
       const shown = studio.shown;
-      byId2("guessed").replaceChildren(
+      byId("guessed").replaceChildren(
         ...[...groundTold(), ...shown.guessed, ...shown.warnings].map((sentence) => Object.assign(document.createElement("li"), { textContent: sentence }))
       );
-      if (studio.isChanging) byId2("command").textContent = shown.command ?? "";
-      if (studio.state) byId2("focus_told").textContent = focusTold(studio.state);
+      if (studio.isChanging) byId("command").textContent = shown.command ?? "";
+      if (studio.state) byId("focus_told").textContent = focusTold(studio.state);
     }
   };
   function groundTold() {
@@ -553,7 +556,7 @@
   }
   var nameOf = (path) => path.replace(/^.*[\\/]/, "").replace(/\.\w+$/, "");
   function offer(id, choices) {
-    const select = byId2(id);
+    const select = byId(id);
     if (select.dataset.shown === JSON.stringify(choices)) return;
     select.dataset.shown = JSON.stringify(choices);
     select.replaceChildren(...choices.map(([value, name]) => new Option(name, value)));
@@ -648,31 +651,30 @@
   }
 
   // src/studio_brush.ts
-  var byId3 = (id) => document.getElementById(id);
   var MOST_POINTS = 2e3;
   var Brush = class {
-    size = byId3("brush_size");
-    drawn = byId3("stroke");
-    tint = byId3("matte");
+    size = byId("brush_size");
+    drawn = byId("stroke");
+    tint = byId("matte");
     points = [];
     waiting = 0;
     constructor() {
-      const button = byId3("brush");
+      const button = byId("brush");
       button.addEventListener("click", () => {
         button.setAttribute("aria-pressed", String(!this.on));
-        byId3("brush_behind").setAttribute("aria-pressed", "false");
+        byId("brush_behind").setAttribute("aria-pressed", "false");
         studio.say(this.on ? "paint over what is in front of the object: the edge snaps to the picture's" : "", this.on);
         this.show();
       });
-      const behind = byId3("brush_behind");
+      const behind = byId("brush_behind");
       behind.addEventListener("click", () => behind.setAttribute("aria-pressed", String(behind.getAttribute("aria-pressed") !== "true")));
-      byId3("brush_clear").addEventListener("click", () => void studio.commit({ matte: null }));
-      const stage = byId3("stage");
+      byId("brush_clear").addEventListener("click", () => void studio.commit({ matte: null }));
+      const stage = byId("stage");
       stage.addEventListener("pointerleave", () => this.points.length || this.drawn.replaceChildren());
       studio.addEventListener("state", () => this.show());
     }
     get on() {
-      return byId3("brush").getAttribute("aria-pressed") === "true";
+      return byId("brush").getAttribute("aria-pressed") === "true";
     }
     get radius_px() {
       return this.size.valueAsNumber / 1e3 * (studio.told?.photo?.width_px ?? 1e3);
@@ -680,9 +682,9 @@
     /** Show the brush's settings, and what it has told so far. */
     show() {
       const matte = studio.state?.matte ?? null;
-      byId3("stage").classList.toggle("painting", this.on);
-      byId3("brush_row").hidden = !this.on;
-      byId3("brush_clear").disabled = !matte;
+      byId("stage").classList.toggle("painting", this.on);
+      byId("brush_row").hidden = !this.on;
+      byId("brush_clear").disabled = !matte;
       this.tint.hidden = !this.on || !matte;
       if (!this.on) {
         this.points = [];
@@ -713,10 +715,8 @@
       this.points = [];
     }
     async end() {
-      const photo = studio.told.photo;
-      const within = (value, most) => Number(Math.min(most, Math.max(0, value)).toFixed(1));
-      const points = this.points.map(([x, y]) => [within(x, photo.width_px), within(y, photo.height_px)]);
-      const front = byId3("brush_behind").getAttribute("aria-pressed") !== "true";
+      const points = this.points.map(inPhoto);
+      const front = byId("brush_behind").getAttribute("aria-pressed") !== "true";
       this.points = [];
       this.waiting++;
       await studio.commit();
@@ -740,35 +740,34 @@
   };
 
   // src/studio_lines.ts
-  var byId4 = (id) => document.getElementById(id);
   var AXES = ["y", "x", "z"];
   var NEAR = 16;
   var SHORTEST = 12;
   var Lines = class {
-    drawn = byId4("lines");
+    drawn = byId("lines");
     axis = "y";
     lines = null;
     /** The end that is dragged: line, and 0 or 2 for its first coordinate. */
     end = [0, 2];
     constructor() {
-      const button = byId4("draw_lines");
+      const button = byId("draw_lines");
       button.addEventListener("click", () => {
         button.setAttribute("aria-pressed", String(!this.on));
         studio.say(this.on ? "draw along two edges of one direction and one of another: the ground follows; tap a line to remove it" : "", this.on);
         this.draw();
       });
       for (const axis of AXES) {
-        byId4(`axis_${axis}`).addEventListener("click", () => {
+        byId(`axis_${axis}`).addEventListener("click", () => {
           this.axis = axis;
-          for (const each of AXES) byId4(`axis_${each}`).setAttribute("aria-pressed", String(each === axis));
+          for (const each of AXES) byId(`axis_${each}`).setAttribute("aria-pressed", String(each === axis));
         });
       }
-      byId4("lines_clear").addEventListener("click", () => void studio.commit({ lines: [] }));
+      byId("lines_clear").addEventListener("click", () => void studio.commit({ lines: [] }));
       studio.addEventListener("state", () => this.draw());
       studio.addEventListener("told", () => this.on && studio.state?.lines.length && studio.say(studio.told?.camera?.told ?? "", true));
     }
     get on() {
-      return byId4("draw_lines").getAttribute("aria-pressed") === "true";
+      return byId("draw_lines").getAttribute("aria-pressed") === "true";
     }
     /** Take the near end of a line of the chosen direction, or begin a new line. px: pixels of the photograph in one of the window. */
     start(at_px, px) {
@@ -779,12 +778,9 @@
       else this.end = [this.lines.push([at_px[0], at_px[1], at_px[0], at_px[1], this.axis]) - 1, 2];
     }
     move(at_px) {
-      const photo = studio.told?.photo;
       const line = this.lines?.[this.end[0]];
-      if (!photo || !line) return;
-      const within = (value, most) => Number(Math.min(most, Math.max(0, value)).toFixed(1));
-      line[this.end[1]] = within(at_px[0], photo.width_px);
-      line[this.end[1] + 1] = within(at_px[1], photo.height_px);
+      if (!line) return;
+      [line[this.end[1]], line[this.end[1] + 1]] = inPhoto(at_px);
       this.draw();
     }
     stop(px) {
@@ -805,8 +801,8 @@
     draw() {
       const photo = studio.told?.photo;
       const lines = this.lines ?? studio.state?.lines ?? [];
-      byId4("lines_row").hidden = !this.on;
-      byId4("lines_clear").disabled = !lines.length;
+      byId("lines_row").hidden = !this.on;
+      byId("lines_clear").disabled = !lines.length;
       this.drawn.replaceChildren();
       if (!photo || !this.on) return;
       this.drawn.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
@@ -952,7 +948,6 @@
   var LOUPE_PX = 240;
   var DRAWN_AGAIN_MS = 900;
   var LOOKS_MS = 150;
-  var byId5 = (id) => document.getElementById(id);
   function scaledHeight(height, factor) {
     if (height === null) return null;
     const unit = height.endsWith("px") ? "px" : "";
@@ -960,11 +955,11 @@
   }
   var within180 = (turn_deg) => ((turn_deg + 180) % 360 + 360) % 360 - 180;
   var PictureStage = class {
-    stage = byId5("stage");
-    picture = byId5("picture");
-    before = byId5("before");
-    ground = byId5("ground");
-    loupe = byId5("loupe");
+    stage = byId("stage");
+    picture = byId("picture");
+    before = byId("before");
+    ground = byId("ground");
+    loupe = byId("loupe");
     brush = new Brush();
     lines = new Lines();
     photoName = "";
@@ -975,7 +970,7 @@
     looking;
     quiet;
     constructor() {
-      new ResizeObserver(() => this.fit()).observe(byId5("room"));
+      new ResizeObserver(() => this.fit()).observe(byId("room"));
       studio.addEventListener("told", () => this.fit());
       studio.addEventListener("state", () => this.mark());
       studio.addEventListener("picture", (event) => this.show(event.detail));
@@ -987,9 +982,9 @@
     fit() {
       const photo = studio.told?.photo ?? null;
       this.stage.hidden = !photo;
-      byId5("welcome").hidden = Boolean(photo);
+      byId("welcome").hidden = Boolean(photo);
       if (!photo) return;
-      const room = byId5("room").getBoundingClientRect();
+      const room = byId("room").getBoundingClientRect();
       const scale = Math.min(room.width / photo.width_px, room.height / photo.height_px);
       this.stage.style.width = `${photo.width_px * scale}px`;
       this.stage.style.height = `${photo.height_px * scale}px`;
@@ -1027,9 +1022,9 @@
     mark() {
       const [photo, state] = [studio.told?.photo ?? null, studio.state];
       const ground = groundOf(photo, state);
-      const wanted = byId5("grid").getAttribute("aria-pressed") === "true";
+      const wanted = byId("grid").getAttribute("aria-pressed") === "true";
       this.stage.classList.toggle("placed", Boolean(state?.at_px));
-      const badge = byId5("badge");
+      const badge = byId("badge");
       badge.textContent = this.next();
       badge.hidden = !badge.textContent;
       this.ground.replaceChildren();
@@ -1043,7 +1038,7 @@
         this.words(`one square: ${ground.cell_m} m`, photo.width_px * 0.015, photo.height_px * 0.985, photo.width_px / this.stage.clientWidth);
       }
       if (photo && !studio.isComplete && this.before.complete && this.before.naturalWidth) this.showPhotograph();
-      const box = byId5("box");
+      const box = byId("box");
       const sides = studio.isComplete ? this.boxOf(state.before.length) : null;
       box.hidden = !sides;
       if (sides) {
@@ -1166,7 +1161,7 @@
     focusAt(x, y) {
       const photo = studio.told.photo;
       const at_px = this.inside(this.pixel(x, y));
-      byId5("focus_here").click();
+      byId("focus_here").click();
       if (photo.has_depth) return void studio.commit({ focus_at_px: at_px, focus_m: null });
       const ground = groundOf(photo, studio.state);
       if (!ground) return studio.say("the plain ground has no distance to focus on: turn Plain off, or type the metres");
@@ -1196,7 +1191,7 @@
       });
       document.addEventListener("keydown", (event) => {
         const tool = this.brush.on ? "brush" : this.lines.on ? "draw_lines" : this.stage.classList.contains("focusing") ? "focus_here" : null;
-        if (event.key === "Escape" && tool) byId5(tool).click();
+        if (event.key === "Escape" && tool) byId(tool).click();
         if (!(event.ctrlKey || event.metaKey) || event.target.matches?.("input[type=text], input[type=number]")) return;
         const key = event.key.toLowerCase();
         if (key !== "z" && key !== "y") return;
@@ -1206,7 +1201,7 @@
     }
     buttons() {
       const pressed = (id, told) => {
-        const button = byId5(id);
+        const button = byId(id);
         button.addEventListener("click", () => {
           const on = button.getAttribute("aria-pressed") !== "true";
           button.setAttribute("aria-pressed", String(on));
@@ -1215,9 +1210,9 @@
       };
       pressed("grid", () => this.mark());
       const tools = ["focus_here", "brush", "draw_lines"];
-      const isOn = (id) => byId5(id).getAttribute("aria-pressed") === "true";
+      const isOn = (id) => byId(id).getAttribute("aria-pressed") === "true";
       for (const id of tools) {
-        byId5(id).addEventListener("click", () => isOn(id) || tools.filter((each) => each !== id && isOn(each)).forEach((each) => byId5(each).click()), true);
+        byId(id).addEventListener("click", () => isOn(id) || tools.filter((each) => each !== id && isOn(each)).forEach((each) => byId(each).click()), true);
       }
       pressed("focus_here", (on) => {
         this.stage.classList.toggle("focusing", on);
@@ -1228,7 +1223,7 @@
         if (!this.loupe.hidden) this.magnify(event);
         if (this.brush.on && studio.told?.photo) this.brush.hover(this.pixel(event.clientX, event.clientY));
       });
-      const hold = byId5("hold_before");
+      const hold = byId("hold_before");
       const show = (on) => {
         this.before.hidden = !on;
       };

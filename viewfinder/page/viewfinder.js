@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 7c73696997138dc7a5dfee10ccd2cda25af10543de47b5e275f7a7136c990a14
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 71938761315c5a39b0e60ffec813835e1a1b24f80911880b22c39c36147ae43f
 "use strict";
 (() => {
   // src/model.ts

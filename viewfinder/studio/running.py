@@ -7,6 +7,7 @@ from pathlib import Path
 
 import mrbokeh
 from mrbokeh.renderers.choose import read_lens
+from mrbokeh.stacks.focal_stack import FILE_NAME
 from mrbokeh.system.channel import say
 from mrbokeh.system.errors import InputError, require_file
 from viewfinder.options import ListeningOptions
@@ -41,6 +42,8 @@ def project_of(options: StudioOptions) -> Project:
         if path is not None:
             raise InputError(f"{photo} and --project {path} are both projects: give one of them")
         path, photo = _there(photo, "a project file of `mrbokeh studio`"), None
+    elif photo is not None and photo.is_dir() and not (photo / FILE_NAME).is_file():
+        raise InputError(f"{photo} is a folder without a merged focal stack ({FILE_NAME}): make one by `mrbokeh capture process`")
     elif photo is not None and not photo.is_dir():
         _there(photo, "a photograph")
     path = path or options.pictures / f"{photo.stem if photo else 'untitled'}{_SUFFIX}"

@@ -1,7 +1,6 @@
 // The brush: strokes over what stands in front of the objects; the server moves their edges to those of the picture.
-import { type Pair, studio } from "./studio_model";
+import { byId, inPhoto, type Pair, studio } from "./studio_model";
 
-const byId = <T extends Element>(id: string): T => document.getElementById(id) as unknown as T;
 const MOST_POINTS = 2000;
 
 export class Brush {
@@ -76,9 +75,7 @@ export class Brush {
   }
 
   async end(): Promise<void> {
-    const photo = studio.told!.photo!;
-    const within = (value: number, most: number): number => Number(Math.min(most, Math.max(0, value)).toFixed(1));
-    const points = this.points.map(([x, y]) => [within(x, photo.width_px), within(y, photo.height_px)]);
+    const points = this.points.map(inPhoto);
     const front = byId<HTMLElement>("brush_behind").getAttribute("aria-pressed") !== "true";
     this.points = [];
     this.waiting++;

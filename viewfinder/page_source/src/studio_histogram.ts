@@ -1,7 +1,6 @@
 // Histogram of the picture on the screen, channel by channel, and how much of it is clipped.
-import { studio } from "./studio_model";
+import { byId, studio } from "./studio_model";
 
-const byId = <T extends Element>(id: string): T => document.getElementById(id) as unknown as T;
 const COLOURS = ["#ff6b6b", "#5ee078", "#6db3ff"];
 const LEVELS = 256;
 const REST_MS = 200;

@@ -1,7 +1,6 @@
 // Lines drawn along edges of the photograph, upright and level ones, by which the server solves the camera.
-import { type DrawnLine, type Pair, studio } from "./studio_model";
+import { byId, type DrawnLine, type Pair, inPhoto, studio } from "./studio_model";
 
-const byId = <T extends Element>(id: string): T => document.getElementById(id) as unknown as T;
 const AXES = ["y", "x", "z"] as const;
 const NEAR = 16;
 const SHORTEST = 12;
@@ -45,12 +44,9 @@ export class Lines {
   }
 
   move(at_px: Pair): void {
-    const photo = studio.told?.photo;
     const line = this.lines?.[this.end[0]];
-    if (!photo || !line) return;
-    const within = (value: number, most: number): number => Number(Math.min(most, Math.max(0, value)).toFixed(1));
-    line[this.end[1]] = within(at_px[0], photo.width_px);
-    line[(this.end[1] + 1) as 1 | 3] = within(at_px[1], photo.height_px);
+    if (!line) return;
+    [line[this.end[1]], line[(this.end[1] + 1) as 1 | 3]] = inPhoto(at_px);
     this.draw();
   }
 

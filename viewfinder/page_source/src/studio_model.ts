@@ -2,6 +2,8 @@
 import type { Matrix3 } from "./model";
 import { sentenceOf } from "./server";
 
+export const byId = <T extends Element>(id: string): T => document.getElementById(id) as unknown as T;
+
 export type Pair = [number, number];
 
 /** Both ends of an edge in pixels, and its direction in the world: y upright, x and z the two level ones. */
@@ -328,3 +330,9 @@ export class Studio extends EventTarget {
 }
 
 export const studio = new Studio();
+
+/** A place within the photograph, in tenths of its pixels. */
+export function inPhoto([x, y]: Pair): Pair {
+  const within = (value: number, most: number): number => Number(Math.min(most, Math.max(0, value)).toFixed(1));
+  return [within(x, studio.told?.photo?.width_px ?? 0), within(y, studio.told?.photo?.height_px ?? 0)];
+}

@@ -1,7 +1,6 @@
 // The panel: fields for everything of the state, the light's dome, the command line and the saves.
-import { type Pair, type Save, type State, studio } from "./studio_model";
+import { byId, type Pair, type Save, type State, studio } from "./studio_model";
 
-const byId = <T extends Element>(id: string): T => document.getElementById(id) as unknown as T;
 const F_NUMBERS = [1, 1.2, 1.4, 1.8, 2, 2.2, 2.4, 2.8, 3.2, 3.5, 4, 4.5, 5, 5.6, 6.3, 7.1, 8, 9, 10, 11, 13, 14, 16, 18, 20, 22, 25, 29, 32];
 const LONG_FORMATS: Record<string, string> = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers" };
 const DEFAULT_SUN: Pair = [-60, 40];

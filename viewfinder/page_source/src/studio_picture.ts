@@ -3,14 +3,13 @@ import { listen } from "./gestures";
 import { Brush } from "./studio_brush";
 import { Lines } from "./studio_lines";
 import { groundOf } from "./studio_ground";
-import { type Box, type Pair, studio } from "./studio_model";
+import { type Box, byId, type Pair, studio } from "./studio_model";
 
 const NUDGES_REST_MS = 500;
 const LOUPE_PX = 240;
 const DRAWN_AGAIN_MS = 900;
 const LOOKS_MS = 150;
 
-const byId = <T extends Element>(id: string): T => document.getElementById(id) as unknown as T;
 
 /** The height, scaled; its unit stays. */
 export function scaledHeight(height: string | null, factor: number): string | null {
