@@ -49,6 +49,7 @@ def test_examples_are_read_from_headings_blocks_and_comments() -> None:
     refused("found none", read_entries, "nothing")
 
 
+@pytest.mark.slow
 def test_the_gallery_is_made_by_the_commands_and_what_a_check_finds_is_its_result(tmp_path: Path) -> None:
     """One changed pixel of 16 x 24: `check` ends with 1 and writes the map. The demo is not run again, for it is finished."""
     demo, out, plate = tmp_path / "demo", tmp_path / "out", np.full((16, 24, 3), 0.2, np.float32)

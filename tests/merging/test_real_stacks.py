@@ -31,6 +31,7 @@ def test_a_real_jpeg_stack(shared_data: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not (DEMO_STACK / "truth.json").is_file(), reason="the RAW stack with truth is not in mrbokeh/demo_data")
+@pytest.mark.slow
 def test_the_shipped_raw_stack_matches_its_truth(tmp_path: Path) -> None:
     """All views whole, the lens as stated, and per channel the light of the truth: defocus conserves the mean, so that the
     inner part of each slice, scaled to the reference by its focal length, must have the mean of the sharp truth.

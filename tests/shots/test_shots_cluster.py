@@ -57,6 +57,7 @@ def address_in(told: Path) -> str:
     return address
 
 
+@pytest.mark.slow
 def test_a_cluster_makes_the_same_file(tmp_path: Path, address: str) -> None:
     clip, executor = clip_of_blobs(tmp_path), DaskExecutor(address)
     assert isinstance(executor, Executor)

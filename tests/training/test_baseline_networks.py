@@ -93,6 +93,7 @@ def test_neural_camera_learns_a_gaussian_and_keeps_what_is_in_focus() -> None:
     assert _psnr_db(network(x), target) > 38.0 and _psnr_db(network(sharp), sharp[:, :3]) > 50.0
 
 
+@pytest.mark.slow
 def test_deepfocus_learns_to_blur_keeps_what_is_in_focus_and_has_no_favourite_colour() -> None:
     """Measured 29.0 dB, 11.0 over no blur (untrained 14.9 dB). It mixes colours, but saw them all alike: exchanged colours are blurred as
     well, up to half a dB (0.03). In focus 24.9 dB; a quarter of the largest blur costs more, 21.6 dB."""

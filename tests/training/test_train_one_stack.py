@@ -111,6 +111,7 @@ def test_training_does_not_look_at_held_out_slices(scene: Path, tmp_path: Path) 
     assert training_data([scene]).split([], 0.0, 0).held_out_slices == ()
 
 
+@pytest.mark.slow
 def test_what_was_held_out_is_recorded_and_what_any_network_saw_is_not_unseen(scene: Path, run: Path) -> None:
     facts = read_facts(run)
     assert (facts.trained_on, facts.held_out, facts.held_out_slices) == (("wall/view",), (), (2,))
@@ -127,6 +128,7 @@ def test_what_was_held_out_is_recorded_and_what_any_network_saw_is_not_unseen(sc
     refused("every slice of these stacks", unseen_of, stacks, [Seen((name,))])
 
 
+@pytest.mark.slow
 def test_evaluate_judges_a_network_of_one_stack_on_the_slices_held_out(scene: Path, run: Path, tmp_path: Path) -> None:
     """The network is nearer to the held-out slice than its neighbour in focus and than the sharp picture; the truth of this stack is the
     reference renderer's, whose score says that the pair is put together rightly."""
@@ -175,6 +177,7 @@ def test_a_budget_without_time_for_200_steps_is_refused_and_nothing_changes(
     assert (tmp_path / "old" / "network.pt").read_bytes() == b"kept" and not (tmp_path / "new").exists()
 
 
+@pytest.mark.slow
 def test_the_bar_counts_what_is_done(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two epochs of five slices, one picture a step: 10 steps of 10, and one by one on the way. Of minutes it counts seconds."""
     bars: list[tuple[float, float]] = []

@@ -205,6 +205,7 @@ def test_without_patience_the_last_weights_are_kept_and_patience_needs_looks(
     assert progress.looks_since_best == 2
 
 
+@pytest.mark.slow
 def test_curve_and_sheets_tell_how_it_came_along_in_bounded_room(scene: Path, tmp_path: Path) -> None:
     """12 steps are less than the 200 points of a curve, so each has one; a look after each adds its own, and the last look one more.
     The first picture of the sheets is of step 1, the last of step 12."""

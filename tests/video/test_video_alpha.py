@@ -133,6 +133,7 @@ def test_a_frame_that_is_opaque_has_alpha_like_the_others(settings: list[str], t
 
 
 @pytest.mark.parametrize("kind", ["exr", "ffv1"])
+@pytest.mark.slow
 def test_workers_that_die_lose_no_alpha(tmp_path: Path, kind: str) -> None:
     """A worker is killed amid the second segment, and its segment is made again; then the whole run is, and goes on from its parts."""
     clip, more = clip_of(tmp_path, kind)

@@ -147,6 +147,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for another process")
+@pytest.mark.slow
 def test_ctrl_c_keeps_finished_segments_and_the_same_command_goes_on(clip: Path, settings: list[str], tmp_path: Path) -> None:
     out, program, root = tmp_path / "results" / "out.mp4", tmp_path / "held.py", Path(__file__).parents[2]
     program.write_text(HELD_COMMAND)

@@ -91,6 +91,7 @@ def deepened(merged: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("view", range(3))
+@pytest.mark.slow
 def test_depth_is_several_times_as_exact_as_focus_alone_and_the_picture_no_worse(
     merged: Path, deepened: Path, truths: list[ViewTruth], view: int
 ) -> None:
@@ -110,6 +111,7 @@ def test_depth_is_several_times_as_exact_as_focus_alone_and_the_picture_no_worse
     np.testing.assert_array_equal(kept, read_image(merged / name / "all_in_focus.exr"))
 
 
+@pytest.mark.slow
 def test_confidence_tells_good_from_bad(deepened: Path, truths: list[ViewTruth]) -> None:
     """What is trusted is off by 0.05 dioptres several times less often than what is not."""
     stack, truth = read_focal_stack(deepened / VIEWS[0]), truths[0]
@@ -119,6 +121,7 @@ def test_confidence_tells_good_from_bad(deepened: Path, truths: list[ViewTruth])
     assert off[trusted & truth.inner].mean() < 0.35 * off[~trusted & truth.inner].mean()
 
 
+@pytest.mark.slow
 def test_finished_stacks_are_kept_and_stale_ones_are_not(deepened: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Another scale makes all of them stale; the depth that is found then is a stand-in."""
     scene = tmp_path / "desk"
@@ -136,6 +139,7 @@ def test_finished_stacks_are_kept_and_stale_ones_are_not(deepened: Path, tmp_pat
     assert all(stack.depth_path.stat().st_mtime_ns != old for stack, old in zip(stacks, before, strict=True))
 
 
+@pytest.mark.slow
 def test_depth_of_another_focus_does_not_go_into_a_data_set(deepened: Path) -> None:
     """As after `scale --overwrite` with another distance, which calibrates the focus anew."""
     stack = read_focal_stack(deepened / VIEWS[0])

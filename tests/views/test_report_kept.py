@@ -180,6 +180,7 @@ def held_bytes() -> int:
     return sum(each.size for each in tracemalloc.take_snapshot().filter_traces(filters).statistics("filename"))
 
 
+@pytest.mark.slow
 def test_finished_stacks_hold_neither_pictures_nor_maps(reported: Path) -> None:
     """What a finished stack holds is far less than a single map of its pixels, 4 bytes each."""
 
