@@ -208,13 +208,15 @@ def _panorama_of(
 
 
 def _lit_from_above(panorama: Float[np.ndarray, "rows columns 3"], white: Triple) -> Rgb:
-    """Return the panorama with light added above the horizon, most of it high up, until the ground has the irradiance of `white` times pi.
+    """Return the panorama with light added above the horizon until the ground has the irradiance of `white` times pi.
 
-    One that is too bright above the horizon is darkened there.
+    It is that of an overcast sky, three times as bright above as at the horizon (Moon and Spencer 1942; CIE S 011). One that is too bright
+    above the horizon is darkened there.
     """
     upwards = np.maximum(-directions(*_PANORAMA_PX)[..., 1:2], 0.0)
     weights = upwards * solid_angles_sr(*_PANORAMA_PX)[..., None]
     wanted, there = math.pi * white, (panorama * weights).sum(axis=(0, 1))
     kept = min(1.0, float((wanted / np.maximum(there, 1e-12)).min()))
-    missing = np.maximum(wanted - kept * there, 0.0) / float((upwards * weights).sum())
-    return (np.where(upwards > 0.0, kept, 1.0) * panorama + missing * upwards).astype(np.float32)
+    overcast = np.where(upwards > 0.0, (1.0 + 2.0 * upwards) / 3.0, 0.0)
+    missing = np.maximum(wanted - kept * there, 0.0) / float((overcast * weights).sum())
+    return (np.where(upwards > 0.0, kept, 1.0) * panorama + missing * overcast).astype(np.float32)

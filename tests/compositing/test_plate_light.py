@@ -8,7 +8,7 @@ import pytest
 
 from mrbokeh.compositing.ground import ground_under
 from mrbokeh.compositing.plate import Plate, plate_of
-from mrbokeh.compositing.plate_light import is_sunlit, picture_light, white_at
+from mrbokeh.compositing.plate_light import Surroundings, is_sunlit, picture_light, white_at
 from mrbokeh.demo.plan import DATA
 from mrbokeh.images.color import luminance
 from mrbokeh.optics.camera import Camera
@@ -54,6 +54,14 @@ def test_the_ground_gets_the_irradiance_of_a_white_surface() -> None:
     assert white[0] > 1.05 * white[1] > 1.05**2 * white[2], "warm light in a warm picture"
     ahead = environment.radiance[18:21, 31:33].mean(axis=(0, 1))  # just below the middle of the picture, where nothing is added
     np.testing.assert_allclose(ahead, plate.rgb[20:28, 18:30].mean(axis=(0, 1)), rtol=0.15)
+
+
+def test_what_is_out_of_sight_is_an_overcast_sky() -> None:
+    """Walls under a sky of radiance 1 + 2 sin(height) have (pi / 2 + 4 / 3) / (7 pi / 3) = 0.396 of the irradiance of the ground."""
+    environment, _ = Surroundings(np.zeros((32, 64, 3)), np.ones(3)).light()
+    towards, solid = directions(32, 64), solid_angles_sr(32, 64)
+    wall, ground = ((np.maximum(towards @ normal, 0.0) * solid * environment.radiance[..., 0]).sum() for normal in ([0, 0, 1], [0, -1, 0]))
+    assert wall / ground == pytest.approx(0.396, abs=0.004)
 
 
 def test_a_main_light_takes_its_share_of_the_light() -> None:
