@@ -130,7 +130,10 @@ class ObjectOptions:
     ] = None
     turn: Annotated[
         list[float] | None,
-        typer.Option(help="Turn of the object about the vertical in degrees. Once for all, or once for each --object. Default: 0."),
+        typer.Option(
+            help="Turn of the object about the vertical in degrees, clockwise from above. Once for all, or once for each --object. "
+            "Default: 0, the front of the GLB towards the camera."
+        ),
     ] = None
     pitch: Annotated[
         float | None,

@@ -1,5 +1,6 @@
 """One picture of `mrbokeh composite` from an opened plate: the camera held, the object placed, all put in and finished."""
 
+import math
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
 
 _NEARER, _MUCH_HIDDEN, _ALL_HIDDEN = 0.03, 0.4, 0.99
 _RASTER, _COLOURLESS = 200, 0.004
+_WIDEST = 2.0
+"""Circle of confusion, in diagonals of the picture, of what is left out: a sixth of its light at most would be in the picture."""
 
 
 @dataclass(frozen=True)
@@ -79,12 +82,13 @@ def composited(
     of a picture. Raises InputError if nothing is seen.
     """
     mode, insertion = insertion_by(options, plate)
-    sharp = layers_by(options, plate, bundle, kept)(plate)
-    if asked is not None and not any((layer.alpha > 0).any() for layer in sharp):
+    drawn = layers_by(options, plate, bundle, kept)(plate)
+    sharp = [_before_the_lens(layer, plate) for layer in drawn]
+    if asked is not None and not any((layer.alpha > 0).any() for layer in drawn):
         _nothing_seen(asked, options.virtual)
     if options.standing.at_pixel:
         plate = with_ground_behind(plate, options.standing.pixels, sharp)
-    if asked is not None and asked.object_ and (warning := placing_warning(sharp, plate, mode, " ".join(asked.height or ()))):
+    if asked is not None and asked.object_ and (warning := placing_warning(drawn, plate, mode, " ".join(asked.height or ()))):
         warn(warning)
     with nullcontext() if kept else working("blurring"):
         inserted = insertion.insert(plate, sharp, renderer)
@@ -94,6 +98,16 @@ def composited(
             inserted = replace(inserted, virtual=replace(inserted.virtual, rgb=grey))
         inserted = finished(inserted, plate, finishing)
     return Composited(inserted, plate, sharp, mode)
+
+
+def _before_the_lens(layer: Layer, plate: Plate) -> Layer:
+    """Return the layer without what all but touches the lens: its light goes everywhere, and would take any amount of memory."""
+    least_px = -_WIDEST * math.hypot(layer.width_px, layer.height_px)
+    touching = (layer.alpha > 0.0) & (plate.lens.coc_px(np.where(layer.alpha > 0.0, layer.depth_m, np.inf), layer.width_px) < least_px)
+    if not touching.any():
+        return layer
+    clear = np.where(touching, np.float32(0.0), np.float32(1.0))
+    return replace(layer, rgb=layer.rgb * clear[..., None], alpha=layer.alpha * clear, depth_m=np.where(touching, np.inf, layer.depth_m))
 
 
 def is_monochrome(plate: Plate) -> bool:

@@ -261,7 +261,7 @@ def measure(kind: str, number: int, out: Path) -> dict[str, Any]:
     foot_m = place.world_from_camera.T @ place.foot_m
     x_px, y_px = place.pixel(place.foot_m)
     high = f"{place.focal_px * place.height_m / foot_m[2]:.1f}px"
-    same = ("--focus", f"{place.focus_m:.3f}", "--turn", f"{turn_deg:.1f}", "--height", high)
+    same = ("--focus", f"{place.focus_m:.3f}", "--turn", f"{turn_deg - 180.0:.1f}", "--height", high)
     ways = {"plain": ("--plain", "--at", ",".join(f"{each:.4f}" for each in foot_m)), "default": ("--at-pixel", f"{x_px:.1f},{y_px:.1f}")}
     if place.sun is not None:
         top_m = place.post_m - [0.0, 0.5, 0.0]

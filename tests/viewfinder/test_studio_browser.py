@@ -138,16 +138,17 @@ async def focus(page: Page, made: MadeStudio) -> None:
 
 async def save(page: Page, made: MadeStudio, waits: bool) -> None:
     """Where nobody waits for the picture, its process ends with the studio."""
-    await page.tap("#to_save")
-    await page.tap("[data-format=jpeg]")
     if not waits:
-        await page.comes_true("studio.told.saves.length === 1")
+        await page.tap("#to_save")
+        await page.comes_true("studio.told.saves[0]?.name === 'floor_mrbokeh.png'")
         return
+    await page.tap("[data-format=jpeg]")
     await page.comes_true("studio.told.saves[0]?.state === 'done'", 60.0)
     link = "document.querySelector('#saves a')"
     assert await page.value(f"{link}.textContent") == "Download floor_mrbokeh.jpg"
     assert await page.value(f"fetch({link}.href).then((answer) => answer.blob()).then((blob) => blob.size)") > 2000
     assert (made.folder / "floor_mrbokeh.jpg").is_file()
+    assert await page.value("studio.told.command.endsWith('_2.jpg')"), "the next one is of the same format"
 
 
 async def test_several_objects_are_added_chosen_by_hand_and_removed(tmp_path: Path) -> None:
@@ -221,6 +222,8 @@ async def test_what_is_in_front_is_painted(tmp_path: Path, size_px: tuple[int, i
         await page.comes_true("!document.getElementById('matte').hidden && document.getElementById('matte').naturalWidth > 0")
         first = made.desk.state
         assert first.at_px == (0.5 * WIDTH, 0.8 * HEIGHT) and first.matte is not None, "the object stays"
+        await page.tap("#brush_hide")
+        assert await page.value("!document.getElementById('before').hidden")
         await page.tap("#brush_behind")
         await page.send("Input.dispatchMouseEvent", type="mouseWheel", x=left + width / 2, y=top + height / 2, deltaX=0, deltaY=200)
         await page.comes_true("document.getElementById('brush_size').valueAsNumber < 35")
@@ -230,6 +233,7 @@ async def test_what_is_in_front_is_painted(tmp_path: Path, size_px: tuple[int, i
         await page.comes_true(f"studio.told.state.matte === '{first.matte}'")
         await pressed(page, "Escape")
         await page.comes_true("document.getElementById('matte').hidden && document.getElementById('brush_row').hidden")
+        assert await page.value("document.getElementById('before').hidden")
         await page.comes_true(RESTS, 60.0)
         assert "--matte" in await page.value("document.getElementById('command').textContent")
         assert page.errors == []
@@ -258,6 +262,25 @@ async def test_lines_are_drawn_corrected_and_removed(tmp_path: Path, size_px: tu
         await page.comes_true("studio.told.state.lines.length === 2 && studio.told.busy === ''", 30.0)
         await page.tap("#brush")
         assert await page.value("document.getElementById('lines_row').hidden && document.getElementById('lines').childElementCount === 0")
+        assert page.errors == []
+
+
+@pytest.mark.parametrize("size_px", [DESK, UPRIGHT], ids=["desk", "upright"])
+async def test_the_sun_is_found_by_a_shadow_that_is_pointed_at(tmp_path: Path, size_px: tuple[int, int]) -> None:
+    """The shadow of a post lies to the right and is twice as long as that is high: the sun is at the left, atan(1 / 2) high."""
+    async with opened(tmp_path, size_px) as (page, made):
+        await page.tap("#sun_by")
+        for x, y, next_words in ((0.5, 4 / 6, "foot"), (0.5, 5 / 6, "tip"), (0.75, 5 / 6, "by the shadow the sun is 9")):
+            assert made.desk.state.sun_deg is None
+            await page.tap("#stage", x, y)
+            await page.comes_true(f"{MESSAGE}.includes('{next_words}')")
+        assert made.desk.state.sun_deg == pytest.approx((-90.0, 26.6), abs=2.5) and made.desk.state.at_px is None
+        assert await page.value("document.getElementById('sun_by').getAttribute('aria-pressed') === 'false'")
+        assert await page.value("document.getElementById('pointed').childElementCount === 0")
+        await page.tap("#sun_by")
+        await page.tap("#stage", 0.5, 0.7)
+        await pressed(page, "Escape")
+        assert not await page.value("document.getElementById('sun_by').getAttribute('aria-pressed') === 'true'")
         assert page.errors == []
 
 

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 71938761315c5a39b0e60ffec813835e1a1b24f80911880b22c39c36147ae43f
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 6d5d3cac768bb79d6d6b16e7fe0b0a56161f3a815ddc467fac9b1c57984a7359
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 71938761315c5a39b0e60ffec813835e1a1b24f80911880b22c39c36147ae43f
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 6d5d3cac768bb79d6d6b16e7fe0b0a56161f3a815ddc467fac9b1c57984a7359
 "use strict";
 (() => {
   // src/model.ts
@@ -317,8 +317,8 @@
       write: (value) => ({ f_number: F_NUMBERS[Math.min(value, F_NUMBERS.length - 1)] }),
       shown: (_v, s) => `f/${Number((s.f_number ?? studio.told?.photo?.lens_f_number ?? 8).toPrecision(3))}`
     },
-    { id: "sun_right", read: (s) => s.sun_deg?.[0] ?? DEFAULT_SUN[0], write: (v) => sun([v, above()]), shown: (v, s) => s.sun_deg ? degrees(v) : "" },
-    { id: "sun_above", read: (s) => s.sun_deg?.[1] ?? DEFAULT_SUN[1], write: (v) => sun([right(), v]), shown: (v, s) => s.sun_deg ? degrees(v) : "" },
+    { id: "sun_right", read: (s) => sunOf(s)[0], write: (v) => sun([v, above()]), shown: (v, s) => s.sun_deg ? degrees(v) : "" },
+    { id: "sun_above", read: (s) => sunOf(s)[1], write: (v) => sun([right(), v]), shown: (v, s) => s.sun_deg ? degrees(v) : "" },
     {
       id: "exposure",
       read: (s) => Math.log2(Math.max(s.exposure, 1e-3)),
@@ -328,8 +328,9 @@
     { id: "shadow", read: (s) => s.shadow ?? 1, write: (v) => ({ shadow: v === 1 ? null : v }), shown: (v) => `${Math.round(100 * v)} %` },
     { id: "pitch", read: (s) => s.pitch_deg ?? studio.told?.photo?.pitch_deg ?? 0, write: (pitch_deg) => ({ pitch_deg }), shown: (v) => degrees(v) }
   ];
-  var right = () => studio.state?.sun_deg?.[0] ?? DEFAULT_SUN[0];
-  var above = () => studio.state?.sun_deg?.[1] ?? DEFAULT_SUN[1];
+  var sunOf = (state) => state?.sun_deg ?? studio.told?.photo?.sun_deg ?? DEFAULT_SUN;
+  var right = () => sunOf(studio.state)[0];
+  var above = () => sunOf(studio.state)[1];
   var sun = (sun_deg) => ({ sun_deg, plain: false });
   var NUMBERS = [
     { id: "focus", name: "focus_m", also: { focus_at_px: null } },
@@ -347,6 +348,7 @@
       this.dome();
       this.result();
       this.files();
+      this.saveAtOnce();
       const react = (id, changes) => byId(id).addEventListener("click", () => void studio.commit(changes()));
       react("focus_auto", () => ({ focus_m: null, focus_at_px: null }));
       react("f_number_auto", () => ({ f_number: null }));
@@ -432,6 +434,13 @@
         if (!navigator.clipboard) getSelection()?.selectAllChildren(byId("command"));
       });
     }
+    /** The header's button saves in the format that was saved last, and shows where the picture goes. */
+    saveAtOnce() {
+      byId("to_save").addEventListener("click", () => {
+        if (!studio.isComplete) return studio.say("place an object first: then its picture can be saved");
+        void save(studio.told.format);
+      });
+    }
     files() {
       for (const id of ["open_photo", "open_object"]) {
         const input = byId(id);
@@ -490,11 +499,7 @@
           const button = document.createElement("button");
           button.textContent = LONG_FORMATS[format] ?? format;
           button.dataset.format = format;
-          button.addEventListener("click", async () => {
-            await studio.commit();
-            const answer = await studio.post("/save", { format });
-            if (answer) studio.take(answer);
-          });
+          button.addEventListener("click", () => void save(format));
           formats.append(button);
         }
       }
@@ -525,7 +530,10 @@
       byId("matched").checked = state.matched;
       byId("plain").checked = state.plain;
       document.querySelectorAll("input[name=lens]").forEach((each) => each.checked = each.value === (state.lens ?? ""));
-      const [turn, high] = state.sun_deg ?? DEFAULT_SUN;
+      const [turn, high] = sunOf(state);
+      const byFile = studio.told?.photo?.sun_deg;
+      byId("sun_told").textContent = byFile ? `By place, time and compass in the file the sun stood ${byFile[0]}° to the right and ${byFile[1]}° high, if it shone.` : "";
+      byId("height_note").textContent = heightNote(state);
       const reach = (90 - high) / 0.9;
       const lamp = byId("lamp");
       lamp.setAttribute("cx", String(reach * Math.sin(turn * Math.PI / 180)));
@@ -548,11 +556,20 @@
       if (studio.state) byId("focus_told").textContent = focusTold(studio.state);
     }
   };
+  function heightNote(state) {
+    const guessed = state.camera_height_m && !studio.told?.photo?.has_depth ? ` for a camera ${state.camera_height_m} m above the ground (see below)` : "";
+    return `Metres${guessed}, or pixels such as 120px. Wheel, pinch, + and - scale it.`;
+  }
   function groundTold() {
     const [told, state] = [studio.told, studio.state];
     if (!told?.photo || told.photo.has_depth || !state?.camera_height_m) return [];
     const tilt = state.camera === null && state.pitch_deg !== null ? [`The camera looks down by ${state.pitch_deg}°, which nothing in the picture tells: see Camera and ground, or draw Lines.`] : [];
     return [...tilt, `The camera is ${state.camera_height_m} m above the ground; all metres hang on that.`];
+  }
+  async function save(format) {
+    await studio.commit();
+    const answer = await studio.post("/save", { format });
+    if (answer) studio.take(answer);
   }
   var nameOf = (path) => path.replace(/^.*[\\/]/, "").replace(/\.\w+$/, "");
   function offer(id, choices) {
@@ -579,20 +596,20 @@
     label.append(name);
     return label;
   }
-  function saveLine(save) {
+  function saveLine(save2) {
     const line = document.createElement("li");
-    if (save.state === "running") {
-      const cancel = Object.assign(document.createElement("button"), { textContent: `Cancel ${save.name}` });
-      cancel.addEventListener("click", () => void studio.post("/cancel", { number: save.number }));
+    if (save2.state === "running") {
+      const cancel = Object.assign(document.createElement("button"), { textContent: `Cancel ${save2.name}` });
+      cancel.addEventListener("click", () => void studio.post("/cancel", { number: save2.number }));
       const bar = document.createElement("progress");
-      bar.setAttribute("aria-label", `making ${save.name}`);
-      line.append(`making ${save.name} ... `, bar, cancel);
-    } else if (save.state === "done") {
-      const link = Object.assign(document.createElement("a"), { href: `/saved/${save.number}`, textContent: `Download ${save.name}` });
-      link.setAttribute("download", save.name);
-      line.append(link, ` (${save.seconds} s) ${save.path}`);
+      bar.setAttribute("aria-label", `making ${save2.name}`);
+      line.append(`making ${save2.name} ... `, bar, cancel);
+    } else if (save2.state === "done") {
+      const link = Object.assign(document.createElement("a"), { href: `/saved/${save2.number}`, textContent: `Download ${save2.name}` });
+      link.setAttribute("download", save2.name);
+      line.append(link, ` (${save2.seconds} s) ${save2.path}`);
     } else {
-      line.append(`${save.name}: ${save.state === "failed" ? save.sentence : "cancelled"}`);
+      line.append(`${save2.name}: ${save2.state === "failed" ? save2.sentence : "cancelled"}`);
     }
     return line;
   }
@@ -608,7 +625,7 @@
     element.addEventListener("pointerdown", (event) => {
       element.setPointerCapture(event.pointerId);
       fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
-      if (kind === "drag") gestures.dragEnd();
+      if (kind === "drag") gestures.dragEnd(true);
       start2 = { x: event.clientX, y: event.clientY };
       kind = fingers.size === 1 ? "tap" : "pinch";
     });
@@ -634,7 +651,7 @@
     });
     const end = (event) => {
       if (!fingers.delete(event.pointerId)) return;
-      if (kind === "drag") gestures.dragEnd();
+      if (kind === "drag") gestures.dragEnd(false);
       if (kind === "tap" && event.type === "pointerup") {
         if (event.timeStamp - lastTap_ms < TWICE_MS) gestures.twice(event.clientX, event.clientY);
         else gestures.tap(event.clientX, event.clientY);
@@ -668,6 +685,13 @@
       });
       const behind = byId("brush_behind");
       behind.addEventListener("click", () => behind.setAttribute("aria-pressed", String(behind.getAttribute("aria-pressed") !== "true")));
+      const hide = byId("brush_hide");
+      const hidden = (on) => {
+        hide.setAttribute("aria-pressed", String(on));
+        byId("before").hidden = !on;
+      };
+      hide.addEventListener("click", () => hidden(hide.getAttribute("aria-pressed") !== "true"));
+      button.addEventListener("click", () => hidden(false));
       byId("brush_clear").addEventListener("click", () => void studio.commit({ matte: null }));
       const stage = byId("stage");
       stage.addEventListener("pointerleave", () => this.points.length || this.drawn.replaceChildren());
@@ -686,10 +710,7 @@
       byId("brush_row").hidden = !this.on;
       byId("brush_clear").disabled = !matte;
       this.tint.hidden = !this.on || !matte;
-      if (!this.on) {
-        this.points = [];
-        this.drawn.replaceChildren();
-      }
+      if (!this.on) this.drop();
       const source = `/matte?of=${encodeURIComponent(matte ?? "")}`;
       if (matte && this.on && this.tint.getAttribute("src") !== source) this.tint.src = source;
     }
@@ -713,6 +734,11 @@
       this.points = [at_px];
       this.draw();
       this.points = [];
+    }
+    /** Forget a stroke that became a pinch. */
+    drop() {
+      this.points = [];
+      this.drawn.replaceChildren();
     }
     async end() {
       const points = this.points.map(inPhoto);
@@ -783,9 +809,11 @@
       [line[this.end[1]], line[this.end[1] + 1]] = inPhoto(at_px);
       this.draw();
     }
-    stop(px) {
-      const lines = this.lines?.filter((each) => Math.hypot(each[2] - each[0], each[3] - each[1]) > SHORTEST * px);
+    /** pinched: the line became a pinch, and is forgotten. */
+    stop(px, pinched) {
+      const lines = pinched ? void 0 : this.lines?.filter((each) => Math.hypot(each[2] - each[0], each[3] - each[1]) > SHORTEST * px);
       this.lines = null;
+      if (pinched) this.draw();
       if (lines) void studio.commit({ lines });
     }
     /** Remove the line under a finger. */
@@ -807,14 +835,51 @@
       if (!photo || !this.on) return;
       this.drawn.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
       const size = photo.width_px / this.drawn.clientWidth;
-      for (const [x1, y1, x2, y2, axis] of lines) {
-        const line = document.createElementNS(this.drawn.namespaceURI, "path");
-        const ring = (x, y) => `M${x - 5 * size} ${y}a${5 * size} ${5 * size} 0 1 0 ${10 * size} 0a${5 * size} ${5 * size} 0 1 0 ${-10 * size} 0`;
-        line.setAttribute("d", `M${x1} ${y1}L${x2} ${y2}${ring(x1, y1)}${ring(x2, y2)}`);
-        line.setAttribute("class", axis);
-        line.setAttribute("vector-effect", "non-scaling-stroke");
-        this.drawn.append(line);
-      }
+      for (const [x1, y1, x2, y2, axis] of lines) this.drawn.append(drawnLine([[x1, y1], [x2, y2]], axis, size));
+    }
+  };
+  function drawnLine(points, kind, size) {
+    const line = document.createElementNS("http://www.w3.org/2000/svg", "path");
+    const ring = ([x, y]) => `M${x - 5 * size} ${y}a${5 * size} ${5 * size} 0 1 0 ${10 * size} 0a${5 * size} ${5 * size} 0 1 0 ${-10 * size} 0`;
+    line.setAttribute("d", points.map(([x, y], i) => `${i ? "L" : "M"}${x} ${y}`).join("") + points.map(ring).join(""));
+    line.setAttribute("class", kind);
+    line.setAttribute("vector-effect", "non-scaling-stroke");
+    return line;
+  }
+  var POINTS = ["click the top of something that stands upright in the sun", "now its foot, on the ground below that top", "now the tip of its shadow on the ground"];
+  var Shadow = class {
+    button = byId("sun_by");
+    drawn = byId("pointed");
+    points = [];
+    constructor() {
+      this.button.addEventListener("click", () => {
+        this.button.setAttribute("aria-pressed", String(!this.on));
+        this.begin();
+        studio.say(this.on ? POINTS[0] : "", this.on);
+      });
+    }
+    get on() {
+      return this.button.getAttribute("aria-pressed") === "true";
+    }
+    /** Take a point. px: pixels of the photograph in one of the window. */
+    async tap(at_px, px) {
+      if (this.points.length === POINTS.length) return;
+      this.points.push(inPhoto(at_px));
+      const photo = studio.told.photo;
+      this.drawn.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
+      this.drawn.replaceChildren(drawnLine(this.points, "sun", px));
+      if (this.points.length < POINTS.length) return studio.say(POINTS[this.points.length], true);
+      await studio.commit();
+      const told = await studio.post("/sun", { points: this.points });
+      this.begin();
+      if (!told) return;
+      this.button.setAttribute("aria-pressed", "false");
+      studio.take(told);
+      studio.say(told.said);
+    }
+    begin() {
+      this.points = [];
+      this.drawn.replaceChildren();
     }
   };
 
@@ -822,6 +887,7 @@
   var ACROSS = 5;
   var WIDE = 40;
   var DEEP = 50;
+  var LEVELS2 = 4;
   var LEAST_APART = 8e-3;
   var EYES_M = 1.5;
   var BELOW_DEG = 10;
@@ -894,16 +960,19 @@
       const [cell, nearest_m] = [this.cell_m, this.nearest_m];
       if (nearest_m === null) return "";
       const lines = [];
-      const first = Math.floor(nearest_m / cell) - 1;
       const cut_m = 0.02 * this.high_m;
-      let last = first;
-      for (let row_px = Infinity; last <= first + DEEP; last++) {
-        const [, y, z] = this.seen(0, last * cell);
-        if (z > cut_m && row_px - y < LEAST_APART * this.photo.height_px) break;
-        row_px = z > cut_m ? y : row_px;
-        this.line(lines, [-WIDE * cell, last * cell], [WIDE * cell, last * cell], cut_m);
+      let [first, row_px] = [Math.floor(nearest_m / cell) - 1, Infinity];
+      for (let side = cell, level = 0; level < LEVELS2; side *= 5, level++) {
+        let last = first;
+        for (; last <= first + DEEP; last++) {
+          const [, y, z] = this.seen(0, last * side);
+          if (z > cut_m && row_px - y < LEAST_APART * this.photo.height_px) break;
+          row_px = z > cut_m ? y : row_px;
+          this.line(lines, [-WIDE * side, last * side], [WIDE * side, last * side], cut_m);
+        }
+        for (let i = -WIDE; i <= WIDE; i++) this.line(lines, [i * side, first * side], [i * side, last * side], cut_m);
+        first = Math.ceil(last / 5);
       }
-      for (let i = -WIDE; i <= WIDE; i++) this.line(lines, [i * cell, first * cell], [i * cell, last * cell], cut_m);
       return lines.join("");
     }
     /** A circle on the ground about a pixel, as the path of an SVG. */
@@ -962,6 +1031,7 @@
     loupe = byId("loupe");
     brush = new Brush();
     lines = new Lines();
+    shadow = new Shadow();
     photoName = "";
     hint = "";
     from = null;
@@ -1114,13 +1184,13 @@
         drag: (x, y, dx, dy) => {
           if (this.brush.on) return this.brush.move(this.pixel(x, y));
           if (this.lines.on) return this.lines.move(this.pixel(x, y));
-          if (!this.from || !studio.state?.object || !this.loupe.hidden) return;
+          if (!this.from || !studio.state?.object || !this.loupe.hidden || this.shadow.on) return;
           this.moved = [this.moved[0] + dx * this.px, this.moved[1] + dy * this.px];
           studio.change({ at_px: this.inside([this.from[0] + this.moved[0], this.from[1] + this.moved[1]]) });
         },
-        dragEnd: () => {
-          if (this.brush.on) return void this.brush.end();
-          if (this.lines.on) return this.lines.stop(this.px);
+        dragEnd: (pinched) => {
+          if (this.brush.on) return pinched ? this.brush.drop() : void this.brush.end();
+          if (this.lines.on) return this.lines.stop(this.px, pinched);
           this.from = null;
           this.stage.classList.remove("dragging");
           void studio.commit();
@@ -1136,6 +1206,7 @@
         return void this.brush.end();
       }
       if (this.lines.on) return this.lines.tap(this.pixel(x, y), this.px);
+      if (this.shadow.on) return void this.shadow.tap(this.pixel(x, y), this.px);
       if (this.stage.classList.contains("focusing")) return this.focusAt(x, y);
       if (this.chose(x, y)) return void studio.commit();
       if (!studio.state?.object) return studio.say("choose an object first: in the list at the right, or drop a GLB file");
@@ -1190,7 +1261,7 @@
         event.preventDefault();
       });
       document.addEventListener("keydown", (event) => {
-        const tool = this.brush.on ? "brush" : this.lines.on ? "draw_lines" : this.stage.classList.contains("focusing") ? "focus_here" : null;
+        const tool = this.brush.on ? "brush" : this.lines.on ? "draw_lines" : this.shadow.on ? "sun_by" : this.stage.classList.contains("focusing") ? "focus_here" : null;
         if (event.key === "Escape" && tool) byId(tool).click();
         if (!(event.ctrlKey || event.metaKey) || event.target.matches?.("input[type=text], input[type=number]")) return;
         const key = event.key.toLowerCase();
@@ -1209,7 +1280,7 @@
         });
       };
       pressed("grid", () => this.mark());
-      const tools = ["focus_here", "brush", "draw_lines"];
+      const tools = ["focus_here", "brush", "draw_lines", "sun_by"];
       const isOn = (id) => byId(id).getAttribute("aria-pressed") === "true";
       for (const id of tools) {
         byId(id).addEventListener("click", () => isOn(id) || tools.filter((each) => each !== id && isOn(each)).forEach((each) => byId(each).click()), true);

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 71938761315c5a39b0e60ffec813835e1a1b24f80911880b22c39c36147ae43f
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 6d5d3cac768bb79d6d6b16e7fe0b0a56161f3a815ddc467fac9b1c57984a7359
 "use strict";
 (() => {
   // src/model.ts
@@ -490,7 +490,7 @@
     element.addEventListener("pointerdown", (event) => {
       element.setPointerCapture(event.pointerId);
       fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
-      if (kind === "drag") gestures.dragEnd();
+      if (kind === "drag") gestures.dragEnd(true);
       start2 = { x: event.clientX, y: event.clientY };
       kind = fingers.size === 1 ? "tap" : "pinch";
     });
@@ -516,7 +516,7 @@
     });
     const end = (event) => {
       if (!fingers.delete(event.pointerId)) return;
-      if (kind === "drag") gestures.dragEnd();
+      if (kind === "drag") gestures.dragEnd(false);
       if (kind === "tap" && event.type === "pointerup") {
         if (event.timeStamp - lastTap_ms < TWICE_MS) gestures.twice(event.clientX, event.clientY);
         else gestures.tap(event.clientX, event.clientY);

@@ -12,7 +12,7 @@ from mrbokeh.system.channel import apart, say
 from mrbokeh.system.errors import InputError
 from viewfinder.studio.project import Project
 from viewfinder.studio.saving import Saves
-from viewfinder.studio.state import DrawnLine, Stroke, StudioState, state_of
+from viewfinder.studio.state import DrawnLine, Pair, Stroke, StudioState, state_of
 
 if TYPE_CHECKING:
     from mrbokeh.solving.solved_camera import SolvedCamera
@@ -181,6 +181,17 @@ class Desk:
                     self.project.add(replace(self.state, matte=_short(path)))
                     self._keep()
                     return
+
+    async def sun_by(self, pixels: tuple[Pair, ...]) -> str:
+        """Take the sun to stand where a shadow says (`sun_by_pixels`); return that in words. Raises InputError."""
+        from viewfinder.studio.photograph import sun_by_pixels
+
+        if (opened := self.photograph) is None:
+            raise InputError("there is no photograph with a shadow yet: drop one on the page")
+        sun_deg, said = await asyncio.to_thread(sun_by_pixels, self.state, opened, pixels)
+        self.project.add(replace(self.state, sun_deg=sun_deg, plain=False))
+        self._keep()
+        return said
 
     async def step(self, by: Any) -> None:
         """Undo or redo."""

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.commands._composite_layers import held_upright
-from mrbokeh.commands._composite_options import CompositeOptions
+from mrbokeh.commands._composite_options import CompositeOptions, typed_sun
 from mrbokeh.commands._insertion_options import focused_at_pixel, require_one_focus
-from mrbokeh.commands._level_ground import HIGH_SHARE, on_level_ground, usual_tilt_rad, with_camera_of_file
+from mrbokeh.commands._level_ground import HIGH_SHARE, on_level_ground, sun_by_shadow, usual_tilt_rad, with_camera_of_file
 from mrbokeh.compositing.plate import (
     HeldLens,
     LensWishes,
@@ -39,9 +39,10 @@ from mrbokeh.solving.solve_camera import Line, solve_camera
 from mrbokeh.solving.solved_camera import SolvedCamera
 from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, read_focal_stack
 from mrbokeh.stacks.photograph import Photograph, read_photograph
+from mrbokeh.system.channel import apart
 from mrbokeh.system.errors import InputError
 from viewfinder.studio.command_line import options_of, preview_scale
-from viewfinder.studio.state import DrawnLine, StudioState
+from viewfinder.studio.state import DrawnLine, Pair, StudioState
 
 MOST_PX = 1e6
 """Pixels of the largest preview."""
@@ -265,6 +266,26 @@ def placed(state: StudioState, opened: OpenedPhotograph) -> StudioState:
     eyes_m = float(plate.world_from_camera[1] @ foot_m)
     height = state.height or f"{plate.length_m(high_px, foot_m[2]):.3g}"
     return replace(state, camera_height_m=state.camera_height_m or float(f"{eyes_m:.4g}"), height=height)
+
+
+def anywhere(state: StudioState, opened: OpenedPhotograph) -> StudioState:
+    """Return a complete state, where something is missing still, by which lens and camera are found; without a matte."""
+    middle_px = (0.5 * opened.size_px[0], 0.8 * opened.size_px[1])
+    return replace(state, photo=opened.path, object=state.object or Path("object.glb"), at_px=state.at_px or middle_px, matte=None)
+
+
+def sun_by_pixels(state: StudioState, opened: OpenedPhotograph, pixels: Sequence[Pair]) -> tuple[Pair, str]:
+    """Return where the sun stands (degrees to the right of the view, and above the horizon), and that in words.
+
+    pixels: of the whole photograph, as of --sun-by. Raises InputError for pixels that cannot be that.
+    """
+    scale = opened.plate.rgb.shape[1] / opened.size_px[0]
+    with apart() as words:
+        plate, *_ = opened.upright(options_of(anywhere(state, opened)), MOST_PX)
+        right_deg, above_deg = typed_sun(sun_by_shadow(plate, *((scale * x_px, scale * y_px) for x_px, y_px in pixels)))
+    side = "right" if right_deg >= 0.0 else "left"
+    told = f"by the shadow the sun is {abs(right_deg):.0f} degrees to the {side} of the view and {above_deg:.0f} above the horizon"
+    return (float(f"{right_deg:.4g}"), float(f"{above_deg:.4g}")), "; ".join([told, *words.warnings])
 
 
 def looks_down_deg(plate: Plate) -> float:

@@ -47,13 +47,14 @@ def project_of(options: StudioOptions) -> Project:
     elif photo is not None and not photo.is_dir():
         _there(photo, "a photograph")
     path = path or options.pictures / f"{photo.stem if photo else 'untitled'}{_SUFFIX}"
-    project = read_project(path) if path.exists() else Project(path)
+    is_new = not path.exists()
+    project = Project(path) if is_new else read_project(path)
     if photo is not None and project.state.photo != photo:
         project.add(StudioState(photo=photo, object=project.state.object, lens=project.state.lens))
     if options.depth is not None and project.state.depth != _there(options.depth, "the depth of the photograph"):
         project.add(replace(project.state, depth=options.depth, camera=None, pitch_deg=None, camera_height_m=None))
     _offer(project, options)
-    return project
+    return replace(project, history=[project.state], place=0) if is_new else project
 
 
 def _offer(project: Project, options: StudioOptions) -> None:

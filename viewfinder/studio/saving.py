@@ -50,6 +50,12 @@ class Saves:
         self._saves: list[Save] = []
         self._tasks: set[asyncio.Task[None]] = set()
 
+    @property
+    def format(self) -> str:
+        """Name of the format that was chosen last."""
+        suffix = self._saves[-1].out.suffix if self._saves else FORMATS["png"]
+        return next(name for name, each in FORMATS.items() if each == suffix)
+
     def told(self) -> list[dict[str, Any]]:
         """Return the saves, newest first."""
         return [each.told() for each in reversed(self._saves)]

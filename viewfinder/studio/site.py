@@ -5,7 +5,7 @@ import json
 import re
 import struct
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,7 +18,7 @@ from viewfinder.server.site import page_routes
 from viewfinder.studio.command_line import command_line, options_of
 from viewfinder.studio.desk import LARGEST, Desk, placed_state
 from viewfinder.studio.saving import FORMATS
-from viewfinder.studio.state import StudioState, stroke_of
+from viewfinder.studio.state import StudioState, shadow_of, stroke_of
 
 if TYPE_CHECKING:
     from viewfinder.studio.loupe import Region
@@ -61,7 +61,7 @@ class StudioSite:
             "/saved/{number}": self._saved,
         }
         post = {"/state": self._change, "/add": self._add, "/history": self._history, "/preview": self._preview, "/upload": self._upload}
-        post |= {"/save": self._save, "/cancel": self._cancel, "/paint": self._paint}
+        post |= {"/save": self._save, "/cancel": self._cancel, "/paint": self._paint, "/sun": self._sun}
         app.add_routes([web.post("/enter", self.access.enter)])
         app.add_routes([web.get(path, _refusing(handler)) for path, handler in get.items()])
         app.add_routes([web.post(path, _refusing(handler)) for path, handler in post.items()])
@@ -98,6 +98,7 @@ class StudioSite:
             "lenses": [{"path": str(each), "name": each.stem} for each in project.lenses],
             "saves": desk.saves.told(),
             "formats": list(FORMATS),
+            "format": desk.saves.format,
             "project": str(project.path.absolute()),
             "largest": LARGEST,
             "camera": desk.camera_told(),
@@ -114,7 +115,9 @@ class StudioSite:
         if not state.is_complete or opened is None:
             return None
         assert state.photo is not None
-        return command_line(options_of(placed_state(state, opened)), self.desk.saves.free_name(state.photo, ".png"))
+        return command_line(
+            options_of(placed_state(state, opened)), self.desk.saves.free_name(state.photo, FORMATS[self.desk.saves.format])
+        )
 
     async def _photo(self, _request: web.Request) -> web.Response:
         """Handle GET /photo: the photograph as it is, as large as the largest preview."""
@@ -156,6 +159,11 @@ class StudioSite:
         """Handle POST /paint: {"points": [[x, y], ...], "radius", "front"} in pixels of the photograph."""
         await self.desk.paint(stroke_of(await _message(request)))
         return web.json_response(self._told())
+
+    async def _sun(self, request: web.Request) -> web.Response:
+        """Handle POST /sun: {"points": pixels of a top, a foot and a shadow's tip}; the answer also has what is "said" of that."""
+        said = await self.desk.sun_by(shadow_of(await _message(request)))
+        return web.json_response(self._told() | {"said": said})
 
     async def _history(self, request: web.Request) -> web.Response:
         """Handle POST /history: {"step": -1 or 1}."""
@@ -224,7 +232,7 @@ class StudioSite:
 
 def _photo_told(opened: "OpenedPhotograph", state: StudioState) -> dict[str, Any]:
     """Return what the page needs of the photograph: its size, and the pinhole by which it draws the ground."""
-    from viewfinder.studio.photograph import looks_down_deg
+    from viewfinder.studio.photograph import anywhere, looks_down_deg
 
     width_px, height_px = opened.size_px
     told = opened.told
@@ -235,10 +243,12 @@ def _photo_told(opened: "OpenedPhotograph", state: StudioState) -> dict[str, Any
             "slices": len(stack),
             "focus_distances_m": list(stack.focus_distances_m) if stack.metres_known else [],
         }
-    shown |= {"f_number": told.f_number, "focus_m": told.focus_distance_m, "focal_length_mm": told.focal_length_mm}
+    sun = opened.plate.sun
+    by_file = None if sun is None or sun.right_deg is None or not sun.is_up else [round(sun.right_deg), round(sun.above_deg)]
+    shown |= {"sun_deg": by_file, "f_number": told.f_number, "focus_m": told.focus_distance_m, "focal_length_mm": told.focal_length_mm}
     try:
         with apart():
-            whole = replace(state if state.is_complete else _anywhere(state, opened), matte=None)
+            whole = anywhere(state, opened)
             plate, _renderer, known_height_m = opened.upright(options_of(whole), _FEW_PX)
             eyes_m = placed_state(whole, opened).camera_height_m or known_height_m
         held = plate.world_from_camera
@@ -250,12 +260,6 @@ def _photo_told(opened: "OpenedPhotograph", state: StudioState) -> dict[str, Any
             "problem": str(problem)
         }
     return shown
-
-
-def _anywhere(state: StudioState, opened: "OpenedPhotograph") -> StudioState:
-    """Return a complete state, where something is missing still, by which the lens is found."""
-    middle_px = (0.5 * opened.size_px[0], 0.8 * opened.size_px[1])
-    return replace(state, photo=opened.path, object=state.object or Path("object.glb"), at_px=state.at_px or middle_px)
 
 
 def _region_of(value: Any) -> "Region | None":

@@ -141,6 +141,15 @@ def stroke_of(document: Mapping[str, Any]) -> Stroke:
     return Stroke(line, _number(1.0, _PIXELS[1])("radius", document.get("radius")), _flag("front", document.get("front")))
 
 
+def shadow_of(document: Mapping[str, Any]) -> tuple[Pair, ...]:
+    """Return three pixels of a page's message: top and foot of something upright, and its shadow's tip. Raises InputError."""
+    points = document.get("points")
+    if not isinstance(points, list) or len(points) != 3:
+        raise InputError(f"expected three points, of a top, a foot and a shadow's tip, got {_shown(points)}")
+    within = _pair(_PIXELS, _PIXELS)
+    return tuple(within(f"points[{number}]", each) for number, each in enumerate(points))
+
+
 def _path(name: str, value: Any) -> Path:
     if not isinstance(value, str) or not value or "\0" in value or len(value) > 4096:
         raise InputError(f"expected {name} to be the name of a file, got {_shown(value)}")

@@ -94,8 +94,8 @@ class OneObject:
     """Object that stands before a camera, with its light, described by the options of a command.
 
     stands_at_m: in camera axes (x right, y down, z forward). world_from_camera: (3, 3) turns them into upright ones (`looking_down`).
-    height_m: scaled to it; None keeps the size of the file. turn_rad: about the vertical, clockwise seen from above. shadow: darkness of
-    the shadow, 0 to 1.
+    height_m: scaled to it; None keeps the size of the file. turn_rad: about the vertical, clockwise seen from above; at 0 the front of a
+    GLB, which is where +z of its file points, looks at the camera. shadow: darkness of the shadow, 0 to 1.
     """
 
     glb: Path
@@ -117,7 +117,11 @@ class OneObject:
         together = (self, *beside)
         placed = tuple(
             PlacedObject(
-                name=f"{each.glb.stem} {number}", glb=each.glb, position_m=each.foot_m, yaw_rad=each.turn_rad, height_m=each.height_m
+                name=f"{each.glb.stem} {number}",
+                glb=each.glb,
+                position_m=each.foot_m,
+                yaw_rad=each.turn_rad + np.pi,
+                height_m=each.height_m,
             )
             for number, each in enumerate(together, 1)
         )

@@ -7,7 +7,8 @@ export interface Gestures {
   tap(x_px: number, y_px: number): void;
   dragStart(x_px: number, y_px: number): void;
   drag(x_px: number, y_px: number, dx_px: number, dy_px: number): void;
-  dragEnd(): void;
+  /** pinched: a second finger came, so that it was no drag. */
+  dragEnd(pinched: boolean): void;
   /** factor: of the distance of the fingers since the last call, about the point between them, which moved by (dx, dy). turn_deg: clockwise. */
   pinch(factor: number, x_px: number, y_px: number, dx_px: number, dy_px: number, turn_deg: number): void;
   twice(x_px: number, y_px: number): void;
@@ -31,7 +32,7 @@ export function listen(element: HTMLElement, gestures: Gestures): void {
   element.addEventListener("pointerdown", (event) => {
     element.setPointerCapture(event.pointerId);
     fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
-    if (kind === "drag") gestures.dragEnd();
+    if (kind === "drag") gestures.dragEnd(true);
     start = { x: event.clientX, y: event.clientY };
     kind = fingers.size === 1 ? "tap" : "pinch";
   });
@@ -59,7 +60,7 @@ export function listen(element: HTMLElement, gestures: Gestures): void {
 
   const end = (event: PointerEvent): void => {
     if (!fingers.delete(event.pointerId)) return;
-    if (kind === "drag") gestures.dragEnd();
+    if (kind === "drag") gestures.dragEnd(false);
     if (kind === "tap" && event.type === "pointerup") {
       if (event.timeStamp - lastTap_ms < TWICE_MS) gestures.twice(event.clientX, event.clientY);
       else gestures.tap(event.clientX, event.clientY);

@@ -20,6 +20,13 @@ export class Brush {
     });
     const behind = byId<HTMLElement>("brush_behind");
     behind.addEventListener("click", () => behind.setAttribute("aria-pressed", String(behind.getAttribute("aria-pressed") !== "true")));
+    const hide = byId("brush_hide");
+    const hidden = (on: boolean): void => {
+      hide.setAttribute("aria-pressed", String(on));
+      byId<HTMLElement>("before").hidden = !on;
+    };
+    hide.addEventListener("click", () => hidden(hide.getAttribute("aria-pressed") !== "true"));
+    button.addEventListener("click", () => hidden(false));
     byId("brush_clear").addEventListener("click", () => void studio.commit({ matte: null }));
     const stage = byId<HTMLElement>("stage");
     stage.addEventListener("pointerleave", () => this.points.length || this.drawn.replaceChildren());
@@ -41,10 +48,7 @@ export class Brush {
     byId<HTMLElement>("brush_row").hidden = !this.on;
     byId<HTMLButtonElement>("brush_clear").disabled = !matte;
     this.tint.hidden = !this.on || !matte;
-    if (!this.on) {
-      this.points = [];
-      this.drawn.replaceChildren();
-    }
+    if (!this.on) this.drop();
     const source = `/matte?of=${encodeURIComponent(matte ?? "")}`;
     if (matte && this.on && this.tint.getAttribute("src") !== source) this.tint.src = source;
   }
@@ -72,6 +76,12 @@ export class Brush {
     this.points = [at_px];
     this.draw();
     this.points = [];
+  }
+
+  /** Forget a stroke that became a pinch. */
+  drop(): void {
+    this.points = [];
+    this.drawn.replaceChildren();
   }
 
   async end(): Promise<void> {

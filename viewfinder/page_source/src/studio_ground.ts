@@ -5,6 +5,7 @@ import type { Photo, State } from "./studio_model";
 const ACROSS = 5;
 const WIDE = 40;
 const DEEP = 50;
+const LEVELS = 4;
 /** Least distance of two rows of the grid, in heights of the picture. */
 const LEAST_APART = 0.008;
 const EYES_M = 1.5;
@@ -91,17 +92,20 @@ export class Ground {
     const [cell, nearest_m] = [this.cell_m, this.nearest_m];
     if (nearest_m === null) return "";
     const lines: string[] = [];
-    const first = Math.floor(nearest_m / cell) - 1;
     const cut_m = 0.02 * this.high_m;
-    let last = first;
-    // Rows that would run together are left out, and the lines along the view end with them.
-    for (let row_px = Infinity; last <= first + DEEP; last++) {
-      const [, y, z] = this.seen(0, last * cell);
-      if (z > cut_m && row_px - y < LEAST_APART * this.photo.height_px) break;
-      row_px = z > cut_m ? y : row_px;
-      this.line(lines, [-WIDE * cell, last * cell], [WIDE * cell, last * cell], cut_m);
+    let [first, row_px] = [Math.floor(nearest_m / cell) - 1, Infinity];
+    // Where rows would run together, squares of five times the side go on, and lines along the view end with theirs.
+    for (let side = cell, level = 0; level < LEVELS; side *= 5, level++) {
+      let last = first;
+      for (; last <= first + DEEP; last++) {
+        const [, y, z] = this.seen(0, last * side);
+        if (z > cut_m && row_px - y < LEAST_APART * this.photo.height_px) break;
+        row_px = z > cut_m ? y : row_px;
+        this.line(lines, [-WIDE * side, last * side], [WIDE * side, last * side], cut_m);
+      }
+      for (let i = -WIDE; i <= WIDE; i++) this.line(lines, [i * side, first * side], [i * side, last * side], cut_m);
+      first = Math.ceil(last / 5);
     }
-    for (let i = -WIDE; i <= WIDE; i++) this.line(lines, [i * cell, first * cell], [i * cell, last * cell], cut_m);
     return lines.join("");
   }
 

@@ -1,5 +1,5 @@
-// Lines drawn along edges of the photograph, upright and level ones, by which the server solves the camera.
-import { byId, type DrawnLine, type Pair, inPhoto, studio } from "./studio_model";
+// Lines drawn along edges, by which the server solves the camera, and a shadow that is pointed at, by which it finds the sun.
+import { byId, type DrawnLine, type Pair, type Told, inPhoto, studio } from "./studio_model";
 
 const AXES = ["y", "x", "z"] as const;
 const NEAR = 16;
@@ -50,9 +50,11 @@ export class Lines {
     this.draw();
   }
 
-  stop(px: number): void {
-    const lines = this.lines?.filter((each) => Math.hypot(each[2] - each[0], each[3] - each[1]) > SHORTEST * px);
+  /** pinched: the line became a pinch, and is forgotten. */
+  stop(px: number, pinched: boolean): void {
+    const lines = pinched ? undefined : this.lines?.filter((each) => Math.hypot(each[2] - each[0], each[3] - each[1]) > SHORTEST * px);
     this.lines = null;
+    if (pinched) this.draw();
     if (lines) void studio.commit({ lines });
   }
 
@@ -76,13 +78,59 @@ export class Lines {
     if (!photo || !this.on) return;
     this.drawn.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
     const size = photo.width_px / this.drawn.clientWidth;
-    for (const [x1, y1, x2, y2, axis] of lines) {
-      const line = document.createElementNS(this.drawn.namespaceURI, "path");
-      const ring = (x: number, y: number): string => `M${x - 5 * size} ${y}a${5 * size} ${5 * size} 0 1 0 ${10 * size} 0a${5 * size} ${5 * size} 0 1 0 ${-10 * size} 0`;
-      line.setAttribute("d", `M${x1} ${y1}L${x2} ${y2}${ring(x1, y1)}${ring(x2, y2)}`);
-      line.setAttribute("class", axis);
-      line.setAttribute("vector-effect", "non-scaling-stroke");
-      this.drawn.append(line);
-    }
+    for (const [x1, y1, x2, y2, axis] of lines) this.drawn.append(drawnLine([[x1, y1], [x2, y2]], axis, size));
+  }
+}
+
+/** A line through points with a ring about each. size: pixels of the photograph in one of the window. */
+function drawnLine(points: Pair[], kind: string, size: number): SVGPathElement {
+  const line = document.createElementNS("http://www.w3.org/2000/svg", "path");
+  const ring = ([x, y]: Pair): string => `M${x - 5 * size} ${y}a${5 * size} ${5 * size} 0 1 0 ${10 * size} 0a${5 * size} ${5 * size} 0 1 0 ${-10 * size} 0`;
+  line.setAttribute("d", points.map(([x, y], i) => `${i ? "L" : "M"}${x} ${y}`).join("") + points.map(ring).join(""));
+  line.setAttribute("class", kind);
+  line.setAttribute("vector-effect", "non-scaling-stroke");
+  return line;
+}
+
+const POINTS = ["click the top of something that stands upright in the sun", "now its foot, on the ground below that top", "now the tip of its shadow on the ground"];
+
+/** Three taps: the top and the foot of something upright, and the tip of its shadow. */
+export class Shadow {
+  private readonly button = byId<HTMLElement>("sun_by");
+  private readonly drawn = byId<SVGSVGElement>("pointed");
+  private points: Pair[] = [];
+
+  constructor() {
+    this.button.addEventListener("click", () => {
+      this.button.setAttribute("aria-pressed", String(!this.on));
+      this.begin();
+      studio.say(this.on ? POINTS[0]! : "", this.on);
+    });
+  }
+
+  get on(): boolean {
+    return this.button.getAttribute("aria-pressed") === "true";
+  }
+
+  /** Take a point. px: pixels of the photograph in one of the window. */
+  async tap(at_px: Pair, px: number): Promise<void> {
+    if (this.points.length === POINTS.length) return;
+    this.points.push(inPhoto(at_px));
+    const photo = studio.told!.photo!;
+    this.drawn.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
+    this.drawn.replaceChildren(drawnLine(this.points, "sun", px));
+    if (this.points.length < POINTS.length) return studio.say(POINTS[this.points.length]!, true);
+    await studio.commit();
+    const told = (await studio.post("/sun", { points: this.points })) as (Told & { said: string }) | null;
+    this.begin();
+    if (!told) return;
+    this.button.setAttribute("aria-pressed", "false");
+    studio.take(told);
+    studio.say(told.said);
+  }
+
+  private begin(): void {
+    this.points = [];
+    this.drawn.replaceChildren();
   }
 }

@@ -58,6 +58,8 @@ export interface Photo {
   world_from_camera: Matrix3 | null;
   pitch_deg: number | null;
   lens_f_number: number | null;
+  /** Where the sun stood by the file: degrees to the right of the view, and above the horizon. */
+  sun_deg: Pair | null;
   /** Of a focal stack: which picture this is, how many there are, and where each is focused. */
   slice?: number;
   slices?: number;
@@ -85,6 +87,8 @@ export interface Told {
   lenses: { path: string; name: string }[];
   saves: Save[];
   formats: string[];
+  /** The one that was saved last. */
+  format: string;
   project: string;
   largest: { photo: number; object: number };
   camera: { told: string; file?: string } | null;

@@ -26,8 +26,8 @@ const SLIDERS: Slider[] = [
     write: (value) => ({ f_number: F_NUMBERS[Math.min(value, F_NUMBERS.length - 1)]! }),
     shown: (_v, s) => `f/${Number((s.f_number ?? studio.told?.photo?.lens_f_number ?? 8).toPrecision(3))}`,
   },
-  { id: "sun_right", read: (s) => s.sun_deg?.[0] ?? DEFAULT_SUN[0], write: (v) => sun([v, above()]), shown: (v, s) => (s.sun_deg ? degrees(v) : "") },
-  { id: "sun_above", read: (s) => s.sun_deg?.[1] ?? DEFAULT_SUN[1], write: (v) => sun([right(), v]), shown: (v, s) => (s.sun_deg ? degrees(v) : "") },
+  { id: "sun_right", read: (s) => sunOf(s)[0], write: (v) => sun([v, above()]), shown: (v, s) => (s.sun_deg ? degrees(v) : "") },
+  { id: "sun_above", read: (s) => sunOf(s)[1], write: (v) => sun([right(), v]), shown: (v, s) => (s.sun_deg ? degrees(v) : "") },
   {
     id: "exposure",
     read: (s) => Math.log2(Math.max(s.exposure, 1e-3)),
@@ -38,8 +38,10 @@ const SLIDERS: Slider[] = [
   { id: "pitch", read: (s) => s.pitch_deg ?? studio.told?.photo?.pitch_deg ?? 0, write: (pitch_deg) => ({ pitch_deg }), shown: (v) => degrees(v) },
 ];
 
-const right = (): number => studio.state?.sun_deg?.[0] ?? DEFAULT_SUN[0];
-const above = (): number => studio.state?.sun_deg?.[1] ?? DEFAULT_SUN[1];
+/** Where the sun is, or would be: as told, as the file tells, or somewhere. */
+const sunOf = (state: State | null): Pair => state?.sun_deg ?? studio.told?.photo?.sun_deg ?? DEFAULT_SUN;
+const right = (): number => sunOf(studio.state)[0];
+const above = (): number => sunOf(studio.state)[1];
 /** A told light takes the plain, even one away. */
 const sun = (sun_deg: Pair): Partial<State> => ({ sun_deg, plain: false });
 
@@ -60,6 +62,7 @@ export class Panel {
     this.dome();
     this.result();
     this.files();
+    this.saveAtOnce();
     const react = (id: string, changes: () => Partial<State>): void => byId(id).addEventListener("click", () => void studio.commit(changes()));
     react("focus_auto", () => ({ focus_m: null, focus_at_px: null }));
     react("f_number_auto", () => ({ f_number: null }));
@@ -154,6 +157,14 @@ export class Panel {
     });
   }
 
+  /** The header's button saves in the format that was saved last, and shows where the picture goes. */
+  private saveAtOnce(): void {
+    byId("to_save").addEventListener("click", () => {
+      if (!studio.isComplete) return studio.say("place an object first: then its picture can be saved");
+      void save(studio.told!.format);
+    });
+  }
+
   private files(): void {
     for (const id of ["open_photo", "open_object"]) {
       const input = byId<HTMLInputElement>(id);
@@ -216,11 +227,7 @@ export class Panel {
         const button = document.createElement("button");
         button.textContent = LONG_FORMATS[format] ?? format;
         button.dataset.format = format;
-        button.addEventListener("click", async () => {
-          await studio.commit();
-          const answer = await studio.post("/save", { format });
-          if (answer) studio.take(answer);
-        });
+        button.addEventListener("click", () => void save(format));
         formats.append(button);
       }
     }
@@ -253,7 +260,10 @@ export class Panel {
     byId<HTMLInputElement>("matched").checked = state.matched;
     byId<HTMLInputElement>("plain").checked = state.plain;
     document.querySelectorAll<HTMLInputElement>("input[name=lens]").forEach((each) => (each.checked = each.value === (state.lens ?? "")));
-    const [turn, high] = state.sun_deg ?? DEFAULT_SUN;
+    const [turn, high] = sunOf(state);
+    const byFile = studio.told?.photo?.sun_deg;
+    byId("sun_told").textContent = byFile ? `By place, time and compass in the file the sun stood ${byFile[0]}° to the right and ${byFile[1]}° high, if it shone.` : "";
+    byId("height_note").textContent = heightNote(state);
     const reach = (90 - high) / 0.9;
     const lamp = byId<SVGCircleElement>("lamp");
     lamp.setAttribute("cx", String(reach * Math.sin((turn * Math.PI) / 180)));
@@ -279,12 +289,24 @@ export class Panel {
   }
 }
 
+/** What the number of the height counts. */
+function heightNote(state: State): string {
+  const guessed = state.camera_height_m && !studio.told?.photo?.has_depth ? ` for a camera ${state.camera_height_m} m above the ground (see below)` : "";
+  return `Metres${guessed}, or pixels such as 120px. Wheel, pinch, + and - scale it.`;
+}
+
 /** What the ground is taken for, where no depth tells it: all metres hang on that. */
 function groundTold(): string[] {
   const [told, state] = [studio.told, studio.state];
   if (!told?.photo || told.photo.has_depth || !state?.camera_height_m) return [];
   const tilt = state.camera === null && state.pitch_deg !== null ? [`The camera looks down by ${state.pitch_deg}°, which nothing in the picture tells: see Camera and ground, or draw Lines.`] : [];
   return [...tilt, `The camera is ${state.camera_height_m} m above the ground; all metres hang on that.`];
+}
+
+async function save(format: string): Promise<void> {
+  await studio.commit();
+  const answer = await studio.post("/save", { format });
+  if (answer) studio.take(answer);
 }
 
 const nameOf = (path: string): string => path.replace(/^.*[\\/]/, "").replace(/\.\w+$/, "");

@@ -1,7 +1,7 @@
 // The picture: fitted to the window, with the ground over it, and everything that hands do on it.
 import { listen } from "./gestures";
 import { Brush } from "./studio_brush";
-import { Lines } from "./studio_lines";
+import { Lines, Shadow } from "./studio_lines";
 import { groundOf } from "./studio_ground";
 import { type Box, byId, type Pair, studio } from "./studio_model";
 
@@ -9,7 +9,6 @@ const NUDGES_REST_MS = 500;
 const LOUPE_PX = 240;
 const DRAWN_AGAIN_MS = 900;
 const LOOKS_MS = 150;
-
 
 /** The height, scaled; its unit stays. */
 export function scaledHeight(height: string | null, factor: number): string | null {
@@ -29,6 +28,7 @@ export class PictureStage {
   private readonly loupe = byId<HTMLCanvasElement>("loupe");
   private readonly brush = new Brush();
   private readonly lines = new Lines();
+  private readonly shadow = new Shadow();
   private photoName = "";
   private hint = "";
   private from: Pair | null = null;
@@ -196,13 +196,13 @@ export class PictureStage {
         if (this.brush.on) return this.brush.move(this.pixel(x, y));
         if (this.lines.on) return this.lines.move(this.pixel(x, y));
         // Under the loupe a finger looks, and moves nothing.
-        if (!this.from || !studio.state?.object || !this.loupe.hidden) return;
+        if (!this.from || !studio.state?.object || !this.loupe.hidden || this.shadow.on) return;
         this.moved = [this.moved[0] + dx * this.px, this.moved[1] + dy * this.px];
         studio.change({ at_px: this.inside([this.from[0] + this.moved[0], this.from[1] + this.moved[1]]) });
       },
-      dragEnd: () => {
-        if (this.brush.on) return void this.brush.end();
-        if (this.lines.on) return this.lines.stop(this.px);
+      dragEnd: (pinched) => {
+        if (this.brush.on) return pinched ? this.brush.drop() : void this.brush.end();
+        if (this.lines.on) return this.lines.stop(this.px, pinched);
         this.from = null;
         this.stage.classList.remove("dragging");
         void studio.commit();
@@ -219,6 +219,7 @@ export class PictureStage {
       return void this.brush.end();
     }
     if (this.lines.on) return this.lines.tap(this.pixel(x, y), this.px);
+    if (this.shadow.on) return void this.shadow.tap(this.pixel(x, y), this.px);
     if (this.stage.classList.contains("focusing")) return this.focusAt(x, y);
     if (this.chose(x, y)) return void studio.commit();
     if (!studio.state?.object) return studio.say("choose an object first: in the list at the right, or drop a GLB file");
@@ -277,7 +278,7 @@ export class PictureStage {
       event.preventDefault();
     });
     document.addEventListener("keydown", (event) => {
-      const tool = this.brush.on ? "brush" : this.lines.on ? "draw_lines" : this.stage.classList.contains("focusing") ? "focus_here" : null;
+      const tool = this.brush.on ? "brush" : this.lines.on ? "draw_lines" : this.shadow.on ? "sun_by" : this.stage.classList.contains("focusing") ? "focus_here" : null;
       if (event.key === "Escape" && tool) byId<HTMLElement>(tool).click();
       if (!(event.ctrlKey || event.metaKey) || (event.target as Element).matches?.("input[type=text], input[type=number]")) return;
       const key = event.key.toLowerCase();
@@ -297,7 +298,7 @@ export class PictureStage {
       });
     };
     pressed("grid", () => this.mark());
-    const tools = ["focus_here", "brush", "draw_lines"];
+    const tools = ["focus_here", "brush", "draw_lines", "sun_by"];
     const isOn = (id: string): boolean => byId(id).getAttribute("aria-pressed") === "true";
     for (const id of tools) {
       // Before the tool itself is told: the others fall silent, then it speaks.
