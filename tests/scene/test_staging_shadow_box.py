@@ -33,6 +33,19 @@ def test_the_shadow_is_that_of_the_whole_frame(stands_at_m: tuple[float, float, 
     np.testing.assert_allclose(found.depth_m, whole.depth_m, rtol=1e-5)
 
 
+def test_the_front_of_an_object_looks_at_the_camera_until_it_is_turned() -> None:
+    """The alien's eyes, the only grey of its head, lie at +z of its file (glTF 2.0: the front of an asset faces +Z)."""
+
+    def eyes(turn_rad: float) -> int:
+        one = OneObject(ALIEN, (0.0, 0.4, 2.0), height_m=0.8, turn_rad=turn_rad)
+        alien = FilmedLayers(Filming("embree"), one.described(), threads=1).at(lambda _: one.seen_by(CAMERA))[0]
+        head = np.nonzero((alien.alpha == 1.0).any(axis=1))[0][:40]
+        rgb = alien.rgb[head][alien.alpha[head] == 1.0]
+        return int((np.ptp(rgb, axis=1) < 0.2 * rgb.max(axis=1)).sum())
+
+    assert eyes(0.0) > 20 and eyes(np.pi) == 0
+
+
 def test_layers_agree_on_motion_where_only_one_of_them_moves() -> None:
     """The head of the alien is in the picture, its foot and the shadow are not, and the camera goes to the right."""
     one = OneObject(ALIEN, (0.0, 0.7, 2.0), height_m=0.3, shadow=0.7)

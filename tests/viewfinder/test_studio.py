@@ -289,6 +289,7 @@ def test_options_of_the_command_are_checked_before_anything_listens(photo: Path,
     lenses = (tmp_path / "lens.json", bank_folder(tmp_path / "bank", Lens(35.0, 2.8, 1.0, 23.5)))
     project = project_of(StudioOptions(photo, (CAKE,), lenses=lenses, pictures=tmp_path))
     assert project.state == StudioState(photo=photo, object=CAKE) and project.lenses == [*lenses]
+    assert len(project.history) == 1, "there is nothing to undo yet"
     assert project.path == tmp_path / "a floor.studio.json"
     project.add(replace(project.state, lens=lenses[1]))
     project.write()

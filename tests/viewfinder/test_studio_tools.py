@@ -29,7 +29,7 @@ from viewfinder.studio.loupe import Region, WholePhotograph, region_of
 from viewfinder.studio.photograph import open_photograph, solved_by_hand
 from viewfinder.studio.preview import preview_of
 from viewfinder.studio.project import read_project
-from viewfinder.studio.state import Stroke, StudioState, state_of, stroke_of
+from viewfinder.studio.state import Stroke, StudioState, shadow_of, state_of, stroke_of
 
 SIZE, MIDDLE, RADIUS = 300, (150, 150), 60.0
 
@@ -230,6 +230,21 @@ async def test_pages_paint_and_see_it(tmp_path: Path) -> None:
 def test_strokes_that_cannot_be_meant_are_refused(message: dict[str, object], why: str) -> None:
     with pytest.raises(InputError, match=why):
         stroke_of(message)
+
+
+async def test_a_shadow_tells_the_sun_in_pixels_of_the_whole_photograph(tmp_path: Path) -> None:
+    """A level camera, a post of 30 px and its shadow of 60 px straight to the left, in a photograph that is larger than its preview."""
+    photo = write_floor(tmp_path / "floor.png", 8 * WIDTH, 8 * HEIGHT)
+    async with made_studio(tmp_path, StudioState(photo=photo, object=CAKE, pitch_deg=0.0, plain=True)) as made:
+        desk = made.desk
+        while desk.photograph is None or desk.busy:
+            await desk.news_after(desk.number, 1.0)
+        said = await desk.sun_by(shadow_of({"points": [[8 * 120, 8 * 120], [8 * 120, 8 * 150], [8 * 60, 8 * 150]]}))
+        assert said.startswith("by the shadow the sun is 90 degrees to the right of the view and 27 above")
+        assert desk.state.sun_deg == pytest.approx((90.0, np.degrees(np.arctan(0.5))), abs=0.05) and not desk.state.plain
+        for points, why in (([[1, 2], [3, 4]], "three points"), ([[960, 900], [960, 600], [500, 1200]], "foot lies above the horizon")):
+            with pytest.raises(InputError, match=why):
+                await desk.sun_by(shadow_of({"points": points}))
 
 
 async def test_drawn_lines_give_the_camera_until_they_are_taken_away(tmp_path: Path) -> None:

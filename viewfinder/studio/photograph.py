@@ -281,7 +281,7 @@ def sun_by_pixels(state: StudioState, opened: OpenedPhotograph, pixels: Sequence
     """
     scale = opened.plate.rgb.shape[1] / opened.size_px[0]
     with apart() as words:
-        plate, *_ = opened.upright(options_of(anywhere(state, opened)), MOST_PX)
+        plate, *_ = opened.upright(options_of(anywhere(replace(state, plain=False), opened)), MOST_PX)
         right_deg, above_deg = typed_sun(sun_by_shadow(plate, *((scale * x_px, scale * y_px) for x_px, y_px in pixels)))
     side = "right" if right_deg >= 0.0 else "left"
     told = f"by the shadow the sun is {abs(right_deg):.0f} degrees to the {side} of the view and {above_deg:.0f} above the horizon"
