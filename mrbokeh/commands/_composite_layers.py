@@ -113,7 +113,8 @@ def _object_layers(options: ObjectOptions, rendering: RenderingOptions, first: P
     catches = rendering.catch or ("shadow" if options.plain else "light")
     usual = 0.0 if options.plain else _DARK if catches == "shadow" else 1.0
     shadow = usual if options.shadow is None else options.shadow
-    filming = replace(rendering.of_photograph.filming(), catches=catches, caught_share=shadow)
+    contrast = 1.0 if options.plain else first.shadow_contrast
+    filming = replace(rendering.of_photograph.filming(), catches=catches, caught_share=shadow, caught_contrast=contrast)
     placed = objects_of(options, first, shadow)
     light = _light(options, first, options.first_px if options.at_pixel else _pixel_of(first.camera, placed[0].stands_at_m), kept)
     placed = [replace(each, light=light) for each in placed]
@@ -236,11 +237,11 @@ def _sun_by_file(sun: "SunOfPhotograph | None", *, shines: bool) -> tuple[float,
         guess(f"the object's light is guessed from the photograph (else --exposure, {option}{there}, --environment or --plain)")
         return None
     if sun is None:
-        guess("by the exposure the sun shines: a soft light from behind the camera is taken (--sun RIGHT,ABOVE says where it is)")
+        guess("by the exposure the sun shines: a soft light from behind at the left is taken (--sun RIGHT,ABOVE says where it is)")
     elif degrees is None:
         guess(
             f"by the exposure the sun shines, and by time and place in the file it stood {sun.above_deg:.0f} degrees high; no compass "
-            f"tells on which side: a soft light from behind the camera is taken (--sun RIGHT,{sun.above_deg:.0f}, or --sun-by, says more)"
+            f"tells on which side: a soft light from behind at the left is taken (--sun RIGHT,{sun.above_deg:.0f}, or --sun-by, says more)"
         )
     else:
         north = ", turned from magnetic to true north," if sun.from_magnetic_north else ""

@@ -1,18 +1,21 @@
 """Light and ground of a photograph for what is put into it: the ground has the irradiance that is told, and slopes as its depth says."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
 from mrbokeh.compositing.ground import ground_under
-from mrbokeh.compositing.plate import Plate, plate_of
+from mrbokeh.compositing.plate import Plate, open_plate, plate_of
 from mrbokeh.compositing.plate_light import Surroundings, is_sunlit, picture_light, white_at
 from mrbokeh.demo.plan import DATA
 from mrbokeh.images.color import luminance
+from mrbokeh.images.image_io import write_image
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
+from mrbokeh.scene.changed_light import LightChange
 from mrbokeh.scene.light import directions, solid_angles_sr
 from mrbokeh.scene.light_change import light_left
 from mrbokeh.scene.staging.filming import FilmedLayers, Filming
@@ -62,6 +65,33 @@ def test_what_is_out_of_sight_is_an_overcast_sky() -> None:
     towards, solid = directions(32, 64), solid_angles_sr(32, 64)
     wall, ground = ((np.maximum(towards @ normal, 0.0) * solid * environment.radiance[..., 0]).sum() for normal in ([0, 0, 1], [0, -1, 0]))
     assert wall / ground == pytest.approx(0.396, abs=0.004)
+
+
+@pytest.mark.parametrize("above_deg", [25.0, 60.0])
+def test_a_sun_that_only_the_exposure_tells_is_wide_and_as_high_as_the_file_says(above_deg: float) -> None:
+    """It comes from behind at the left, and is half as bright acos(0.5 ** (1 / 24)) = 13.7 degrees beside its middle."""
+    environment, lights = Surroundings(np.zeros((32, 64, 3)), np.ones(3), above_deg).light()
+    light, towards = (
+        environment.radiance[..., 1] - Surroundings(np.zeros((32, 64, 3)), np.zeros(3)).light()[0].radiance[..., 1],
+        directions(32, 64),
+    )
+    x, y, z = towards[np.unravel_index(light.argmax(), light.shape)]
+    assert not lights and np.degrees(np.arcsin(-y)) == pytest.approx(above_deg, abs=4.0) and x < 0.0 and z < 0.0
+    assert (solid_angles_sr(32, 64) * (light > light.max() / 2)).sum() == pytest.approx(2 * np.pi * (1 - np.cos(np.radians(13.7))), rel=0.3)
+
+
+def test_shadows_in_what_a_camera_developed_are_deeper(tmp_path: Path) -> None:
+    """A JPEG has the tones of a camera, a PNG of one's own has not: half the light is shown as 0.5 ** 1.3 there."""
+    picture = np.full((24, 32, 3), 0.4, np.float32)
+    facts = {"focal_length_mm": 30.0, "f_number": 4.0, "sensor_width_mm": 36.0}
+    contrasts = []
+    for name in ("a.jpg", "a.png"):
+        write_image(tmp_path / name, picture)
+        contrasts.append(open_plate(tmp_path / name, facts=facts, focus_m=2.0).shadow_contrast)
+    assert contrasts == [1.3, 1.0]
+    ratio = np.full((2, 2, 3), 0.5, np.float32)
+    change = LightChange(ratio, np.zeros_like(ratio), np.ones((2, 2), np.float32), np.ones((2, 2), np.float32))
+    assert change.deepened(1.3).ratio == pytest.approx(0.406, abs=1e-3) and change.deepened(1.0) is change
 
 
 def test_a_main_light_takes_its_share_of_the_light() -> None:

@@ -55,7 +55,7 @@ def test_options_replace_the_sun_of_the_file(tmp_path: Path) -> None:
         (GPS | {16: "M"}, EXPOSED, "compass, turned from magnetic to true north, in the file it stood at --sun 84,40"),
         (GPS, EXPOSED | {0x829A: 0.5}, "else --exposure, --sun 90,40, where the sun would be by the file"),
         (GPS | {7: (6.0, 30.0, 0.0)}, {0x9003: "2003:10:16 23:30:00"}, "else --exposure, --sun RIGHT,ABOVE"),
-        ({}, EXPOSED, "a soft light from behind the camera is taken (--sun RIGHT,ABOVE"),
+        ({}, EXPOSED, "a soft light from behind at the left is taken (--sun RIGHT,ABOVE"),
     ],
     ids=["no compass", "magnetic north", "a room", "night", "no place"],
 )

@@ -43,8 +43,8 @@ class Filming:
 
     backend: a name of `mrbokeh.scene.choose`. samples: paths per pixel of "mitsuba". distortion: of the plate's lens. catches:
     "shadow", as dark as the scene says, or "light": all that the objects change on the ground (`mrbokeh.scene.light_change`), of which
-    caught_share (0 to 1) is shown, computed in at most change_px pixels, and with finer_change in more where it is uneven. shutter:
-    motion blur; None for none.
+    caught_share (0 to 1) is shown, computed in at most change_px pixels, and with finer_change in more where it is uneven.
+    caught_contrast: power of the light that remains there by which a camera shows it. shutter: motion blur; None for none.
     """
 
     backend: str = "auto"
@@ -52,6 +52,7 @@ class Filming:
     denoise: bool = False
     catches: str = "shadow"
     caught_share: float = 1.0
+    caught_contrast: float = 1.0
     distortion: LensDistortion = field(default_factory=LensDistortion)
     shutter: ShutterTiming | None = None
     change_px: int = _MOST_PX
@@ -100,6 +101,16 @@ def _finer(
     else:
         ratio[pixels] = light_left(scene, camera.resized(width_px, height_px), catcher, pixels, samples)
     return replace(change, ratio=ratio.reshape(change.ratio.shape))
+
+
+def _without_noise(
+    ratio: Float32[np.ndarray, "height width 3"], covered: Bool[np.ndarray, "height width"]
+) -> Float32[np.ndarray, "height width 3"]:
+    """Return the mean of what is not covered in the window of each pixel: soft shadows are smooth, what was drawn of them is rough."""
+    seen = (~covered).astype(np.float32)
+    share = cv2.blur(seen, (_WINDOW_PX, _WINDOW_PX))[..., None]
+    mean = cv2.blur(ratio * seen[..., None], (_WINDOW_PX, _WINDOW_PX)) / np.maximum(share, 1e-6)
+    return np.where(share > 1e-3, mean, ratio).astype(np.float32)
 
 
 def _beside(
@@ -186,7 +197,8 @@ class FilmedLayers:
         if box.is_empty:
             return [clear(camera.height_px, camera.width_px)]
         alpha = np.ascontiguousarray(box.of(objects.alpha))
-        change = self._change(scene, box.camera_of(camera), catcher, alpha).weakened(self._filming.caught_share)
+        change = self._change(scene, box.camera_of(camera), catcher, alpha)
+        change = change.deepened(self._filming.caught_contrast).weakened(self._filming.caught_share)
         part_rgb = None if sharp_rgb is None else np.ascontiguousarray(box.of(sharp_rgb))
         part = change.evenly().as_layer(np.zeros_like(change.ratio)) if part_rgb is None else change.as_layer(part_rgb)
         return [part if box == frame else box.placed(part, frame.size_px)]
@@ -220,6 +232,8 @@ class FilmedLayers:
         while self._filming.finer_change and change.alpha.shape != tuple(size_px):
             change = _finer(change, scene, camera, catcher, covered, np.minimum(2 * np.array(change.alpha.shape), size_px), samples)
         change = change.enlarged(camera.height_px, camera.width_px)
+        if not scene.lighting[0]:
+            change = replace(change, ratio=_without_noise(change.ratio, covered))
         return replace(change, ratio=np.minimum(_beside(covered, change.ratio) + np.float32(_UNSEEN), np.float32(1.0)))
 
     def _shadow(self, scene: Scene, camera: Camera, catcher: ShadowCatcher) -> Layer:
