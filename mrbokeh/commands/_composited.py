@@ -103,9 +103,10 @@ def composited(
 def _before_the_lens(layer: Layer, plate: Plate) -> Layer:
     """Return the layer without what all but touches the lens: its light goes everywhere, and would take any amount of memory."""
     least_px = -_WIDEST * math.hypot(layer.width_px, layer.height_px)
-    touching = (layer.alpha > 0.0) & (plate.lens.coc_px(np.where(layer.alpha > 0.0, layer.depth_m, np.inf), layer.width_px) < least_px)
-    if not touching.any():
+    nearest_m = float(np.min(layer.depth_m, initial=np.inf, where=layer.alpha > 0.0))
+    if nearest_m == np.inf or plate.lens.coc_px(nearest_m, layer.width_px) >= least_px:
         return layer
+    touching = (layer.alpha > 0.0) & (plate.lens.coc_px(np.where(layer.alpha > 0.0, layer.depth_m, np.inf), layer.width_px) < least_px)
     clear = np.where(touching, np.float32(0.0), np.float32(1.0))
     return replace(layer, rgb=layer.rgb * clear[..., None], alpha=layer.alpha * clear, depth_m=np.where(touching, np.inf, layer.depth_m))
 

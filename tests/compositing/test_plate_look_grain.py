@@ -5,12 +5,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.optimize
 from scipy.ndimage import gaussian_filter
 from scipy.stats import ks_2samp
 
 from mrbokeh.compositing.plate_look import noise_measurement
 from mrbokeh.compositing.plate_look.grain import Grain, measured_grain, measured_grain_of_pair, read_grain, write_grain
-from mrbokeh.compositing.plate_look.noise_measurement import REACH_PX, NoiseLevel, fit_noise_level, noise_blocks, white
+from mrbokeh.compositing.plate_look.noise_measurement import REACH_PX, NoiseLevel, fit_noise_level, least_line, noise_blocks, white
 from mrbokeh.images.image_io import read_image
 from mrbokeh.system.atomic_files import write_json
 from mrbokeh.video.clip import read_frames
@@ -224,3 +225,12 @@ def test_what_residuals_say_of_a_correlation_is_that_of_whole_matrices() -> None
     for column in (0, 7, 40, 66):
         seen = off_smooth @ masks[column] @ off_smooth
         np.testing.assert_allclose(table[:, column], [seen[mask > 0].mean() for mask in masks], atol=1e-12)
+
+
+@pytest.mark.parametrize("truth", [(0.3, 0.1), (0.5, 0.0), (0.0, 0.2), (-0.2, 0.3), (0.8, -0.2), (0.0, 0.0)])
+def test_the_least_line_is_that_of_non_negative_least_squares(truth: tuple[float, float]) -> None:
+    rng = np.random.default_rng(3)
+    level, weight = rng.random(400), rng.uniform(0.5, 3.0, 400)
+    variance = np.maximum(truth[0] * level + truth[1] + 0.05 * rng.normal(size=400), 0.0) if any(truth) else np.zeros(400)
+    plain, _ = scipy.optimize.nnls(np.stack([level, np.ones(400)], axis=1) * weight[:, None] ** 0.5, variance * weight**0.5)
+    assert least_line(level, variance, weight) == pytest.approx(tuple(plain), abs=1e-9)

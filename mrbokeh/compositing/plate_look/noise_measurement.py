@@ -177,16 +177,33 @@ def _bins(level: Float64[np.ndarray, " blocks"], variance: Float64[np.ndarray, "
 
 def _line(level: Float64[np.ndarray, " points"], variance: Float64[np.ndarray, " points"]) -> tuple[float, float]:
     """Slope and intercept, neither below 0, by least squares of relative errors: a variance is as uncertain as it is large."""
-    from scipy.optimize import nnls
-
     level = np.maximum(level, 0.0)
     expected = np.full_like(variance, variance.mean())
     slope = intercept = 0.0
     for _ in range(8):
         weight = 1.0 / np.maximum(expected, 1e-3 * max(float(variance.mean()), 1e-30))
-        (slope, intercept), _ = nnls(np.stack([level, np.ones_like(level)], axis=1) * weight[:, None], variance * weight)
+        slope, intercept = least_line(level, variance, weight**2)
         expected = slope * level + intercept
-    return float(slope), float(intercept)
+    return slope, intercept
+
+
+def least_line(
+    level: Float64[np.ndarray, " points"], variance: Float64[np.ndarray, " points"], weight: Float64[np.ndarray, " points"]
+) -> tuple[float, float]:
+    """Return slope and intercept, neither below 0, of the line with the least weighted squares. level, variance: not below 0.
+
+    Where the best line has a slope or an intercept below 0, one of them is 0: that which leaves less.
+    """
+    steep = weight * level  # summed without BLAS, whose threads wait for one another over so little
+    level2, level1, ones = (float(each.sum()) for each in (steep * level, steep, weight))
+    product, sum_ = float((steep * variance).sum()), float((weight * variance).sum())
+    if (size := level2 * ones - level1 * level1) > 1e-12 * level2 * ones:
+        slope, intercept = (product * ones - level1 * sum_) / size, (level2 * sum_ - level1 * product) / size
+        if slope >= 0.0 and intercept >= 0.0:
+            return slope, intercept
+    # What one of them takes off the sum of squares.
+    by_slope, even = product**2 / level2 if level2 > 0.0 else 0.0, sum_**2 / ones
+    return (product / level2, 0.0) if by_slope > even else (0.0, sum_ / ones)
 
 
 def _as_noise(lines: list[tuple[float, float]]) -> NoiseLevel:
