@@ -60,6 +60,7 @@ SUB_COMMANDS = {
     "video": SubCommand("mrbokeh.commands.video", "Put virtual objects into a video."),
     "refocus": SubCommand("mrbokeh.commands.refocus", "New slices of a focal stack, between and beyond the captured ones."),
     "transfer": SubCommand("mrbokeh.commands.transfer", "Put a lens on an all-in-focus photograph with a depth map."),
+    "tilt-shift": SubCommand("mrbokeh.commands.tilt_shift", "Blur a photograph away from a line, as a tilted lens does."),
     "check": SubCommand("mrbokeh.commands.check", "Find what is wrong in composites: NaN, leaks, lost light, flicker."),
     "track": SubCommand("mrbokeh.commands.track", "The camera of every frame of a clip, and its files."),
     "viewfinder": SubCommand("viewfinder.cli", "Stream a camera with virtual objects in it to a browser."),

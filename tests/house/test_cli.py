@@ -25,7 +25,7 @@ COMMANDS = [
     ["capture", "dataset"], ["capture", "process"], ["train"], ["train", "fit"], ["train", "evaluate"], ["train", "export"],
     ["train", "ablate"],
     ["lens"], ["lens", "new"], ["lens", "coc"], ["lens", "show"], ["lens", "psf"], ["lens", "export"],
-    ["lens", "fit"], ["lens", "match"], ["render"], ["composite"], ["video"], ["refocus"], ["transfer"],
+    ["lens", "fit"], ["lens", "match"], ["render"], ["composite"], ["video"], ["refocus"], ["transfer"], ["tilt-shift"],
     ["check"], ["blender-addon"], ["track"], ["track", "clip"], ["track", "convert"],
     ["capture", "matchmove"],
     ["viewfinder"], ["viewfinder", "board"], ["viewfinder", "calibrate-phone"], ["studio"], ["demo"], ["doctor"],
