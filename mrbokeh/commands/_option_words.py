@@ -46,7 +46,7 @@ PANELS = {
     "sensor-width shutter tilt prescription",
     "The opening": "axial-chromatic cat-eye curvature image inner lateral-chromatic levels path rotation shape "
     "spherical-aberration squeeze",
-    "The blur": "alpha-out highlights motion renderer residuals samples slices",
+    "The blur": "alpha-out highlights motion rank renderer residuals samples slices two-passes",
     "The kernels": "anisotropy cells counts density-per-m diameters far focal-px image-width longest-motion near near-lights "
     "pixels psf-picture rays regions smoothness symmetric",
     "Metres": "dictionary distance distance-at ground lens-calibration marker metric ruler square",

@@ -1,8 +1,8 @@
 """`mrbokeh render`: blur a picture with depth, or layers, as a lens does."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,6 +14,10 @@ from mrbokeh.renderers.choose import DEFAULT
 from mrbokeh.system.channel import tell
 from mrbokeh.system.errors import InputError
 
+if TYPE_CHECKING:
+    from mrbokeh.optics.lens import Lens
+    from mrbokeh.renderers.base import Renderer
+
 app = typer.Typer(add_completion=False)
 
 
@@ -22,11 +26,41 @@ class BlurOptions:
     """Renderer and its settings."""
 
     method: Annotated[str | None, typer.Option("--renderer", help=f"lrdm, {ANY_RENDERER}")] = None
-    slices: Annotated[int, typer.Option(help="How many slices of depth at most.", min=1)] = 16
+    slices: Annotated[int | None, typer.Option(help="How many slices of depth at most, where depth is sliced. Default: 16.", min=1)] = None
+    rank: Annotated[
+        int | None,
+        typer.Option(
+            help="With low-rank: at most so many separable terms a kernel, where it has 11 px or more. Default: as 10 % of error ask.",
+            min=1,
+            max=512,
+        ),
+    ] = None
+    two_passes: Annotated[
+        bool, typer.Option("--two-passes", help="With low-rank: McGraw's own two passes, whose width changes from pixel to pixel.")
+    ] = False
     threads: Annotated[int, typer.Option(help="Threads; 0 takes all cores. The result does not depend on it.", min=0, max=4096)] = 0
     device: Annotated[
         str, typer.Option(help="cuda, cuda:1 or cpu: --renderer laplacian or lrdm by torch there; without it compiled loops on the CPU.")
     ] = ""
+
+    def renderer_of(self, lens: Path | None) -> "tuple[Lens | None, Renderer]":
+        """Return lens and renderer of --lens and these options. Raises InputError for an option that the renderer does not have."""
+        from mrbokeh.layering.layering import Layering
+        from mrbokeh.renderers.choose import lens_and_renderer
+        from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
+
+        layering = Layering() if self.slices is None else Layering(slices=self.slices)
+        held, renderer = lens_and_renderer(lens, self.method, threads=self.threads, layering=layering, device=self.device)
+        if self.slices is not None and not hasattr(renderer, "layering"):
+            raise InputError("--slices is for renderers that cut depth into slices, and this one does not: leave it out")
+        if self.rank is None and not self.two_passes:
+            return held, renderer
+        if not isinstance(renderer, LowRankFilter):
+            raise InputError("--rank and --two-passes are of --renderer low-rank: give that too, or leave them out")
+        if renderer.bank is not None and self.rank is not None:
+            raise InputError("--rank is of an opening; the terms of a bank are kept beside it: leave --rank out, or give LENS.json")
+        terms = {} if self.rank is None else {"relative_error": 0.0, "max_rank": self.rank}
+        return held, replace(renderer, per_pixel=self.two_passes, **terms)
 
 
 @dataclass(frozen=True)
@@ -56,8 +90,7 @@ def render(
     """
     from mrbokeh.commands._render_inputs import focused, read_sharp, reconstructed
     from mrbokeh.images.image_io import INTEGER_SUFFIXES, require_suffix
-    from mrbokeh.layering.layering import Layering
-    from mrbokeh.renderers.choose import lens_and_renderer, spreads_light
+    from mrbokeh.renderers.choose import spreads_light
     from mrbokeh.system.atomic_files import require_safe_outputs
     from mrbokeh.system.console import working
 
@@ -70,8 +103,7 @@ def render(
     sharp = {} if given.samples is not None else read_sharp(given)
     if given.samples is not None and facts.given:
         raise InputError("--samples hold the blur of their own lens: leave --focal-length, --f-number and --sensor-width out")
-    layering = Layering(slices=blur.slices)
-    held, renderer = lens_and_renderer(lens, blur.method, threads=blur.threads, layering=layering, device=blur.device)
+    held, renderer = blur.renderer_of(lens)
     method = blur.method or (str(lens) if spreads_light(lens) else DEFAULT)
     # A network brings its lens.
     used = focused(facts.on(getattr(renderer, "lens", None) if held is None else held), sharp, focus)

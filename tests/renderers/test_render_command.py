@@ -64,6 +64,27 @@ def test_a_lens_can_be_told_in_options_instead_of_a_file(folder: Path) -> None:
     assert psnr(wide, by_options) < 40.0, "the f-number is heard"
 
 
+def test_terms_and_passes_of_low_rank_filters_can_be_told(folder: Path) -> None:
+    """The more terms, the nearer to exact kernels: with the focus at 0.3 m circles are 19 and 22 px wide."""
+    picture = ("--rgb", "aif.exr", "--depth", "z.exr", "--lens", "lens.json", "--focus", "0.3")
+    exact = read_image(run(folder, *picture, "--renderer", "scatter"))
+
+    def error(*words: str) -> float:
+        return float(
+            np.abs(read_image(run(folder, *picture, "--renderer", "low-rank", *words, "--overwrite", out="low.exr")) - exact).mean()
+        )
+
+    assert error("--rank", "1") > 2.0 * error("--rank", "3") > 2.0 * error("--rank", "12")
+    assert error("--two-passes") != error()
+    for words, told in (
+        (("--rank", "3"), "--rank and --two-passes are of --renderer low-rank"),
+        (("--renderer", "lrdm", "--slices", "4"), "--slices is for renderers that cut"),
+    ):
+        with pytest.raises(InputError, match=told):
+            run(folder, *picture, *words, out="none.exr")
+    assert not (folder / "none.exr").exists()
+
+
 def test_depth_may_be_even_in_dioptres(folder: Path) -> None:
     """White is 1 m, black infinity: half of it is 2 m."""
     levels = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
