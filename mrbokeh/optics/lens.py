@@ -13,6 +13,7 @@ from mrbokeh.system.errors import InputError
 
 MM_PER_M = 1000.0
 _STEEPEST_TILT_RAD = np.pi / 4
+_SAME = 1e-3
 _NEAR_IMAGE_DISTANCES = 20.0
 """Nearer than so many times the distance from lens to sensor, it shows whether a focus distance counts from the one or the other."""
 
@@ -29,6 +30,8 @@ class Lens:
       way up the sensor is meant, for photographs taken the other way up (`mrbokeh.stacks.photograph`), or None.
     petzval_radius_mm: radius of curvature of the surface in focus; positive bends it towards the camera away from the axis
       (as an uncorrected lens does, about 1.5 focal lengths), negative away from it, inf is flat.
+    widest_f_number: the smallest f-number to which it opens, with which `stating` another one closes the opening; None: it has any
+      f-number, and the opening is in proportion.
     spread_by: the bank of kernels or the network that it was read from, which spreads its light; None: any renderer, by the opening.
     """
 
@@ -40,6 +43,7 @@ class Lens:
     tilt_rad: tuple[float, float] = (0.0, 0.0)
     petzval_radius_mm: float = float("inf")
     sensor_height_mm: float | None = None
+    widest_f_number: float | None = None
     spread_by: Path | None = None
 
     def __post_init__(self) -> None:
@@ -115,10 +119,20 @@ class Lens:
         return float(x) / length, float(y) / length, 1.0 / length
 
     def stating(self, facts: Mapping[str, float]) -> "Lens":
-        """Return the lens with other facts, by their names; the height of its sensor keeps its proportion to the width."""
+        """Return the lens with other facts, by their names; the height of its sensor keeps its proportion to the width.
+
+        Of a lens with a widest f-number the rims stay where they are: cat-eyes shrink on a smaller sensor and behind a closed iris.
+        """
         width_mm = facts.get("sensor_width_mm", self.sensor_width_mm)
         height_mm = self.sensor_height_mm and self.sensor_height_mm * width_mm / self.sensor_width_mm
-        return replace(self, **{"sensor_height_mm": height_mm, **facts})  # type: ignore[arg-type]
+        stated = replace(self, **{"sensor_height_mm": height_mm, **facts})  # type: ignore[arg-type]
+        if self.widest_f_number is None:
+            return stated
+        if stated.f_number < self.widest_f_number * (1.0 - _SAME):
+            raise InputError(f"the lens opens to f/{self.widest_f_number:.3g}: expected an f-number of at least that, got {stated.f_number:g}")
+        closed = self.aperture.stopped_down(stated.f_number / self.f_number)
+        wider = width_mm / self.sensor_width_mm * self.focal_length_mm / stated.focal_length_mm
+        return replace(stated, aperture=replace(closed, rims=tuple((shift * wider, radius) for shift, radius in closed.rims)))
 
     def focused_at(self, focus_distance_m: float) -> "Lens":
         """Return the same lens focused at a distance in metres; inf is allowed."""
