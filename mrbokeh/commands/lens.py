@@ -20,13 +20,15 @@ if TYPE_CHECKING:
 class BankOptions:
     """Options of the models; None leaves a model's default."""
 
-    lens: Annotated[Path | None, typer.Option(help="Lens file whose opening is used (model simple; a disc without).")] = None
+    lens: Annotated[Path | None, typer.Option(help="Lens file, or a name of `lens list`, whose opening is used (model simple; a disc without).")] = None
     image: Annotated[Path | None, typer.Option("--psf-picture", help="The picture of a PSF (model stylized).")] = None
     diameter_px: Annotated[
         float | None, typer.Option("--diameter", max=4096.0, help="Largest circle of confusion in px (simple, combined, stylized).")
     ] = None
     motion_px: Annotated[float | None, typer.Option("--longest-motion", help="Longest motion in px per shutter (combined).")] = None
-    prescription: Annotated[Path | None, typer.Option(help="A .dat file of lens surfaces (model physical; a bi-convex lens without).")] = (
+    prescription: Annotated[
+        Path | None, typer.Option(help="A .dat file of lens surfaces, or a name of `lens list` (physical; else a bi-convex lens).")
+    ] = (
         None
     )
     focus_distance_m: Annotated[
@@ -141,6 +143,24 @@ def spreadlets(
 
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help="Make, inspect and draw lens files and banks of PSFs.")
+
+
+@app.command(name="list")
+def list_lenses() -> None:
+    """List the lenses of the library, which every --lens takes by name: focal length, widest f-number, what for, patent.
+
+    Example: mrbokeh lens list
+    """
+    from mrbokeh.optics.lens_library import all_lenses
+
+    lenses = [each.facts for each in all_lenses()]
+    rows = [(each["name"], f"{each['focal_length_mm']:.0f} mm", f"f/{each['widest_f_number']:.2g}", each["about"]) for each in lenses]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row, facts in zip(rows, lenses, strict=True):
+        aligned = "  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True))
+        tell(f"{aligned}  {facts['inventors']} {facts['year']}, {facts['patent']}")
+    tell("Use one as --lens NAME; its traced kernels: mrbokeh lens psf physical --prescription NAME --out BANK", lenses=lenses)
+
 
 SHAPES = {
     "disc": (),
@@ -257,7 +277,7 @@ def new(
 
 @app.command()
 def coc(
-    lens: Annotated[Path, typer.Argument(help="Lens file.")],
+    lens: Annotated[Path, typer.Argument(help="Lens file, or a name of `lens list`.")],
     depths: Annotated[list[float], typer.Argument(help="Depths in metres.")],
     width: Annotated[int, typer.Option("--image-width", help="Image width in pixels.")] = 1920,
 ) -> None:
@@ -276,7 +296,7 @@ def coc(
 
 
 def show(
-    lens: Annotated[Path, typer.Argument(help="Lens file, or the folder of a bank of PSFs.")],
+    lens: Annotated[Path, typer.Argument(help="Lens file, a name of `lens list`, or the folder of a bank of PSFs.")],
     out: Annotated[Path, typer.Option(help="The picture to write (.png, .pdf or .svg).")],
     width: Annotated[int, typer.Option("--image-width", min=16, help="Image width in pixels (of a lens file).")] = 1920,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT where it exists.")] = False,

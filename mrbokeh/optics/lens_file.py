@@ -37,6 +37,7 @@ from jaxtyping import Float32, Float64
 from mrbokeh.images.picture_codec import stored_pixels
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_library import shipped
 from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError, require_file
 
@@ -276,7 +277,11 @@ def stated_facts(lens: Lens) -> dict[str, Any]:
 
 
 def read_lens(path: Path | str) -> Lens:
-    """Read a lens file (LENS.json), with the opening that it names. Raises InputError where it does not describe a lens."""
+    """Read a lens file (LENS.json), with the opening that it names, or a lens of the library by its name.
+
+    Raises InputError where it does not describe a lens.
+    """
+    path = shipped(path)
     return lens_from_json(read_json(path, "a lens file (LENS.json)"), str(path), Path(path).parent)
 
 

@@ -17,11 +17,13 @@ from jaxtyping import Float64
 
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import stated_facts
+from mrbokeh.optics.lens_library import shipped
 from mrbokeh.optics.psf_bank import Axis, Turns
 from mrbokeh.psf_models import _physical_lens_numba as compiled
 from mrbokeh.psf_models._lens_beam import GREEN_UM, LensBeam, area_of
 from mrbokeh.psf_models.base import Kernel, centred, check_positive, digest, sobol_blocks
 from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface, estimated_abbe_number
+from mrbokeh.system.atomic_files import read_json
 from mrbokeh.system.errors import InputError
 
 
@@ -55,8 +57,11 @@ def read_prescription(path: Path | str) -> LensPrescription:
     Columns, in mm: radius (0: the stop; inf: flat), distance to the next surface, index n_d behind it (0: as before),
     aperture diameter; with five columns the Abbe number stands before the aperture (the order of Kolb et al. 1995).
     Where it is missing it is estimated (mrbokeh.psf_models.lens_prescription). InputError names the line that is not understood.
+    A name of the lens library, or a lens file that holds a prescription, gives that one.
     """
-    path = Path(path)
+    path = shipped(path)
+    if path.suffix.lower() == ".json":
+        return _of_lens_file(path)
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -69,6 +74,18 @@ def read_prescription(path: Path | str) -> LensPrescription:
             surfaces.append(_surface(words, surfaces[-1].index if surfaces else 1.0, surfaces[-1].abbe_number if surfaces else inf))
         except InputError as error:
             raise InputError(f"{path}, line {number}: {error}") from None
+    return with_estimated_abbe_numbers(LensPrescription(path.stem, tuple(surfaces)))
+
+
+def _of_lens_file(path: Path) -> LensPrescription:
+    document = read_json(path, "a lens file with a prescription")
+    rows = document.get("prescription", {}).get("surfaces") if isinstance(document, dict) else None
+    if not rows:
+        raise InputError(f"expected a lens file with the surfaces of a prescription, as `mrbokeh lens list` names them, got {path} without")
+    surfaces: list[Surface] = []
+    for row in rows:
+        words = ["inf" if each is None else repr(each) for each in row]
+        surfaces.append(_surface(words, surfaces[-1].index if surfaces else 1.0, surfaces[-1].abbe_number if surfaces else inf))
     return with_estimated_abbe_numbers(LensPrescription(path.stem, tuple(surfaces)))
 
 
