@@ -37,6 +37,7 @@ _ALONG = (np.arange(_CELLS * _FINER) + 0.5) / (_CELLS * _FINER) * 2.0 * _SPAN - 
 _X, _Y = np.meshgrid(_ALONG, _ALONG, indexing="ij")
 
 Cells = Float64[np.ndarray, "cells cells"]
+Kernel = Float64[np.ndarray, "size size"]
 
 
 @dataclass(frozen=True)
@@ -217,7 +218,7 @@ def _bend_mm(lens: Lens, light: TracedLight) -> float:
     return float(per_dioptre_mm * slope**2 * MM_PER_M / (2.0 * lens.petzval_radius_mm))
 
 
-def _traced_px(light: TracedLight, channel: int, side: int) -> Cells:
+def _traced_px(light: TracedLight, channel: int, side: int) -> Kernel:
     """Return a kernel (K, K) of the light of a colour, in front of the focus mirrored through the middle, as pictures show it."""
     x_px, y_px = (light.u[:, channel, :] * (0.5 * side * _HELD_OUT_PX)).T
     weights = light.weights[:, channel]
@@ -228,5 +229,5 @@ def _traced_px(light: TracedLight, channel: int, side: int) -> Cells:
     return np.asarray(counted / counted.sum())
 
 
-def _padded(kernel: Cells, size: int) -> Cells:
+def _padded(kernel: Kernel, size: int) -> Float64[np.ndarray, "wide wide"]:
     return np.pad(kernel, (size - len(kernel)) // 2)
