@@ -26,7 +26,9 @@ HELD_OUT_FIELDS, HELD_OUT_DEPTHS = (0.2, 0.5, 0.85), (0.75, 3.0)
 
 def main() -> None:
     """Describe the lenses of the names given, or all."""
-    print("| lens | focal length, stated (mm) | f-number, stated | light in the corner | distortion | axial colour (mm) | misplaced | disc |")
+    print(
+        "| lens | focal length, stated (mm) | f-number, stated | light in the corner | distortion | axial colour (mm) | misplaced | disc |"
+    )
     print("|---|---|---|---|---|---|---|---|")
     for name in sys.argv[1:] or names():
         path = FOLDER / f"{name}.json"

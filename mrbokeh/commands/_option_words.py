@@ -3,6 +3,8 @@
 from types import SimpleNamespace
 from typing import Any
 
+from mrbokeh.optics.lens_library import names
+
 FEW = 9
 """A command with no more options shows them on one panel."""
 
@@ -112,6 +114,8 @@ CHOICES = {
     "viewfinder calibrate-phone source": "gphoto2 whip test folder:",
     "capture ingest white-balance": "camera",
     "lens psf model": "simple combined physical volume stylized",
+    "lens": " ".join(names()),
+    "prescription": " ".join(names()),
 }
 """Values that the shell completes, of an option in all commands or in one; where none fits, it completes files."""
 

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 class BankOptions:
     """Options of the models; None leaves a model's default."""
 
-    lens: Annotated[Path | None, typer.Option(help="Lens file, or a name of `lens list`, whose opening is used (model simple; a disc without).")] = None
+    lens: Annotated[
+        Path | None, typer.Option(help="Lens file, or a name of `lens list`, whose opening is used (model simple; a disc without).")
+    ] = None
     image: Annotated[Path | None, typer.Option("--psf-picture", help="The picture of a PSF (model stylized).")] = None
     diameter_px: Annotated[
         float | None, typer.Option("--diameter", max=4096.0, help="Largest circle of confusion in px (simple, combined, stylized).")
@@ -28,9 +30,7 @@ class BankOptions:
     motion_px: Annotated[float | None, typer.Option("--longest-motion", help="Longest motion in px per shutter (combined).")] = None
     prescription: Annotated[
         Path | None, typer.Option(help="A .dat file of lens surfaces, or a name of `lens list` (physical; else a bi-convex lens).")
-    ] = (
-        None
-    )
+    ] = None
     focus_distance_m: Annotated[
         float | None, typer.Option("--focus", help="Where the lens is focused in metres, inf is allowed (physical; else 2 m).")
     ] = None

@@ -131,7 +131,9 @@ class Lens:
         if self.widest_f_number is None:
             return stated
         if stated.f_number < self.widest_f_number * (1.0 - _MARKED_WITHIN):
-            raise InputError(f"the lens opens to f/{self.widest_f_number:.3g}: expected an f-number of at least that, got {stated.f_number:g}")
+            raise InputError(
+                f"the lens opens to f/{self.widest_f_number:.3g}: expected an f-number of at least that, got {stated.f_number:g}"
+            )
         stated = replace(stated, f_number=max(stated.f_number, self.widest_f_number))
         wider = width_mm / self.sensor_width_mm * self.focal_length_mm / stated.focal_length_mm
         return replace(stated, aperture=_closed(self.aperture, stated.f_number / self.f_number, wider))
@@ -237,7 +239,7 @@ class Lens:
 
 @lru_cache(maxsize=64)
 def _closed(aperture: Aperture, ratio: float, wider: float) -> Aperture:
-    """Return an opening closed by a ratio on a sensor so many times as wide; the same object for the same one, which keeps what it `seen`."""
+    """Return an opening closed by a ratio, on a sensor so many times as wide; always the same object, which keeps what was `seen` of it."""
     closed = aperture.stopped_down(ratio)
     return closed if wider == 1.0 else replace(closed, rims=tuple((shift * wider, radius) for shift, radius in closed.rims))
 

@@ -2,8 +2,8 @@
 
 A prescription states: `about` what the lens is for; `patent`, `inventors`, `year` and `source`, from where its figures come; the focal
 length and f-number that the patent states (scaled as the surfaces are); `closest_focus_m`, from the sensor, of a lens built to it, or
-null; `surfaces`, columns as in `mrbokeh.psf_models.physical_lens.read_prescription`, radius null for a flat one; `clear_diameters`, how they
-are known. `measured` is what the makers of the file computed (`python -m datasets_scripts.lens_library`): the light of a corner
+null; `surfaces`, columns as in `mrbokeh.psf_models.physical_lens.read_prescription`, radius null for a flat one; `clear_diameters`, how
+they are known. `measured` is what the makers of the file computed (`python -m datasets_scripts.lens_library`): the light of a corner
 as a share of the middle's, distortion in the corner, axial colour, and how much light the description misplaces (docs/lens_library.md).
 """
 
@@ -62,4 +62,6 @@ def shipped(path: Path | str) -> Path:
     if len(path.parts) != 1:
         return path
     near = difflib.get_close_matches(path.name.lower(), known, _NEAREST_NAMES, 0.4) or known[:_NEAREST_NAMES]
-    raise InputError(f"expected a lens file or a name of the lens library such as {', '.join(near)}, got {path.name!r}: `mrbokeh lens list` shows all")
+    raise InputError(
+        f"expected a lens file or a name of the lens library such as {', '.join(near)}, got {path.name!r}: `mrbokeh lens list` shows all"
+    )

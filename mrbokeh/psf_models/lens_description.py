@@ -96,7 +96,7 @@ class Bench:
 
 @dataclass(frozen=True)
 class Opening:
-    """What is fitted: two rims as (shift, radius), the weight over the pupil, the size of the blur of each side, the bent field.
+    """Opening that is fitted: two rims as (shift, radius), the weight over the pupil, the size of the blur of each side, the bent field.
 
     smaller_behind: the circle of confusion is so much smaller behind the focus and larger in front. bend_mm: added to it in a corner.
     """

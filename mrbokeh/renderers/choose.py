@@ -1,7 +1,8 @@
 """Lenses and the renderers of their blur; the only module that knows them all.
 
-A lens is a description (LENS.json, or a name of the lens library), whose opening any renderer spreads light by, a bank of kernels (a folder) or a network (.onnx).
-The last two have their own ways of spreading light, which travel with the `Lens` as the path in `Lens.spread_by`.
+A lens is a description (LENS.json, or a name of the lens library), whose opening any renderer spreads light by, a bank of kernels (a
+folder) or a network (.onnx). The last two have their own ways of spreading light, which travel with the `Lens` as the path in
+`Lens.spread_by`.
 """
 
 import logging
@@ -109,7 +110,9 @@ def lens_and_renderer(
 
 
 def read_lens(path: Path | str) -> Lens:
-    """Read a lens: a description (LENS.json, or a name of the lens library), a bank of PSFs (its folder) or a network (.onnx), which keep their own blur.
+    """Read a lens: a description (LENS.json, or a name of the library), a bank of PSFs (its folder) or a network (.onnx).
+
+    The last two keep their own blur.
 
     A bank that does not say which lens it was made for gives that of `Lens.default` with its opening: `Lens.stating` says more. Raises
     InputError where it is none.
