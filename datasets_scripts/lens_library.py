@@ -1,6 +1,7 @@
 """Describe the lenses of the library by their prescriptions again: fills in the lens files of mrbokeh/lens_data and prints their table.
 
     python -m datasets_scripts.lens_library [NAME ...]
+    python -m datasets_scripts.lens_library --sheet docs/pictures/lens_library.jpg
 
 Only "prescription" of a file is written by hand; all else comes from there (`mrbokeh.psf_models.lens_description`). The error is
 measured at places of the field and depths that the fit has not seen.
@@ -10,10 +11,12 @@ import json
 import sys
 from typing import Any
 
+import cv2
 import numpy as np
 
+from mrbokeh.images.color import srgb_codes
 from mrbokeh.optics.lens import Lens
-from mrbokeh.optics.lens_file import lens_to_json
+from mrbokeh.optics.lens_file import lens_to_json, read_lens
 from mrbokeh.optics.lens_library import FOLDER, names
 from mrbokeh.psf_models.lens_description import FOCUS_IN_FOCAL_LENGTHS, Bench, describe, misplaced_light
 from mrbokeh.psf_models.lens_prescription import LensPrescription
@@ -25,7 +28,10 @@ HELD_OUT_FIELDS, HELD_OUT_DEPTHS = (0.2, 0.5, 0.85), (0.75, 3.0)
 
 
 def main() -> None:
-    """Describe the lenses of the names given, or all."""
+    """Describe the lenses of the names given, or all; or draw the sheet of their blur."""
+    if sys.argv[1:2] == ["--sheet"]:
+        cv2.imwrite(sys.argv[2], np.ascontiguousarray(srgb_codes(sheet(), np.uint8)[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])
+        return
     print(
         "| lens | focal length, stated (mm) | f-number, stated | light in the corner | distortion | axial colour (mm) | misplaced | disc |"
     )
@@ -77,6 +83,39 @@ def row(name: str, lens: Lens, prescription: dict[str, Any]) -> str:
         f"{figures['corner_light']:.0%} | {figures['distortion']:+.1%} | {figures['axial_colour_mm']:+.2f} | {figures['misplaced']:.0%} | "
         f"{figures['misplaced_by_a_disc']:.0%} |"
     )
+
+
+_CELL_PX, _DISC_PX, _LABEL_PX, _QUALITY = 60, 44, 150, 50
+_SHOWN = ((1, 0.0), (1, 0.35), (1, 0.7), (1, 1.0), (-1, 0.0), (-1, 0.5), (-1, 1.0))
+"""Side of the focus, and place to the right of the middle in half diagonals."""
+
+
+def sheet() -> np.ndarray:
+    """Return a picture (H, W, 3) of the blur of every lens: behind the focus from the middle to a corner on the right, then in front."""
+    rows = [_strip(name) for name in names()]
+    half = (len(rows) + 1) // 2
+    rows += [np.zeros_like(rows[0])] * (2 * half - len(rows))
+    return np.concatenate([np.concatenate(rows[:half]), np.concatenate(rows[half:])], axis=1)
+
+
+def _strip(name: str) -> np.ndarray:
+    lens = read_lens(name)
+    written = np.zeros((_CELL_PX, _LABEL_PX), np.uint8)
+    cv2.putText(written, name, (8, _CELL_PX // 2 + 5), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (200,), 1, cv2.LINE_AA)
+    label = np.repeat(written[..., None].astype(np.float32) / 255.0, 3, axis=2)
+    return np.concatenate([label, *(_blurred(lens, side, place) for side, place in _SHOWN)], axis=1)
+
+
+def _blurred(lens: Lens, side: int, place: float) -> np.ndarray:
+    cell = np.zeros((_CELL_PX, _CELL_PX, 3), np.float32)
+    for channel in range(3):
+        opening = lens.aperture.seen(side, (place, 0.0), channel)
+        kernel = opening.rasterize(side * _DISC_PX * lens.aperture.channel_scale(side)[channel]).kernel
+        over = max(0, (len(kernel) - _CELL_PX + 1) // 2)
+        kernel = kernel[over : len(kernel) - over, over : len(kernel) - over]
+        top = (_CELL_PX - len(kernel)) // 2
+        cell[top : top + len(kernel), top : top + len(kernel), channel] = kernel * (0.25 * np.pi * _DISC_PX**2 * 0.35)
+    return np.clip(cell, 0.0, 1.0)
 
 
 if __name__ == "__main__":
