@@ -45,7 +45,7 @@ PANELS = {
     "Its light": "environment exposure shadow",
     "Its look": "grain grey-value light-wrap match-black match-exposure match-grey match-white plate-exposure vignetting seed",
     "The lens": "distortion f-number focal-length focus focus-at focus-pull lens petzval-radius readout same-view sensor-height "
-    "sensor-width shutter tilt prescription",
+    "sensor-width sharpest shutter tilt prescription",
     "The opening": "axial-chromatic cat-eye curvature image inner lateral-chromatic levels path rotation shape "
     "spherical-aberration squeeze",
     "The blur": "alpha-out highlights motion renderer residuals samples slices",

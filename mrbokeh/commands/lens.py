@@ -49,6 +49,10 @@ class BankOptions:
     vignetting: Annotated[
         bool | None, typer.Option("--no-vignetting", help="Kernels do not darken off the axis (physical; else they do).")
     ] = None
+    sharpest: Annotated[
+        bool | None,
+        typer.Option("--sharpest", help="The sensor is where a point at --focus is smallest, not its paraxial image (physical)."),
+    ] = None
     density_per_m: Annotated[float | None, typer.Option(help="Collisions per metre (volume; else 0.9).")] = None
     anisotropy: Annotated[float | None, typer.Option(help="Henyey-Greenstein's g, -1 to 1 (volume; else 0.8).")] = None
     focal_px: Annotated[float | None, typer.Option(help="Focal length of the picture in px (volume; else 1024).")] = None
@@ -66,7 +70,13 @@ class BankOptions:
 
         counts = None if self.counts is None else _steps(self.counts)
         return ModelOptions(
-            **vars(self) | {"counts": counts, "device": self.device or None, "vignetting": False if self.vignetting else None}
+            **vars(self)
+            | {
+                "counts": counts,
+                "device": self.device or None,
+                "vignetting": False if self.vignetting else None,
+                "sharpest": self.sharpest or None,
+            }
         )
 
 
@@ -159,7 +169,7 @@ def list_lenses() -> None:
     for row, facts in zip(rows, lenses, strict=True):
         aligned = "  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True))
         tell(f"{aligned}  {facts['inventors']} {facts['year']}, {facts['patent']}")
-    tell("Use one as --lens NAME; its traced kernels: mrbokeh lens psf physical --prescription NAME --out BANK", lenses=lenses)
+    tell("Use one as --lens NAME; its traced kernels: mrbokeh lens psf physical --prescription NAME --sharpest --out BANK", lenses=lenses)
 
 
 SHAPES = {

@@ -22,6 +22,7 @@ from mrbokeh.optics.psf_bank import Axis, Turns
 from mrbokeh.psf_models import _physical_lens_numba as compiled
 from mrbokeh.psf_models._lens_beam import GREEN_UM, LensBeam, area_of
 from mrbokeh.psf_models.base import Kernel, centred, check_positive, digest, sobol_blocks
+from mrbokeh.psf_models.lens_description import Bench
 from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface, estimated_abbe_number
 from mrbokeh.system.atomic_files import read_json
 from mrbokeh.system.errors import InputError
@@ -162,7 +163,8 @@ class PhysicalLens:
     prescription: itself or a file of surfaces. focus_distance_m: the sensor is moved to where the paraxial green image of
     this distance lies. f_number: closes the iris, None leaves it open. sensor_mm: width and height. nearest_m, farthest_m: range
     of depth of a bank. vignetting: a kernel sums to the open share of its beam (`throughput`), not to 1. counts: steps of
-    the nested grid along depth and eccentricity.
+    the nested grid along depth and eccentricity. sharpest: the sensor stands where green light of a point at the focus distance is
+    smallest, as a photographer focuses, instead.
     The range of eccentricity ends where the lens goes black if that is before the corner.
     """
 
@@ -184,20 +186,24 @@ class PhysicalLens:
         nearest_m: float = 0.5,
         farthest_m: float = 100.0,
         vignetting: bool = True,
+        sharpest: bool = False,
         counts: tuple[int, ...] = COUNTS,
         device: str = "",
     ) -> None:
         lens = read_prescription(prescription) if isinstance(prescription, (Path, str)) else prescription or biconvex_lens()
         self.lens = lens if f_number is None else lens.stopped_down(f_number)
         self.focus_distance_m, self.vignetting, self.counts, self.device = focus_distance_m, vignetting, counts, device
+        self.sharpest = sharpest
         width_mm, height_mm = (check_positive("the sensor's width and height in mm", size) for size in sensor_mm)
         self.stated = Lens(self.lens.focal_length_mm, self.lens.f_number, focus_distance_m, width_mm, sensor_height_mm=height_mm)
         self.mm_per_px = width_mm / check_positive("the picture's width in pixels", float(image_width_px))
         self._depth = Axis("depth_m", check_positive("the nearest depth", nearest_m), farthest_m, EXPONENTS[0])
-        sensor_at_mm = self.lens.paraxial_at(GREEN_UM).sensor_mm(focus_distance_m)
-        if not sensor_at_mm > self.lens.vertices_mm[-1]:
+        half_diagonal_mm = 0.5 * float(np.hypot(width_mm, height_mm))
+        self.beam = LensBeam(self.lens, self.lens.paraxial_at(GREEN_UM).sensor_mm(focus_distance_m), half_diagonal_mm)
+        if sharpest:
+            self.beam = Bench(self.lens, focus_distance_m, half_diagonal_mm).beam
+        if not self.beam.sensor_at_mm > self.lens.vertices_mm[-1]:
             raise InputError(f"{self.lens.name} forms its image inside its own glass: no sensor fits there")
-        self.beam = LensBeam(self.lens, sensor_at_mm, 0.5 * float(np.hypot(width_mm, height_mm)))
         self._ends_per_mm = self._per_mm(np.array([nearest_m, farthest_m]))
 
     @cached_property
@@ -216,6 +222,7 @@ class PhysicalLens:
             "half_diagonal_mm": self.beam.half_diagonal_mm,
             "mm_per_px": self.mm_per_px,
             "vignetting": self.vignetting,
+            **({"sharpest": True} if self.sharpest else {}),
         }
 
     def exact(self, coords: Float64[np.ndarray, " axes"]) -> Kernel | None:  # noqa: ARG002

@@ -16,7 +16,7 @@ from mrbokeh.optics.lens_file import read_lens, write_lens
 from mrbokeh.optics.lens_library import FOLDER, all_lenses, names, shipped
 from mrbokeh.psf_models import lens_description
 from mrbokeh.psf_models.lens_description import FOCUS_IN_FOCAL_LENGTHS, Bench, TracedLight, misplaced_light
-from mrbokeh.psf_models.physical_lens import read_prescription
+from mrbokeh.psf_models.physical_lens import PhysicalLens, read_prescription
 from mrbokeh.renderers.choose import files_of, lens_and_renderer
 from mrbokeh.system.errors import InputError
 from tests.support.command_line import mrbokeh
@@ -112,6 +112,18 @@ def test_descriptions_beat_a_disc_where_they_were_not_fitted(monkeypatch: pytest
     made = lens_description.describe(prescription, iris_blades=9)
     assert misplaced_light(made, light) < 0.7 * misplaced_light(disc, light)
     assert (made.focal_length_mm, made.widest_f_number, made.aperture.iris_blades) == (kept.focal_length_mm, kept.widest_f_number, 9)
+
+
+def test_the_sharpest_focus_is_sharper_than_the_paraxial_one() -> None:
+    """Mean radius of green light on the axis of the f/1.4 lens, by kernels: three times smaller where a photographer focuses."""
+    spots_px = []
+    for sharpest in (False, True):
+        model = PhysicalLens("fast-50", focus_distance_m=2.0, image_width_px=7200, nearest_m=1.0, farthest_m=10.0, sharpest=sharpest)
+        kernel = model.kernel(np.array([[2.0, 2.0], [0.0, 0.0]]), 1 << 12, 0)[..., 1]
+        y, x = np.indices(kernel.shape) - len(kernel) // 2
+        spots_px.append(float((np.hypot(x, y) * kernel).sum() / kernel.sum()))
+        assert ("sharpest" in model.settings) is sharpest
+    assert spots_px[1] < spots_px[0] / 3.0
 
 
 def test_light_of_an_ideal_lens_is_all_in_its_place() -> None:
