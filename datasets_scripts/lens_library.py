@@ -18,13 +18,11 @@ from mrbokeh.images.color import srgb_codes
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import lens_to_json, read_lens
 from mrbokeh.optics.lens_library import FOLDER, names
-from mrbokeh.psf_models.lens_description import FOCUS_IN_FOCAL_LENGTHS, Bench, describe, misplaced_light
+from mrbokeh.psf_models.lens_description import Bench, describe, held_out_error
 from mrbokeh.psf_models.lens_prescription import LensPrescription
 from mrbokeh.psf_models.physical_lens import read_prescription
 
 SENSOR_MM = (36.0, 24.0)
-HELD_OUT_FIELDS, HELD_OUT_DEPTHS = (0.2, 0.5, 0.85), (0.75, 3.0)
-"""Places in half diagonals, and depths in focus distances."""
 
 
 def main() -> None:
@@ -49,18 +47,15 @@ def main() -> None:
 def measured(prescription: LensPrescription, lens: Lens) -> dict[str, float]:
     """Return the figures of a lens that its description does not hold, and the light that the description and a plain disc misplace."""
     half_diagonal_mm = 0.5 * float(np.hypot(*SENSOR_MM))
-    far, focus_m = Bench(prescription, np.inf, half_diagonal_mm), FOCUS_IN_FOCAL_LENGTHS * prescription.focal_length_mm / 1000.0
-    near = Bench(prescription, focus_m, half_diagonal_mm)
-    lights = [near.light(share * focus_m, each) for share in HELD_OUT_DEPTHS for each in HELD_OUT_FIELDS]
-    disc = Lens(lens.focal_length_mm, lens.f_number, lens.focus_distance_m)
+    far, misplaced = Bench(prescription, np.inf, half_diagonal_mm), held_out_error(prescription, lens)
     ray = far.beam.chief_ray(1.0)
     slope = abs(ray[3] / ray[4])
     return {
         "corner_light": round(far.beam.open_share(0.0, 1.0) / (1.0 + slope**2) ** 2, 2),
         "distortion": round(half_diagonal_mm / (prescription.focal_length_mm * slope) - 1.0, 4),
         "axial_colour_mm": round(prescription.axial_colour_mm, 3),
-        "misplaced": round(float(np.mean([misplaced_light(lens, each) for each in lights])), 3),
-        "misplaced_by_a_disc": round(float(np.mean([misplaced_light(disc, each) for each in lights])), 3),
+        "misplaced": round(misplaced[0], 3),
+        "misplaced_by_a_disc": round(misplaced[1], 3),
     }
 
 

@@ -22,6 +22,7 @@ EVERYDAY = {
     "train ablate": "out table minutes dry-run",
     "lens new": "focal-length f-number focus sensor-width blades overwrite",
     "lens psf": "out lens diameter overwrite",
+    "lens describe": "out f-number blades overwrite",
     "lens fit": "out lights overwrite",
     "lens match": "out evidence focus f-number overwrite",
     "render": "out rgb depth lens focus focus-at",

@@ -286,6 +286,44 @@ def new(
 
 
 @app.command()
+def describe(
+    prescription: Annotated[Path, typer.Argument(help="A .dat file of lens surfaces, or a name of `lens list`.")],
+    out: Annotated[Path, typer.Option(help="The lens file to write, e.g. lens.json.")],
+    f_number: Annotated[float | None, typer.Option(help="Widest f-number, where that is not the one of the table's stop.")] = None,
+    sensor_width: Annotated[float, typer.Option(help="Width in mm of the sensor with the camera held level.")] = 36.0,
+    sensor_height: Annotated[float, typer.Option(help="Its height in mm.")] = 24.0,
+    blades: Annotated[int, typer.Option(help="Blades of the iris, which show once it closes; 0 is a round one.")] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file where it exists.")] = False,
+) -> None:
+    """Describe a lens by its prescription: rims, bright and soft blur, colours and curved field of traced rays become a lens file.
+
+    Example: mrbokeh lens describe dgauss.50mm.dat --blades 8 --out double_gauss.json
+    """
+    from mrbokeh.images.image_io import require_suffix
+    from mrbokeh.optics.lens_file import write_lens
+    from mrbokeh.psf_models.lens_description import describe as described
+    from mrbokeh.psf_models.lens_description import held_out_error
+    from mrbokeh.psf_models.physical_lens import read_prescription
+    from mrbokeh.system.atomic_files import require_safe_outputs
+    from mrbokeh.system.console import working
+
+    require_suffix(out, (".json",), "LENS")
+    require_safe_outputs((out,), (prescription,), overwrite)
+    traced = read_prescription(prescription)
+    traced = traced if f_number is None else traced.stopped_down(f_number)
+    with working("tracing"):
+        lens = described(traced, (sensor_width, sensor_height), blades)
+        misplaced, by_a_disc = held_out_error(traced, lens)
+    write_lens(out, lens)
+    tell(
+        f"wrote {out}: {lens.focal_length_mm:.4g} mm f/{lens.f_number:.3g}; it misplaces {misplaced:.0%} of a point's light, a round "
+        f"opening {by_a_disc:.0%}",
+        misplaced=misplaced,
+        misplaced_by_a_disc=by_a_disc,
+    )
+
+
+@app.command()
 def coc(
     lens: Annotated[Path, typer.Argument(help="Lens file, or a name of `lens list`.")],
     depths: Annotated[list[float], typer.Argument(help="Depths in metres.")],

@@ -193,6 +193,21 @@ def _field_radius_mm(bench: Bench, bend_mm: float) -> float:
 
 
 _HELD_OUT_PX = 48.0
+HELD_OUT_FIELDS, HELD_OUT_DEPTHS = (0.2, 0.5, 0.85), (0.75, 3.0)
+"""Places in half diagonals, and depths in focus distances, that the fit does not see."""
+
+
+def held_out_error(prescription: LensPrescription, lens: Lens) -> tuple[float, float]:
+    """Return the share of light that a description of a prescription misplaces where it was not fitted, and that a plain disc does."""
+    bench = Bench(prescription, lens.focus_distance_m, _half_diagonal_mm(lens))
+    lights = [bench.light(share * lens.focus_distance_m, each) for share in HELD_OUT_DEPTHS for each in HELD_OUT_FIELDS]
+    disc = Lens(lens.focal_length_mm, lens.f_number, lens.focus_distance_m, lens.sensor_width_mm)
+    of_lens, of_disc = (float(np.mean([misplaced_light(each, light) for light in lights])) for each in (lens, disc))
+    return of_lens, of_disc
+
+
+def _half_diagonal_mm(lens: Lens) -> float:
+    return 0.5 * float(np.hypot(lens.sensor_width_mm, lens.sensor_height_mm or lens.sensor_width_mm * 2.0 / 3.0))
 
 
 def misplaced_light(lens: Lens, light: TracedLight) -> float:
@@ -212,8 +227,7 @@ def misplaced_light(lens: Lens, light: TracedLight) -> float:
 
 
 def _bend_mm(lens: Lens, light: TracedLight) -> float:
-    half_diagonal_mm = 0.5 * float(np.hypot(lens.sensor_width_mm, lens.sensor_height_mm or lens.sensor_width_mm * 2.0 / 3.0))
-    slope = light.eccentricity * half_diagonal_mm / lens.image_distance_mm
+    slope = light.eccentricity * _half_diagonal_mm(lens) / lens.image_distance_mm
     per_dioptre_mm = lens.coc_px_per_dioptre(round(lens.sensor_width_mm))
     return float(per_dioptre_mm * slope**2 * MM_PER_M / (2.0 * lens.petzval_radius_mm))
 
