@@ -43,7 +43,9 @@ def viewfinder(
     ] = None,
     lens: Annotated[
         list[Path] | None,
-        typer.Option(help="LENS.json, a bank of PSFs (folder) or NETWORK.onnx (repeat: the page switches between them); else the scene's."),
+        typer.Option(
+            help="LENS.json, a name of `lens list`, a bank (folder) or NETWORK.onnx (repeat: the page switches); else the scene's."
+        ),
     ] = None,
     renderer: Annotated[
         list[str] | None,

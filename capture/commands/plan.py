@@ -76,8 +76,6 @@ def planned_for(
     path: Path | None, focal_length: float | None, f_number: float | None, sensor_width: float | None, focus_m: float
 ) -> "Lens":
     """Return the lens of a file, or of three numbers; an f-number goes before the file's."""
-    from dataclasses import replace
-
     from mrbokeh.optics.lens import Lens
     from mrbokeh.renderers.choose import read_lens
 
@@ -85,7 +83,7 @@ def planned_for(
         if focal_length is not None or sensor_width is not None:
             raise InputError("the lens file states focal length and sensor width: leave --focal-length and --sensor-width out")
         lens = read_lens(path)
-        return lens if f_number is None else replace(lens, f_number=f_number)
+        return lens if f_number is None else lens.stating({"f_number": f_number})
     if focal_length is None or f_number is None or sensor_width is None:
         raise InputError("give a lens file, or --focal-length, --f-number and --sensor-width")
     return Lens(focal_length, f_number, focus_m, sensor_width)

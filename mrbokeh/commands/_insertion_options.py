@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mrbokeh.scene.staging.filming import Filming
 
 
-ANY_LENS = "LENS.json, a bank of PSFs (its folder) or a network (.onnx)"
+ANY_LENS = "LENS.json, a name of `mrbokeh lens list`, a bank of PSFs (its folder) or a network (.onnx)"
 ANY_RENDERER = (
     "polygon, low-rank, scatter, laplacian, a network (.onnx) or a bank (folder). Default: --lens if a network or bank, else polygon."
 )

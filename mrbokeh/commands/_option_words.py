@@ -3,6 +3,8 @@
 from types import SimpleNamespace
 from typing import Any
 
+from mrbokeh.optics.lens_library import names
+
 FEW = 9
 """A command with no more options shows them on one panel."""
 
@@ -20,6 +22,7 @@ EVERYDAY = {
     "train ablate": "out table minutes dry-run",
     "lens new": "focal-length f-number focus sensor-width blades overwrite",
     "lens psf": "out lens diameter overwrite",
+    "lens describe": "out f-number blades overwrite",
     "lens fit": "out lights overwrite",
     "lens match": "out evidence focus f-number overwrite",
     "render": "out rgb depth lens focus focus-at",
@@ -43,7 +46,7 @@ PANELS = {
     "Its light": "environment exposure shadow",
     "Its look": "grain grey-value light-wrap match-black match-exposure match-grey match-white plate-exposure vignetting seed",
     "The lens": "distortion f-number focal-length focus focus-at focus-pull lens petzval-radius readout same-view sensor-height "
-    "sensor-width shutter tilt prescription",
+    "sensor-width sharpest shutter tilt prescription",
     "The opening": "axial-chromatic cat-eye curvature image inner lateral-chromatic levels path rotation shape "
     "spherical-aberration squeeze",
     "The blur": "alpha-out highlights motion rank renderer residuals samples slices two-passes",
@@ -112,6 +115,8 @@ CHOICES = {
     "viewfinder calibrate-phone source": "gphoto2 whip test folder:",
     "capture ingest white-balance": "camera",
     "lens psf model": "simple combined physical volume stylized",
+    "lens": " ".join(names()),
+    "prescription": " ".join(names()),
 }
 """Values that the shell completes, of an option in all commands or in one; where none fits, it completes files."""
 

@@ -20,15 +20,17 @@ if TYPE_CHECKING:
 class BankOptions:
     """Options of the models; None leaves a model's default."""
 
-    lens: Annotated[Path | None, typer.Option(help="Lens file whose opening is used (model simple; a disc without).")] = None
+    lens: Annotated[
+        Path | None, typer.Option(help="Lens file, or a name of `lens list`, whose opening is used (model simple; a disc without).")
+    ] = None
     image: Annotated[Path | None, typer.Option("--psf-picture", help="The picture of a PSF (model stylized).")] = None
     diameter_px: Annotated[
         float | None, typer.Option("--diameter", max=4096.0, help="Largest circle of confusion in px (simple, combined, stylized).")
     ] = None
     motion_px: Annotated[float | None, typer.Option("--longest-motion", help="Longest motion in px per shutter (combined).")] = None
-    prescription: Annotated[Path | None, typer.Option(help="A .dat file of lens surfaces (model physical; a bi-convex lens without).")] = (
-        None
-    )
+    prescription: Annotated[
+        Path | None, typer.Option(help="A .dat file of lens surfaces, or a name of `lens list` (physical; else a bi-convex lens).")
+    ] = None
     focus_distance_m: Annotated[
         float | None, typer.Option("--focus", help="Where the lens is focused in metres, inf is allowed (physical; else 2 m).")
     ] = None
@@ -47,6 +49,10 @@ class BankOptions:
     vignetting: Annotated[
         bool | None, typer.Option("--no-vignetting", help="Kernels do not darken off the axis (physical; else they do).")
     ] = None
+    sharpest: Annotated[
+        bool | None,
+        typer.Option("--sharpest", help="The sensor is where a point at --focus is smallest, not its paraxial image (physical)."),
+    ] = None
     density_per_m: Annotated[float | None, typer.Option(help="Collisions per metre (volume; else 0.9).")] = None
     anisotropy: Annotated[float | None, typer.Option(help="Henyey-Greenstein's g, -1 to 1 (volume; else 0.8).")] = None
     focal_px: Annotated[float | None, typer.Option(help="Focal length of the picture in px (volume; else 1024).")] = None
@@ -64,7 +70,13 @@ class BankOptions:
 
         counts = None if self.counts is None else _steps(self.counts)
         return ModelOptions(
-            **vars(self) | {"counts": counts, "device": self.device or None, "vignetting": False if self.vignetting else None}
+            **vars(self)
+            | {
+                "counts": counts,
+                "device": self.device or None,
+                "vignetting": False if self.vignetting else None,
+                "sharpest": self.sharpest or None,
+            }
         )
 
 
@@ -141,6 +153,24 @@ def spreadlets(
 
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help="Make, inspect and draw lens files and banks of PSFs.")
+
+
+@app.command(name="list")
+def list_lenses() -> None:
+    """List the lenses of the library, which every --lens takes by name: focal length, widest f-number, what for, patent.
+
+    Example: mrbokeh lens list
+    """
+    from mrbokeh.optics.lens_library import all_lenses
+
+    lenses = [each.facts for each in all_lenses()]
+    rows = [(each["name"], f"{each['focal_length_mm']:.0f} mm", f"f/{each['widest_f_number']:.2g}", each["about"]) for each in lenses]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row, facts in zip(rows, lenses, strict=True):
+        aligned = "  ".join(word.ljust(width) for word, width in zip(row, widths, strict=True))
+        tell(f"{aligned}  {facts['inventors']} {facts['year']}, {facts['patent']}")
+    tell("Use one as --lens NAME; its traced kernels: mrbokeh lens psf physical --prescription NAME --sharpest --out BANK", lenses=lenses)
+
 
 SHAPES = {
     "disc": (),
@@ -256,8 +286,46 @@ def new(
 
 
 @app.command()
+def describe(
+    prescription: Annotated[Path, typer.Argument(help="A .dat file of lens surfaces, or a name of `lens list`.")],
+    out: Annotated[Path, typer.Option(help="The lens file to write, e.g. lens.json.")],
+    f_number: Annotated[float | None, typer.Option(help="Widest f-number, where that is not the one of the table's stop.")] = None,
+    sensor_width: Annotated[float, typer.Option(help="Width in mm of the sensor with the camera held level.")] = 36.0,
+    sensor_height: Annotated[float, typer.Option(help="Its height in mm.")] = 24.0,
+    blades: Annotated[int, typer.Option(help="Blades of the iris, which show once it closes; 0 is a round one.")] = 0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the file where it exists.")] = False,
+) -> None:
+    """Describe a lens by its prescription: rims, bright and soft blur, colours and curved field of traced rays become a lens file.
+
+    Example: mrbokeh lens describe dgauss.50mm.dat --blades 8 --out double_gauss.json
+    """
+    from mrbokeh.images.image_io import require_suffix
+    from mrbokeh.optics.lens_file import write_lens
+    from mrbokeh.psf_models.lens_description import describe as described
+    from mrbokeh.psf_models.lens_description import held_out_error
+    from mrbokeh.psf_models.physical_lens import read_prescription
+    from mrbokeh.system.atomic_files import require_safe_outputs
+    from mrbokeh.system.console import working
+
+    require_suffix(out, (".json",), "LENS")
+    require_safe_outputs((out,), (prescription,), overwrite)
+    traced = read_prescription(prescription)
+    traced = traced if f_number is None else traced.stopped_down(f_number)
+    with working("tracing"):
+        lens = described(traced, (sensor_width, sensor_height), blades)
+        misplaced, by_a_disc = held_out_error(traced, lens)
+    write_lens(out, lens)
+    tell(
+        f"wrote {out}: {lens.focal_length_mm:.4g} mm f/{lens.f_number:.3g}; it misplaces {misplaced:.0%} of a point's light, a round "
+        f"opening {by_a_disc:.0%}",
+        misplaced=misplaced,
+        misplaced_by_a_disc=by_a_disc,
+    )
+
+
+@app.command()
 def coc(
-    lens: Annotated[Path, typer.Argument(help="Lens file.")],
+    lens: Annotated[Path, typer.Argument(help="Lens file, or a name of `lens list`.")],
     depths: Annotated[list[float], typer.Argument(help="Depths in metres.")],
     width: Annotated[int, typer.Option("--image-width", help="Image width in pixels.")] = 1920,
 ) -> None:
@@ -276,7 +344,7 @@ def coc(
 
 
 def show(
-    lens: Annotated[Path, typer.Argument(help="Lens file, or the folder of a bank of PSFs.")],
+    lens: Annotated[Path, typer.Argument(help="Lens file, a name of `lens list`, or the folder of a bank of PSFs.")],
     out: Annotated[Path, typer.Option(help="The picture to write (.png, .pdf or .svg).")],
     width: Annotated[int, typer.Option("--image-width", min=16, help="Image width in pixels (of a lens file).")] = 1920,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace OUT where it exists.")] = False,

@@ -14,6 +14,7 @@ from mrbokeh.system.errors import InputError
 PerColour = tuple[float, float, float]
 _NO_COLOUR: PerColour = (0.0, 0.0, 0.0)
 _LEAST_LIGHT = 1e-9
+_FARTHEST_RIM, _MOST_BLADES = 1e4, 32
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,6 +31,8 @@ class Aperture:
     Modifiers; 0 is neutral. A field position is x right, y down, in half diagonals of the frame (length 1 in a corner).
     cat_eye: -1 to 1. The pupil is clipped by a round rim of radius 1 whose centre lies at -cat_eye times the field
       position: a rim in front of the pupil where positive, behind it where negative.
+    rims: (shift, radius) of more such rims: of that radius, their centres at -shift times the field position.
+    iris_blades: of an iris that is round while it is fully open and shows straight blades once it closes (`stopped_down`).
     spherical_aberration: -1 to 1. Behind the focus light is weighted by 1 + s (2 rho^2 - 1) over the pupil radius rho, in
       front by 1 - s (2 rho^2 - 1): positive (over-corrected) gives bright rims behind and soft ones in front.
     axial_chromatic: (r, g, b), each in (-1, 1). The circle of confusion of a colour is 1 + side times this as large.
@@ -45,6 +48,8 @@ class Aperture:
     spherical_aberration: float = 0.0
     axial_chromatic: PerColour = _NO_COLOUR
     lateral_chromatic: PerColour = _NO_COLOUR
+    rims: tuple[tuple[float, float], ...] = ()
+    iris_blades: int = 0
     _seen: dict[tuple[object, ...], "Aperture"] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -132,6 +137,25 @@ class Aperture:
             raise InputError(f"an anamorphic squeeze is a positive number such as 1.33 or 2 (1: none), got {squeeze}")
         return self if squeeze == 1.0 else replace(self, outlines=tuple(outline / np.array([squeeze, 1.0]) for outline in self.outlines))
 
+    def stopped_down(self, ratio: float) -> "Aperture":
+        """Return the opening of a smaller pupil, `ratio` times (1 or more) as far closed: rims stay in the barrel and aberrations fade.
+
+        Rims grow in units of the pupil. Defocus bends a wave by rho^2 and spherical aberration by rho^4 (Born and Wolf 5.3), so that the
+        weight over the pupil that it causes falls with the square of the ratio, as the share by which it changes the size of green does;
+        the focus of red and blue against that of green stays. A round iris shows its blades, if it has any.
+        """
+        if ratio == 1.0:
+            return self
+        red, green, blue = self.axial_chromatic
+        closed = replace(self, outlines=(aperture_shapes.blades(self.iris_blades, 0.0, 0.0),), weights=(1.0,)) if self.iris_blades else self
+        return replace(
+            closed,
+            cat_eye=0.0,
+            rims=tuple((shift * ratio, radius * ratio) for shift, radius in (*self.rims, *([(self.cat_eye, 1.0)] if self.cat_eye else []))),
+            spherical_aberration=self.spherical_aberration / ratio**2,
+            axial_chromatic=(red - green + green / ratio**2, green / ratio**2, blue - green + green / ratio**2),
+        )
+
     @property
     def is_plain(self) -> bool:
         """Return whether all modifiers are neutral: the same weighted polygons everywhere and for every colour."""
@@ -140,7 +164,7 @@ class Aperture:
     @property
     def varies_over_field(self) -> bool:
         """Return whether the pupil looks different from different places in the frame."""
-        return self.cat_eye != 0.0 or any(self.lateral_chromatic)
+        return self.cat_eye != 0.0 or bool(self.rims) or any(self.lateral_chromatic)
 
     @property
     def is_chromatic(self) -> bool:
@@ -177,10 +201,11 @@ class Aperture:
         opening = (self.outlines, self.weights)
         if self.spherical_aberration:
             opening = radially_weighted(opening, side * self.spherical_aberration)
-        if self.cat_eye:
-            opening = clipped_by_rim(opening, (-self.cat_eye * field_xy[0], -self.cat_eye * field_xy[1]))
+        for shift, radius in (*([(self.cat_eye, 1.0)] if self.cat_eye else []), *self.rims):
+            opening = clipped_by_rim(opening, (-shift * field_xy[0], -shift * field_xy[1]), radius) if opening[0] else opening
         if not opening[0] or not net_area(opening) > _LEAST_LIGHT:
-            raise InputError(f"no light passes at field position {field_xy}: cat_eye {self.cat_eye} is too strong for this opening")
+            told = f"cat_eye {self.cat_eye}" if not self.rims else f"the rims {self.rims}"
+            raise InputError(f"no light passes at field position {field_xy}: expected an opening there, but {told} cut all of it away")
         return Aperture(*opening)
 
     @property
@@ -225,6 +250,10 @@ def _check_modifiers(aperture: Aperture) -> None:
     for name in ("cat_eye", "spherical_aberration"):
         if not abs(getattr(aperture, name)) <= 1.0:
             raise InputError(f"{name} must lie between -1 and 1 (0: none), got {getattr(aperture, name)}")
+    if not all(len(rim) == 2 and abs(rim[0]) <= _FARTHEST_RIM and 0.0 < rim[1] <= _FARTHEST_RIM for rim in aperture.rims):
+        raise InputError(f"expected rims as pairs of a shift and a radius above 0, both at most {_FARTHEST_RIM:g}, got {aperture.rims}")
+    if aperture.iris_blades and not 3 <= aperture.iris_blades <= _MOST_BLADES:
+        raise InputError(f"expected iris_blades from 3 to {_MOST_BLADES} (0: a round iris), got {aperture.iris_blades}")
     if len(aperture.axial_chromatic) != 3 or not all(abs(share) < 1.0 for share in aperture.axial_chromatic):
         raise InputError(f"axial_chromatic needs three numbers (r, g, b) within (-1, 1), got {aperture.axial_chromatic}")
     if len(aperture.lateral_chromatic) != 3 or not all(abs(share) <= 1.0 for share in aperture.lateral_chromatic):

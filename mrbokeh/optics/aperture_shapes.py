@@ -234,16 +234,16 @@ def clipped(outline: Outline, clip: Outline, weight: float = 1.0) -> WeightedOut
     return outlines_of(whole.intersection(window), weight)
 
 
-def clipped_by_rim(opening: WeightedOutlines, centre_xy: tuple[float, float]) -> WeightedOutlines:
-    """Return the part of the opening that is seen through a round rim of radius 1 about `centre_xy`: a cat-eye.
+def clipped_by_rim(opening: WeightedOutlines, centre_xy: tuple[float, float], radius: float = 1.0) -> WeightedOutlines:
+    """Return the part of the opening that is seen through a round rim about `centre_xy`: a cat-eye.
 
     Outlines that reach beyond the rim by less than its own polygon strays from a circle are left as they are.
     """
     centre = np.asarray(centre_xy)
     parts: list[WeightedOutlines] = []
     for outline, weight in zip(*opening, strict=True):
-        untouched = float(np.hypot(*(outline - centre).T).max()) <= 1.0 + _RIM_TOLERANCE
-        parts.append(((outline,), (weight,)) if untouched else clipped(outline, unit_disc() + centre, weight))
+        untouched = float(np.hypot(*(outline - centre).T).max()) <= radius + _RIM_TOLERANCE
+        parts.append(((outline,), (weight,)) if untouched else clipped(outline, radius * unit_disc() + centre, weight))
     return joined(parts)
 
 

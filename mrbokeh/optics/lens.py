@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from mrbokeh.system.errors import InputError
 
 MM_PER_M = 1000.0
 _STEEPEST_TILT_RAD = np.pi / 4
+_MARKED_WITHIN = 0.05
 _NEAR_IMAGE_DISTANCES = 20.0
 """Nearer than so many times the distance from lens to sensor, it shows whether a focus distance counts from the one or the other."""
 
@@ -29,6 +31,8 @@ class Lens:
       way up the sensor is meant, for photographs taken the other way up (`mrbokeh.stacks.photograph`), or None.
     petzval_radius_mm: radius of curvature of the surface in focus; positive bends it towards the camera away from the axis
       (as an uncorrected lens does, about 1.5 focal lengths), negative away from it, inf is flat.
+    widest_f_number: the smallest f-number to which it opens, with which `stating` another one closes the opening; None: it has any
+      f-number, and the opening is in proportion.
     spread_by: the bank of kernels or the network that it was read from, which spreads its light; None: any renderer, by the opening.
     """
 
@@ -40,6 +44,7 @@ class Lens:
     tilt_rad: tuple[float, float] = (0.0, 0.0)
     petzval_radius_mm: float = float("inf")
     sensor_height_mm: float | None = None
+    widest_f_number: float | None = None
     spread_by: Path | None = None
 
     def __post_init__(self) -> None:
@@ -115,10 +120,23 @@ class Lens:
         return float(x) / length, float(y) / length, 1.0 / length
 
     def stating(self, facts: Mapping[str, float]) -> "Lens":
-        """Return the lens with other facts, by their names; the height of its sensor keeps its proportion to the width."""
+        """Return the lens with other facts, by their names; the height of its sensor keeps its proportion to the width.
+
+        Of a lens with a widest f-number the rims stay where they are: cat-eyes shrink on a smaller sensor and behind a closed iris. Makers
+        round f-numbers: a little below the widest one is fully open.
+        """
         width_mm = facts.get("sensor_width_mm", self.sensor_width_mm)
         height_mm = self.sensor_height_mm and self.sensor_height_mm * width_mm / self.sensor_width_mm
-        return replace(self, **{"sensor_height_mm": height_mm, **facts})  # type: ignore[arg-type]
+        stated = replace(self, **{"sensor_height_mm": height_mm, **facts})  # type: ignore[arg-type]
+        if self.widest_f_number is None:
+            return stated
+        if stated.f_number < self.widest_f_number * (1.0 - _MARKED_WITHIN):
+            raise InputError(
+                f"the lens opens to f/{self.widest_f_number:.3g}: expected an f-number of at least that, got {stated.f_number:g}"
+            )
+        stated = replace(stated, f_number=max(stated.f_number, self.widest_f_number))
+        wider = width_mm / self.sensor_width_mm * self.focal_length_mm / stated.focal_length_mm
+        return replace(stated, aperture=_closed(self.aperture, stated.f_number / self.f_number, wider))
 
     def focused_at(self, focus_distance_m: float) -> "Lens":
         """Return the same lens focused at a distance in metres; inf is allowed."""
@@ -217,6 +235,13 @@ class Lens:
                 )
             in_focus = self.focus_dioptres(width_px, height_px).astype(dioptres.dtype)
         return np.asarray(self.coc_px_per_dioptre(image_width_px) * (in_focus - dioptres))
+
+
+@lru_cache(maxsize=64)
+def _closed(aperture: Aperture, ratio: float, wider: float) -> Aperture:
+    """Return an opening closed by a ratio, on a sensor so many times as wide; always the same object, which keeps what was `seen` of it."""
+    closed = aperture.stopped_down(ratio)
+    return closed if wider == 1.0 else replace(closed, rims=tuple((shift * wider, radius) for shift, radius in closed.rims))
 
 
 def lens_distance_m(film_plane_m: float, focal_length_mm: float, hiatus_mm: float = 0.0) -> float | None:

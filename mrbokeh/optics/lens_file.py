@@ -1,10 +1,11 @@
 """The lens file: a Lens as JSON, so that a lens can be kept, named and passed around.
 
     {"focal_length_mm": 50, "f_number": 1.8, "focus_distance_m": 2.0, "sensor_width_mm": 36,
-     "tilt_deg": [0, 0], "petzval_radius_mm": null,
+     "tilt_deg": [0, 0], "petzval_radius_mm": null, "widest_f_number": null,
      "aperture": {"shape": "polygon", "blades": 7, "curvature": 0.3, "rotation_deg": 0, "inner": 0.6, "image": "heart.png",
                   "levels": 1, "points": [[0, 0], [1, 0], [0, 1]], "path": "M0 0 L1 0 L0 1 Z", "squeeze": 1.0, "cat_eye": 0.0,
-                  "spherical_aberration": 0.0, "axial_chromatic": [0, 0, 0], "lateral_chromatic": [0, 0, 0]}}
+                  "spherical_aberration": 0.0, "axial_chromatic": [0, 0, 0], "lateral_chromatic": [0, 0, 0],
+                  "rims": [[0.4, 1.1]], "iris_blades": 0}}
 
 focus_distance_m null is infinity, petzval_radius_mm null a flat field. sensor_width_mm is that of the camera held level, as data
 sheets have it; where EXIF turned a photograph upright, the lens is turned with it (`mrbokeh.stacks.photograph`). "sensor_height_mm" may be
@@ -18,8 +19,9 @@ The aperture's shape is one of
     image     image (a picture beside the lens file, light where open), levels
     outline   points or path (the d of an SVG path)
 and what another shape would need is not looked at, so that the shape can be switched by one word. rotation_deg and squeeze
-hold for every shape; the last four for every aperture. In place of a shape an aperture may have "outlines" and "weights",
-which is what `write_lens` writes. A key that nothing knows is an error.
+hold for every shape; the last six for every aperture. In place of a shape an aperture may have "outlines" and "weights",
+which is what `write_lens` writes. Lenses of the library (`mrbokeh.optics.lens_library`) have a "prescription" too, which only those
+who trace it look at. A key that nothing knows is an error.
 
 Values of a JSON object by key, checked one by one; each mistake names the key and what stands there.
 """
@@ -35,6 +37,7 @@ from jaxtyping import Float32, Float64
 from mrbokeh.images.picture_codec import stored_pixels
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_library import shipped
 from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError, require_file
 
@@ -109,11 +112,16 @@ class Values:
 
     def points(self, key: str, value: Any) -> Float64[np.ndarray, "points 2"]:
         """Return a list of [x, y] as an array."""
-        pairs = value if isinstance(value, list) else []
-        fine = all(isinstance(pair, list) and len(pair) == 2 and all(_is_number(v) and np.isfinite(v) for v in pair) for pair in pairs)
-        if len(pairs) < 3 or not fine:
+        if not _are_pairs(value) or len(value) < 3:
             raise InputError(f"{self.where}: expected {key} to be lists of at least 3 points [x, y], got {str(value)[:80]}")
-        return np.asarray(pairs, np.float64)
+        return np.asarray(value, np.float64)
+
+    def pairs(self, key: str) -> list[list[float]]:
+        """Return a list of pairs of numbers; without the key an empty one."""
+        value = self._value(key, [])
+        if not _are_pairs(value):
+            raise self._wrong(key, "a list of pairs of numbers")
+        return list(value)
 
     def _value(self, key: str, default: Any) -> Any:
         if key not in self.document and default is _MISSING:
@@ -122,6 +130,11 @@ class Values:
 
     def _wrong(self, key: str, expected: str) -> InputError:
         return InputError(f"{self.where}: expected {key} to be {expected}, got {str(self.document.get(key))[:80]!r}")
+
+
+def _are_pairs(value: Any) -> bool:
+    pairs = value if isinstance(value, list) else [None]
+    return all(isinstance(pair, list) and len(pair) == 2 and all(_is_number(v) and np.isfinite(v) for v in pair) for pair in pairs)
 
 
 def _is_number(value: Any) -> bool:
@@ -147,9 +160,9 @@ def read_transmission(path: Path) -> Float32[np.ndarray, "height width"]:
 FORMAT = "mrbokeh-lens"
 VERSION = 1
 
-_OPTIONAL = {"format", "version", "sensor_height_mm", "tilt_deg", "petzval_radius_mm"}
+_OPTIONAL = {"format", "version", "sensor_height_mm", "tilt_deg", "petzval_radius_mm", "widest_f_number", "prescription"}
 _REQUIRED = {"focal_length_mm", "f_number", "focus_distance_m", "sensor_width_mm", "aperture"}
-_MODIFIERS = {"cat_eye", "spherical_aberration", "axial_chromatic", "lateral_chromatic"}
+_MODIFIERS = {"cat_eye", "spherical_aberration", "axial_chromatic", "lateral_chromatic", "rims", "iris_blades"}
 _OF_SHAPES = {"shape", "blades", "curvature", "rotation_deg", "inner", "image", "levels", "points", "path", "squeeze"}
 
 
@@ -166,6 +179,10 @@ def lens_to_json(lens: Lens) -> dict[str, Any]:
     for key in ("axial_chromatic", "lateral_chromatic"):
         if any(getattr(opening, key)):
             aperture[key] = list(getattr(opening, key))
+    if opening.rims:
+        aperture["rims"] = [list(rim) for rim in opening.rims]
+    if opening.iris_blades:
+        aperture["iris_blades"] = opening.iris_blades
     document = {
         "format": FORMAT,
         "version": VERSION,
@@ -180,6 +197,8 @@ def lens_to_json(lens: Lens) -> dict[str, Any]:
         document["tilt_deg"] = np.degrees(lens.tilt_rad).tolist()
     if np.isfinite(lens.petzval_radius_mm):
         document["petzval_radius_mm"] = lens.petzval_radius_mm
+    if lens.widest_f_number is not None:
+        document["widest_f_number"] = lens.widest_f_number
     return document | {"aperture": aperture}
 
 
@@ -199,6 +218,7 @@ def lens_from_json(document: dict[str, Any], where: str = "lens", folder: Path |
             tilt_rad=(float(np.radians(tilt_x_deg)), float(np.radians(tilt_y_deg))),
             petzval_radius_mm=values.number("petzval_radius_mm", default=np.inf, null=np.inf),
             sensor_height_mm=None if document.get("sensor_height_mm") is None else values.number("sensor_height_mm"),
+            widest_f_number=None if document.get("widest_f_number") is None else values.number("widest_f_number"),
         )
     except InputError as error:
         raise error if str(error).startswith(where) else InputError(f"{where}: {error}") from None
@@ -221,6 +241,8 @@ def _aperture_from_json(document: Any, where: str, folder: Path) -> Aperture:
         spherical_aberration=values.number("spherical_aberration", default=0.0),
         axial_chromatic=values.three("axial_chromatic"),
         lateral_chromatic=values.three("lateral_chromatic"),
+        rims=tuple((float(shift), float(radius)) for shift, radius in values.pairs("rims")),
+        iris_blades=values.whole("iris_blades", default=0),
     )
 
 
@@ -255,7 +277,11 @@ def stated_facts(lens: Lens) -> dict[str, Any]:
 
 
 def read_lens(path: Path | str) -> Lens:
-    """Read a lens file (LENS.json), with the opening that it names. Raises InputError where it does not describe a lens."""
+    """Read a lens file (LENS.json), with the opening that it names, or a lens of the library by its name.
+
+    Raises InputError where it does not describe a lens.
+    """
+    path = shipped(path)
     return lens_from_json(read_json(path, "a lens file (LENS.json)"), str(path), Path(path).parent)
 
 

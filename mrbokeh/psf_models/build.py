@@ -152,6 +152,7 @@ class ModelOptions:
     nearest_m: float | None = None
     farthest_m: float | None = None
     vignetting: bool | None = None
+    sharpest: bool | None = None
     density_per_m: float | None = None
     anisotropy: float | None = None
     focal_px: float | None = None
@@ -198,7 +199,18 @@ def _stylized(options: ModelOptions) -> PsfModel:
 
 
 _SENSOR_WIDTH_MM = 36.0
-_PHYSICAL = ("prescription", "focus_distance_m", "f_number", "image_width_px", "nearest_m", "farthest_m", "vignetting", "counts", "device")
+_PHYSICAL = (
+    "prescription",
+    "focus_distance_m",
+    "f_number",
+    "image_width_px",
+    "nearest_m",
+    "farthest_m",
+    "vignetting",
+    "sharpest",
+    "counts",
+    "device",
+)
 _VOLUME = ("density_per_m", "anisotropy", "focal_px", "farthest_m", "counts", "device")
 _MODELS: dict[str, tuple[Callable[[ModelOptions], PsfModel], frozenset[str]]] = {
     "simple": (_simple, frozenset({"lens", "diameter_px", "counts", "device"})),

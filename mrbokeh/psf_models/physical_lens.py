@@ -17,11 +17,14 @@ from jaxtyping import Float64
 
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import stated_facts
+from mrbokeh.optics.lens_library import shipped
 from mrbokeh.optics.psf_bank import Axis, Turns
 from mrbokeh.psf_models import _physical_lens_numba as compiled
 from mrbokeh.psf_models._lens_beam import GREEN_UM, LensBeam, area_of
 from mrbokeh.psf_models.base import Kernel, centred, check_positive, digest, sobol_blocks
+from mrbokeh.psf_models.lens_description import Bench
 from mrbokeh.psf_models.lens_prescription import LensPrescription, Surface, estimated_abbe_number
+from mrbokeh.system.atomic_files import read_json
 from mrbokeh.system.errors import InputError
 
 
@@ -55,8 +58,11 @@ def read_prescription(path: Path | str) -> LensPrescription:
     Columns, in mm: radius (0: the stop; inf: flat), distance to the next surface, index n_d behind it (0: as before),
     aperture diameter; with five columns the Abbe number stands before the aperture (the order of Kolb et al. 1995).
     Where it is missing it is estimated (mrbokeh.psf_models.lens_prescription). InputError names the line that is not understood.
+    A name of the lens library, or a lens file that holds a prescription, gives that one.
     """
-    path = Path(path)
+    path = shipped(path)
+    if path.suffix.lower() == ".json":
+        return _of_lens_file(path)
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -69,6 +75,18 @@ def read_prescription(path: Path | str) -> LensPrescription:
             surfaces.append(_surface(words, surfaces[-1].index if surfaces else 1.0, surfaces[-1].abbe_number if surfaces else inf))
         except InputError as error:
             raise InputError(f"{path}, line {number}: {error}") from None
+    return with_estimated_abbe_numbers(LensPrescription(path.stem, tuple(surfaces)))
+
+
+def _of_lens_file(path: Path) -> LensPrescription:
+    document = read_json(path, "a lens file with a prescription")
+    rows = document.get("prescription", {}).get("surfaces") if isinstance(document, dict) else None
+    if not rows:
+        raise InputError(f"expected a lens file with the surfaces of a prescription, as `mrbokeh lens list` names them, got {path} without")
+    surfaces: list[Surface] = []
+    for row in rows:
+        words = ["inf" if each is None else repr(each) for each in row]
+        surfaces.append(_surface(words, surfaces[-1].index if surfaces else 1.0, surfaces[-1].abbe_number if surfaces else inf))
     return with_estimated_abbe_numbers(LensPrescription(path.stem, tuple(surfaces)))
 
 
@@ -145,7 +163,8 @@ class PhysicalLens:
     prescription: itself or a file of surfaces. focus_distance_m: the sensor is moved to where the paraxial green image of
     this distance lies. f_number: closes the iris, None leaves it open. sensor_mm: width and height. nearest_m, farthest_m: range
     of depth of a bank. vignetting: a kernel sums to the open share of its beam (`throughput`), not to 1. counts: steps of
-    the nested grid along depth and eccentricity.
+    the nested grid along depth and eccentricity. sharpest: the sensor stands where green light of a point at the focus distance is
+    smallest, as a photographer focuses, instead.
     The range of eccentricity ends where the lens goes black if that is before the corner.
     """
 
@@ -167,20 +186,24 @@ class PhysicalLens:
         nearest_m: float = 0.5,
         farthest_m: float = 100.0,
         vignetting: bool = True,
+        sharpest: bool = False,
         counts: tuple[int, ...] = COUNTS,
         device: str = "",
     ) -> None:
         lens = read_prescription(prescription) if isinstance(prescription, (Path, str)) else prescription or biconvex_lens()
         self.lens = lens if f_number is None else lens.stopped_down(f_number)
         self.focus_distance_m, self.vignetting, self.counts, self.device = focus_distance_m, vignetting, counts, device
+        self.sharpest = sharpest
         width_mm, height_mm = (check_positive("the sensor's width and height in mm", size) for size in sensor_mm)
         self.stated = Lens(self.lens.focal_length_mm, self.lens.f_number, focus_distance_m, width_mm, sensor_height_mm=height_mm)
         self.mm_per_px = width_mm / check_positive("the picture's width in pixels", float(image_width_px))
         self._depth = Axis("depth_m", check_positive("the nearest depth", nearest_m), farthest_m, EXPONENTS[0])
-        sensor_at_mm = self.lens.paraxial_at(GREEN_UM).sensor_mm(focus_distance_m)
-        if not sensor_at_mm > self.lens.vertices_mm[-1]:
+        half_diagonal_mm = 0.5 * float(np.hypot(width_mm, height_mm))
+        self.beam = LensBeam(self.lens, self.lens.paraxial_at(GREEN_UM).sensor_mm(focus_distance_m), half_diagonal_mm)
+        if sharpest:
+            self.beam = Bench(self.lens, focus_distance_m, half_diagonal_mm).beam
+        if not self.beam.sensor_at_mm > self.lens.vertices_mm[-1]:
             raise InputError(f"{self.lens.name} forms its image inside its own glass: no sensor fits there")
-        self.beam = LensBeam(self.lens, sensor_at_mm, 0.5 * float(np.hypot(width_mm, height_mm)))
         self._ends_per_mm = self._per_mm(np.array([nearest_m, farthest_m]))
 
     @cached_property
@@ -199,6 +222,7 @@ class PhysicalLens:
             "half_diagonal_mm": self.beam.half_diagonal_mm,
             "mm_per_px": self.mm_per_px,
             "vignetting": self.vignetting,
+            **({"sharpest": True} if self.sharpest else {}),
         }
 
     def exact(self, coords: Float64[np.ndarray, " axes"]) -> Kernel | None:  # noqa: ARG002

@@ -1,7 +1,8 @@
 """Lenses and the renderers of their blur; the only module that knows them all.
 
-A lens is a description (LENS.json), whose opening any renderer spreads light by, a bank of kernels (a folder) or a network (.onnx).
-The last two have their own ways of spreading light, which travel with the `Lens` as the path in `Lens.spread_by`.
+A lens is a description (LENS.json, or a name of the lens library), whose opening any renderer spreads light by, a bank of kernels (a
+folder) or a network (.onnx). The last two have their own ways of spreading light, which travel with the `Lens` as the path in
+`Lens.spread_by`.
 """
 
 import logging
@@ -12,6 +13,7 @@ from typing import Any
 from mrbokeh.layering.layering import Layering
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import read_lens as read_description
+from mrbokeh.optics.lens_library import shipped
 from mrbokeh.optics.psf_bank import PsfBank
 from mrbokeh.optics.psf_bank_file import HEAD, read_bank
 from mrbokeh.renderers.bank.bank_lens import lens_of, opening_of, polygons_suit
@@ -108,7 +110,9 @@ def lens_and_renderer(
 
 
 def read_lens(path: Path | str) -> Lens:
-    """Read a lens: a description (LENS.json), a bank of PSFs (its folder) or a network (.onnx), which keep their own blur.
+    """Read a lens: a description (LENS.json, or a name of the library), a bank of PSFs (its folder) or a network (.onnx).
+
+    The last two keep their own blur.
 
     A bank that does not say which lens it was made for gives that of `Lens.default` with its opening: `Lens.stating` says more. Raises
     InputError where it is none.
@@ -130,8 +134,8 @@ def spreads_light(lens: Path | None) -> bool:
 
 
 def files_of(lens: Path) -> list[Path]:
-    """Return the file that changes when a lens, bank or network changes."""
-    return [lens / HEAD if is_bank(lens) else lens]
+    """Return the file that changes when a lens, bank or network changes; that of a name of the lens library."""
+    return [lens / HEAD if is_bank(lens) else shipped(lens)]
 
 
 def is_bank(path: Path | str | None) -> bool:

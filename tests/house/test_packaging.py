@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from mrbokeh.optics.lens_library import names as library_names
+
 ROOT = Path(__file__).resolve().parents[2]
 COMMANDS = ("capture", "train", "lens", "render", "composite", "video", "viewfinder", "demo", "doctor")
 
@@ -56,6 +58,7 @@ def test_data_travels_with_its_licences(wheel: Path) -> None:
     assert "mrbokeh/py.typed" in names
     assert {f"mrbokeh/demo_data/{folder}/LICENSE.txt" for folder in ("raw_stack", "pcb_oblique", "objects")} <= names
     assert {f"mrbokeh/demo_data/raw_stack/view_{v}/slice_{i:02d}.dng" for v in range(3) for i in range(9)} <= names
+    assert {f"mrbokeh/lens_data/{each}.json" for each in library_names()} <= names and len(library_names()) >= 10
     assert any(name.startswith("viewfinder/page/") for name in names) and wheel.stat().st_size < 20e6
 
 

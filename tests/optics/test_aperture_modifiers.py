@@ -104,6 +104,26 @@ def test_a_rim_may_cut_an_opening_into_parts_or_hide_it() -> None:
         far_left.seen(1, (-1.0, 0.0))
 
 
+def test_rims_cut_as_cat_eyes_do_and_stay_where_they_are_while_the_iris_closes() -> None:
+    """A rim of radius 1 is a cat-eye; a closed iris of half the diameter sees it twice as far off and twice as large."""
+    rimmed, cat_eyed = replace(Aperture.disc(), rims=((0.6, 1.0),)), replace(Aperture.disc(), cat_eye=0.6)
+    np.testing.assert_array_equal(rimmed.seen(1, CORNER).outlines[0], cat_eyed.seen(1, CORNER).outlines[0])
+    both = replace(Aperture.disc(), rims=((0.5, 1.0), (-0.5, 1.0)))
+    assert light(both.seen(1, CORNER)) / np.pi == pytest.approx(overlap_of_discs(1.0), rel=1e-3)
+    assert not rimmed.is_plain and rimmed.varies_over_field and not rimmed.is_chromatic
+    changed = replace(rimmed, spherical_aberration=0.8, axial_chromatic=(0.3, 0.2, 0.1), iris_blades=6)
+    assert changed.stopped_down(1.0) is changed
+    for closed in (changed.stopped_down(2.0), replace(changed, rims=(), cat_eye=0.6).stopped_down(2.0)):
+        assert closed.rims == ((1.2, 2.0),) and closed.cat_eye == 0.0 and closed.outlines[0].shape == (6, 2)
+        assert closed.spherical_aberration == pytest.approx(0.2)  # a quarter: it falls with the square of the diameter
+        assert closed.axial_chromatic == pytest.approx((0.15, 0.05, -0.05))  # so does what green has; red and blue stay beside it
+    for wrong in ({"rims": ((0.5, 0.0),)}, {"rims": ((0.5,),)}, {"iris_blades": 2}):
+        with pytest.raises(InputError, match="expected"):
+            replace(Aperture.disc(), **wrong)
+    with pytest.raises(InputError, match="no light passes"):
+        replace(Aperture.disc(), rims=((3.0, 1.0),)).seen(1, CORNER)
+
+
 @pytest.mark.parametrize("strength", [-1.0, -0.4, 0.05, 1.0])
 def test_spherical_aberration_weights_by_the_square_of_the_radius(strength: float) -> None:
     """The mean of rho^2 under 1 + s (2 rho^2 - 1) is 1/2 + s/6, with K zones of equal area 1/2 + s/6 (1 - 1/K^2)."""

@@ -138,7 +138,8 @@ def test_mistakes_in_a_lens_are_named(changed: dict[str, Any], message: str) -> 
     ({"shape": "outline", "points": [[0, 0], [1, 1], [2, "x"]]}, "at least 3 points"),
     ({"shape": ["disc"]}, "expected a shape out of"), ({"shape": "outline", "points": [[0, 0], [1, 1]]}, "at least 3 points"),
     ({"shape": "image", "image": ""}, "image to be a text"), ({"shape": "disc", "cat_eye": 1.5}, "cat_eye must lie between"),
-    ({"shape": "disc", "squeeze": 0}, "squeeze"),
+    ({"shape": "disc", "squeeze": 0}, "squeeze"), ({"shape": "disc", "rims": [[1, 2, 3]]}, "rims to be a list of pairs"),
+    ({"shape": "disc", "rims": [[0.1, -1]]}, "rims as pairs of a shift"), ({"shape": "disc", "iris_blades": 1}, "3 to"),
     ({"shape": "disc", "axial_chromatic": [0, 0]}, "axial_chromatic to be a list of 3 numbers"),
     ({"outlines": [[[0, 0], [1, 0], [0, 1]]], "weights": [0]}, "let light through"),
     ({"outlines": [[[0, 0], [1, 0], [0, 1]]]}, "weights missing"),
@@ -147,6 +148,14 @@ def test_mistakes_in_a_lens_are_named(changed: dict[str, Any], message: str) -> 
 def test_mistakes_in_an_aperture_are_named(aperture: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message):
         aperture_of(**aperture)
+
+
+def test_rims_and_the_widest_f_number_are_written_and_read(tmp_path: Path) -> None:
+    opening = replace(Aperture.disc(), rims=((0.4, 1.1), (-0.3, 0.9)), iris_blades=9)
+    lens = Lens(85.0, 1.5, 3.0, aperture=opening, widest_f_number=1.4)
+    write_lens(tmp_path / "lens.json", lens)
+    again = read_lens(tmp_path / "lens.json")
+    assert again.aperture.rims == opening.rims and again.aperture.iris_blades == 9 and again.widest_f_number == 1.4
 
 
 def test_a_lens_file_that_is_none_is_named(tmp_path: Path) -> None:

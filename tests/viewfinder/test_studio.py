@@ -30,6 +30,7 @@ from mrbokeh.images.image_io import write_image, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.optics.lens_library import FOLDER as LIBRARY
 from mrbokeh.scene.staging.scene_description import looking_down
 from mrbokeh.solving.solved_camera import HIGH, LOW, SOLVED, SolvedCamera
 from mrbokeh.system.errors import InputError
@@ -287,14 +288,15 @@ def test_options_of_the_command_are_checked_before_anything_listens(photo: Path,
         assert done.returncode == 2 and why in done.stderr and len(done.stderr.splitlines()) == 1, done.stderr
     write_lens(tmp_path / "lens.json", Lens(35.0, 2.8, 1.0, 23.5))
     lenses = (tmp_path / "lens.json", bank_folder(tmp_path / "bank", Lens(35.0, 2.8, 1.0, 23.5)))
-    project = project_of(StudioOptions(photo, (CAKE,), lenses=lenses, pictures=tmp_path))
-    assert project.state == StudioState(photo=photo, object=CAKE) and project.lenses == [*lenses]
+    project = project_of(StudioOptions(photo, (CAKE,), lenses=(*lenses, Path("biotar-58")), pictures=tmp_path))
+    assert project.state == StudioState(photo=photo, object=CAKE) and project.lenses == [*lenses, LIBRARY / "biotar-58.json"]
     assert len(project.history) == 1, "there is nothing to undo yet"
     assert project.path == tmp_path / "a floor.studio.json"
     project.add(replace(project.state, lens=lenses[1]))
     project.write()
     again = read_project(project.path)
-    assert again.state.lens == lenses[1] and again.lenses == [*lenses] and "path" in bokeh_svg(lenses[1])
+    assert again.state.lens == lenses[1] and again.lenses[:2] == [*lenses] and "path" in bokeh_svg(lenses[1])
+    assert again.lenses[2].resolve() == LIBRARY / "biotar-58.json" and '"biotar-58"' in project.path.read_text(encoding="utf-8")
 
 
 async def asked(session: aiohttp.ClientSession, url: str, message: Any = None) -> tuple[int, Any]:

@@ -5,7 +5,7 @@ LensBook keeps the lenses that the page can switch between, and the chosen one a
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 
@@ -157,12 +157,11 @@ class LensBook:
         """Return the chosen lens with what is known of it now; a focus that it cannot reach becomes its closest."""
         lens = self.lens
         focus_m = lens.focus_distance_m if state.focus_distance_m is None else max(state.focus_distance_m, self.closest_m)
-        return replace(
-            lens,
-            focus_distance_m=float(focus_m),
-            f_number=state.f_number or lens.f_number,
-            focal_length_mm=state.focal_length_mm or lens.focal_length_mm,
-        )
+        told = {"f_number": state.f_number, "focal_length_mm": state.focal_length_mm}
+        facts = {name: value for name, value in told.items() if value}
+        if lens.widest_f_number is not None and "f_number" in facts:
+            facts["f_number"] = max(facts["f_number"], lens.widest_f_number)
+        return lens.stating({"focus_distance_m": float(focus_m), **facts})
 
 
 def read_lenses(paths: Sequence[Path], scene: Path | None) -> tuple[LensBook, dict[str, MakeRenderer]]:

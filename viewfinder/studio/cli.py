@@ -33,7 +33,7 @@ def studio(
     lens: Annotated[
         list[Path] | None,
         typer.Option(
-            help="LENS.json, a bank of PSFs (folder) or NETWORK.onnx (repeat: the page switches between them); else the photograph's."
+            help="LENS.json, a name of `lens list`, a bank (folder) or NETWORK.onnx (repeat: the page switches); else the photograph's."
         ),
     ] = None,
     project: Annotated[

@@ -6,6 +6,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from mrbokeh.optics.lens_library import FOLDER as LIBRARY
+from mrbokeh.optics.lens_library import shipped
 from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError
 from viewfinder.studio.state import StudioState, state_of
@@ -103,10 +105,12 @@ def _by_paths(state: StudioState, change: Callable[[Path], Path]) -> StudioState
 
 def _stored(path: Path, folder: Path) -> Path:
     whole = path.absolute()
+    if whole.parent == LIBRARY:
+        return Path(path.stem)
     return whole.relative_to(folder) if whole.is_relative_to(folder) else whole
 
 
 def _found(path: Path, folder: Path) -> Path:
     """Return where a stored path leads, as one would type it from the working folder."""
-    whole = path if path.is_absolute() else folder / path
+    whole = shipped(path if path.is_absolute() else folder / path)
     return Path(os.path.relpath(whole)) if whole.is_relative_to(Path.cwd()) else whole

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import mrbokeh
+from mrbokeh.optics.lens_library import shipped
 from mrbokeh.renderers.choose import read_lens
 from mrbokeh.stacks.focal_stack import FILE_NAME
 from mrbokeh.system.channel import say
@@ -65,7 +66,7 @@ def _offer(project: Project, options: StudioOptions) -> None:
             raise InputError(f"expected --object to be a .glb file, got {path}: export the object as glTF binary")
     for path in (*given, *sorted(SHIPPED.glob("*.glb"))):
         project.offer(path)
-    for path in options.lenses:
+    for path in map(shipped, options.lenses):
         if path.suffix.lower() != ".onnx":
             read_lens(path)
         project.offer(path if path.is_dir() else _there(path, "a lens file"))

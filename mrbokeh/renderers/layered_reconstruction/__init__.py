@@ -91,7 +91,7 @@ class LayeredReconstruction:
         _require_memory(flat.alpha.shape, self.per_pixel)
         if aperture.varies_over_field or aperture.is_chromatic:
             raise InputError(
-                "layered reconstruction takes openings that are the same over the frame and for all colours: set cat_eye, "
+                "layered reconstruction takes openings that are the same over the frame and for all colours: leave out rims, set cat_eye, "
                 "axial_chromatic and lateral_chromatic to 0, or take another renderer"
             )
         if all_sharp(layers, lens):
