@@ -59,8 +59,8 @@ class BlurOptions:
             raise InputError("--rank and --two-passes are of --renderer low-rank: give that too, or leave them out")
         if renderer.bank is not None and self.rank is not None:
             raise InputError("--rank is of an opening; the terms of a bank are kept beside it: leave --rank out, or give LENS.json")
-        terms = {} if self.rank is None else {"relative_error": 0.0, "max_rank": self.rank}
-        return held, replace(renderer, per_pixel=self.two_passes, **terms)
+        told = renderer if self.rank is None else replace(renderer, relative_error=0.0, max_rank=self.rank)
+        return held, replace(told, per_pixel=self.two_passes)
 
 
 @dataclass(frozen=True)
