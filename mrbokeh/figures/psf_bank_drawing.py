@@ -3,6 +3,7 @@ coordinates, their cells and sizes); and a bank's kernels as pictures for Nuke o
 """
 
 import csv
+import math
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -189,7 +190,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from matplotlib.gridspec import SubplotSpec
 
-KERNELS_IN_ROW = 6
+KERNELS_IN_ROW, _DECADES = 6, 6
 _TICKS = np.linspace(0.0, 1.0, 5)
 _COLOURS = {1: ("black",), 3: ("tab:red", "tab:green", "tab:blue")}
 _SHORT = {
@@ -214,6 +215,7 @@ def draw_bank(bank: PsfBank) -> "Figure":
     )
     columns = figure.add_gridspec(1, 2, width_ratios=(1.5, 1.0))
     _draw_kernels(figure, columns[0, 0], bank)
+    figure.supxlabel(f"each kernel twice: as a display shows light, and the logarithm of its last {_DECADES} decades", fontsize=8)
     right = columns[0, 1].subgridspec(2, 1, height_ratios=(1.4, 1.0))
     (_draw_cells if len(bank.axes) > 1 else _draw_widths)(figure.add_subplot(right[0, 0]), bank)
     absorbs = bool((bank.throughput < 0.999).any())
@@ -224,7 +226,7 @@ def draw_bank(bank: PsfBank) -> "Figure":
 def sampled_cells(bank: PsfBank) -> list[int]:
     """Return the cells whose kernels are drawn: at even steps of the unit coordinates, the second axis downwards, others in their middle.
 
-    In a bank with a knee the steps are those of the logarithm beyond it.
+    Along a single axis each cell comes once. In a bank with a knee the steps are those of the logarithm beyond it.
     """
     steps = (np.arange(KERNELS_IN_ROW) + 0.5) / KERNELS_IN_ROW
     if bank.knee_px is not None:
@@ -233,19 +235,24 @@ def sampled_cells(bank: PsfBank) -> list[int]:
         return [int(cell) for cell in bank.grid.index_of(np.stack(np.meshgrid(columns, rows), axis=-1)).ravel()]
     if len(bank.axes) == 1:
         fine = (np.arange(KERNELS_IN_ROW**2) + 0.5) / KERNELS_IN_ROW**2
-        return [int(cell) for cell in bank.grid.index_of(fine[:, None])]
+        return list(dict.fromkeys(int(cell) for cell in bank.grid.index_of(fine[:, None])))
     places = np.full((KERNELS_IN_ROW, KERNELS_IN_ROW, len(bank.axes)), 0.5)
     places[..., 0], places[..., 1] = steps[None, :], steps[:, None]
     return [int(cell) for cell in bank.grid.index_of(places).ravel()]
 
 
 def _draw_kernels(figure: "Figure", place: "SubplotSpec", bank: PsfBank) -> None:
+    """Draw kernels twice, side by side: as a display shows light, and its logarithm over the last decades, where faint light is seen."""
     cells = sampled_cells(bank)
-    grid = place.subgridspec(KERNELS_IN_ROW, KERNELS_IN_ROW)
+    in_row = KERNELS_IN_ROW if len(bank.axes) > 1 else math.ceil(math.sqrt(len(cells) / 2))
+    grid = place.subgridspec(math.ceil(len(cells) / in_row), in_row)
     for index, cell in enumerate(cells):
-        axes = figure.add_subplot(grid[index // KERNELS_IN_ROW, index % KERNELS_IN_ROW])
+        axes = figure.add_subplot(grid[index // in_row, index % in_row])
         kernel = bank.kernels[cell]
-        axes.imshow(shown_light(np.broadcast_to(kernel, (*kernel.shape[:2], 3))), interpolation="nearest")
+        light = np.broadcast_to(kernel, (*kernel.shape[:2], 3))
+        decades = np.clip(1.0 + np.log10(np.maximum(light / light.max(), 1e-30)) / _DECADES, 0.0, 1.0)
+        between = np.ones((len(light), max(1, len(light) // 20), 3))
+        axes.imshow(np.concatenate([shown_light(light), between, decades], axis=1), interpolation="nearest")
         axes.set_title(", ".join(f"{value:.3g}" for value in bank.centres[cell].round(9) + 0.0), fontsize=7)
         axes.axis("off")
 
@@ -269,6 +276,7 @@ def _draw_widths(axes: "Axes", bank: PsfBank) -> None:
     boxes = bank.boxes[:, 0]
     finite = np.isfinite(boxes).all(axis=1)
     axes.plot(bank.centres[finite, 0], boxes[finite, 1] - boxes[finite, 0], ".", ms=3)
+    axes.set_ylim(0.0, 1.1 * float((boxes[finite, 1] - boxes[finite, 0]).max(initial=1e-9)))
     axes.set_xlabel(_SHORT[bank.axes[0].name])
     axes.set_title("width of the cells, each of which shares one kernel", fontsize=9)
     axes.grid(alpha=0.3)

@@ -86,6 +86,16 @@ def test_absorbed_light_is_kept_track_of_and_shown_on_the_sheet() -> None:
     assert "light that arrives" in titles(random_bank(light=0.5))
     row = PsfBank("m", (INFINITE,), (3,), (np.ones((1, 1, 1), np.float32),) * 3, nested=False)
     assert "width of the cells" in titles(row)
+    assert len(draw_bank(row).axes) == 3 + 2, "each of three kernels once, and two graphs"
+
+
+def test_faint_light_is_seen_beside_a_bright_middle() -> None:
+    """Of a kernel whose middle is 10,000 times brighter the right half, the logarithm, shows a third of white where the left is black."""
+    kernel = np.full((9, 9, 1), 1.0, np.float32)
+    kernel[4, 4] = 1e4
+    sheet = draw_bank(PsfBank("m", (INFINITE,), (1,), (kernel / kernel.sum(),), nested=False))
+    shown = sheet.axes[0].images[0].get_array()[..., 1]
+    assert shown[1, 1] < 0.01 and shown[1, -2] == pytest.approx(1.0 / 3.0, abs=1e-3) and shown[4, -5] == pytest.approx(1.0)
 
 
 def test_what_is_not_a_bank() -> None:
