@@ -154,7 +154,7 @@ def placing_warning(sharp: Sequence[Layer], plate: Plate, mode: str, height: str
     if whole:
         return f"what is put in reaches across the whole picture; {mend}"
     if plate.near_alpha is not None and float(alpha[plate.near_alpha > 0.5].sum()) > _ALL_HIDDEN * float(alpha.sum()):
-        return "all of it lies behind what --matte shows in front: white is in front, black is behind"
+        return "all of it lies behind what the matte shows in front: white is in front, black is behind"
     if plate.depth_m is None or mode == "front":
         return None
     depth_m = np.minimum.reduce([np.where(layer.alpha > 0.5, layer.depth_m, np.inf) for layer in sharp])

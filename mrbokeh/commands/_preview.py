@@ -37,15 +37,18 @@ def smaller(plate: Plate, options: CompositeOptions) -> tuple[Plate, CompositeOp
     return shrunk(plate, *small_px), options.scaled((width_px, height_px), small_px), scale
 
 
-def write_preview_of(out: Path, inserted: Inserted, plate: Plate, objects: Sequence[Layer], scale: float) -> str:
+def write_preview_of(
+    out: Path, inserted: Inserted, plate: Plate, objects: Sequence[Layer], heights_m: Sequence[float | None], scale: float
+) -> str:
     """Write the picture with the grid on the ground, a box around each object and a line below for each, and return these lines.
 
-    objects: each alone, sharp. scale: of `smaller`; the lines count pixels of the whole photograph.
+    objects: each alone, sharp. heights_m: of each, None where its file tells, which is then measured in the picture.
+    scale: of `smaller`; the lines count pixels of the whole photograph.
     """
     drawn, covered = np.ascontiguousarray(srgb_codes(inserted.rgb, np.uint8)), np.maximum.reduce([each.alpha for each in objects]) > 0.5
     told = []
-    for number, each in enumerate(objects):
-        drawn, words = _told(drawn, plate, each, None if number else covered, scale)
+    for number, (each, height_m) in enumerate(zip(objects, heights_m, strict=True)):
+        drawn, words = _told(drawn, plate, each, height_m, None if number else covered, scale)
         told.append(words)
     for number, words in enumerate(reversed(told)):
         _write_line(drawn, words, number)
@@ -53,7 +56,9 @@ def write_preview_of(out: Path, inserted: Inserted, plate: Plate, objects: Seque
     return "; ".join(told)
 
 
-def _told(drawn: Picture, plate: Plate, one: Layer, covered: Bool[np.ndarray, "height width"] | None, scale: float) -> tuple[Picture, str]:
+def _told(
+    drawn: Picture, plate: Plate, one: Layer, height_m: float | None, covered: Bool[np.ndarray, "height width"] | None, scale: float
+) -> tuple[Picture, str]:
     """Return the picture with a box around an object, and what is told of it. covered: by all objects; None draws no grid."""
     rows, columns = np.nonzero(one.alpha > 0.5)
     if not len(rows):
@@ -73,7 +78,7 @@ def _told(drawn: Picture, plate: Plate, one: Layer, covered: Bool[np.ndarray, "h
     coc_px = np.abs(plate.lens.coc_px(np.array([nearest_m, farthest_m]), plate.rgb.shape[1])) / scale
     unit = "guessed m" if plate.metres_guessed else "m"
     is_cut = left == 0 or top == 0 or right == one.width_px - 1 or bottom == one.height_px - 1
-    high = f"{plate.length_m(float(bottom - top + 1), float(np.median(seen_m))):.2g} {unit} high"
+    high = f"{height_m or plate.length_m(float(bottom - top + 1), float(np.median(seen_m))):.2g} {unit} high"
     told = (
         f"{nearest_m:.3g} to {farthest_m:.3g} {unit} away, {(right - left + 1) / scale:.0f}x{(bottom - top + 1) / scale:.0f} px, "
         f"{'cut off by the frame' if is_cut else high}, blurred by {coc_px.min():.1f} to {coc_px.max():.1f} px"

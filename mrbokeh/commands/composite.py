@@ -35,7 +35,7 @@ def composite(options: CompositeOptions, out: OutOption) -> None:
 
     Example: mrbokeh composite captures/20261122-101500 --out captured.png
     """
-    from mrbokeh.commands._composite_layers import objects_apart
+    from mrbokeh.commands._composite_layers import objects_apart, objects_of
     from mrbokeh.commands._composite_parts import alpha_lost, blur_told, check_outputs, write_results
     from mrbokeh.commands._composited import composited, placed
     from mrbokeh.commands._level_ground import with_camera_of_file
@@ -64,7 +64,8 @@ def composite(options: CompositeOptions, out: OutOption) -> None:
     made = composited(plate, options, renderer, finishing, bundle=bundle, asked=asked)
     if options.result.preview:
         objects = objects_apart(options, made.plate, made.sharp)
-        tell(f"wrote the preview {out}: {write_preview_of(out, made.inserted, made.plate, objects, scale)}")
+        heights_m = [each.height_m for each in objects_of(options.standing, made.plate)]
+        tell(f"wrote the preview {out}: {write_preview_of(out, made.inserted, made.plate, objects, heights_m, scale)}")
         return
     write_results(out, made.inserted, made.plate, made.sharp, options.colour, options.result)
     if lost := alpha_lost(out, made.plate):

@@ -400,7 +400,7 @@ def test_a_matte_that_cannot_be_meant_is_told(files: Path) -> None:
     write_image(files / "white.png", np.ones((96, 144, 3), np.float32), "linear")
     words = (files / "photo.exr", "--lens", files / "lens.json", "--object", CAKE, "--at", "0,0.15,1.5", "--matte", files / "white.png")
     done = mrbokeh("composite", *words, "--out", files / "hidden.exr")
-    assert done.returncode == 0 and "all of it lies behind what --matte shows" in done.stderr, done.stderr
+    assert done.returncode == 0 and "all of it lies behind what the matte shows" in done.stderr, done.stderr
     for mode in ("front", "matte"):
         done = mrbokeh("composite", *words, "--mode", mode, "--out", files / f"{mode}.exr")
         assert done.returncode == 2 and f"the mode {mode} does not look at" in done.stderr and len(done.stderr.splitlines()) == 1

@@ -138,11 +138,14 @@ async def focus(page: Page, made: MadeStudio) -> None:
 
 async def save(page: Page, made: MadeStudio, waits: bool) -> None:
     """Where nobody waits for the picture, its process ends with the studio."""
+    await page.tap("#to_save")
+    await page.comes_true(f"{MESSAGE}.includes('choose a format')")
+    await page.tap("[data-format=jpeg]")
+    await page.comes_true("studio.told.saves[0]?.name === 'floor_mrbokeh.jpg'")
     if not waits:
         await page.tap("#to_save")
-        await page.comes_true("studio.told.saves[0]?.name === 'floor_mrbokeh.png'")
+        await page.comes_true("studio.told.saves[0]?.name === 'floor_mrbokeh_2.jpg'")
         return
-    await page.tap("[data-format=jpeg]")
     await page.comes_true("studio.told.saves[0]?.state === 'done'", 60.0)
     link = "document.querySelector('#saves a')"
     assert await page.value(f"{link}.textContent") == "Download floor_mrbokeh.jpg"

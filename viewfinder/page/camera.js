@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 6d5d3cac768bb79d6d6b16e7fe0b0a56161f3a815ddc467fac9b1c57984a7359
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 76e5812187800afc3cc08817493b061f40eda058938b525aa706f4c00a3fab34
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 6d5d3cac768bb79d6d6b16e7fe0b0a56161f3a815ddc467fac9b1c57984a7359
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 76e5812187800afc3cc08817493b061f40eda058938b525aa706f4c00a3fab34
 "use strict";
 (() => {
   // src/model.ts
@@ -79,6 +79,7 @@
     changes = 0;
     finished = -1;
     drafting = false;
+    warned = false;
     resting;
     quiet;
     /** The state as this page sees it now. */
@@ -240,7 +241,10 @@
       try {
         const answer = await fetch("/preview", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(message) });
         if (answer.status === 204) return;
-        if (!answer.ok) return this.say(await sentenceOf(answer), true);
+        if (!answer.ok) {
+          this.warned = true;
+          return this.say(await sentenceOf(answer), true);
+        }
         const body = await answer.arrayBuffer();
         const length = new DataView(body).getUint32(0);
         const shown = JSON.parse(new TextDecoder().decode(new Uint8Array(body, 4, length)));
@@ -249,12 +253,14 @@
         if (draft && change <= this.finished) return;
         if (!draft) this.finished = change;
         this.shown = shown;
-        this.say(shown.warnings[0] ?? "", true);
+        if (shown.warnings[0] || this.warned) this.say(shown.warnings[0] ?? "", true);
+        this.warned = Boolean(shown.warnings[0]);
         this.counts[draft ? "drafts" : "whole"]++;
         this.counts[draft ? "draft_ms" : "whole_ms"] = Math.round(performance.now() - began);
         this.dispatchEvent(new CustomEvent("picture", { detail: bitmap }));
       } catch {
         this.say("the studio does not answer: nothing is lost, this page tries again", true);
+        this.warned = true;
       }
     }
   };
@@ -262,6 +268,11 @@
   function inPhoto([x, y]) {
     const within = (value, most) => Number(Math.min(most, Math.max(0, value)).toFixed(1));
     return [within(x, studio.told?.photo?.width_px ?? 0), within(y, studio.told?.photo?.height_px ?? 0)];
+  }
+  function scaledHeight(height, factor, digits = 6) {
+    if (height === null) return null;
+    const unit = height.endsWith("px") ? "px" : "";
+    return `${Number((parseFloat(height) * factor).toPrecision(digits))}${unit}`;
   }
 
   // src/studio_histogram.ts
@@ -317,8 +328,8 @@
       write: (value) => ({ f_number: F_NUMBERS[Math.min(value, F_NUMBERS.length - 1)] }),
       shown: (_v, s) => `f/${Number((s.f_number ?? studio.told?.photo?.lens_f_number ?? 8).toPrecision(3))}`
     },
-    { id: "sun_right", read: (s) => sunOf(s)[0], write: (v) => sun([v, above()]), shown: (v, s) => s.sun_deg ? degrees(v) : "" },
-    { id: "sun_above", read: (s) => sunOf(s)[1], write: (v) => sun([right(), v]), shown: (v, s) => s.sun_deg ? degrees(v) : "" },
+    { id: "sun_right", read: (s) => sunOf(s)[0], write: (v) => sun([v, above()]), shown: (v, s) => s.sun_deg ? `${Math.abs(Math.round(v))}° ${v < 0 ? "left" : "right"}` : "" },
+    { id: "sun_above", read: (s) => sunOf(s)[1], write: (v) => sun([right(), v]), shown: (v, s) => s.sun_deg ? degrees(Math.round(v)) : "" },
     {
       id: "exposure",
       read: (s) => Math.log2(Math.max(s.exposure, 1e-3)),
@@ -373,6 +384,9 @@
     }
     slider(each) {
       const input = byId(each.id);
+      let before = null;
+      input.addEventListener("pointerdown", () => before = studio.state ? each.read(studio.state) : null);
+      input.addEventListener("pointercancel", () => before !== null && void studio.commit(each.write(before)));
       if (each.id === "f_number") input.max = String(F_NUMBERS.length - 1);
       input.addEventListener("input", () => studio.change(each.write(input.valueAsNumber)));
       input.addEventListener("change", () => void studio.commit(each.write(input.valueAsNumber)));
@@ -438,7 +452,9 @@
     saveAtOnce() {
       byId("to_save").addEventListener("click", () => {
         if (!studio.isComplete) return studio.say("place an object first: then its picture can be saved");
-        void save(studio.told.format);
+        if (studio.told.saves.length) return void save(studio.told.format);
+        studio.say("choose a format under Save: the next time this button takes the same");
+        byId("formats").querySelector("button")?.focus();
       });
     }
     files() {
@@ -519,7 +535,7 @@
         input.setAttribute("aria-valuetext", output.textContent);
       }
       for (const { id, name } of NUMBERS) this.fill(id, state[name] === null ? "" : String(state[name]));
-      this.fill("height", state.height ?? "");
+      this.fill("height", scaledHeight(state.height, 1, 3) ?? "");
       byId("object").value = state.object ?? "";
       const objects = studio.objects;
       offer("chosen", objects.map((each, number) => [String(number), `${number + 1}: ${nameOf(each.object)}`]));
@@ -779,7 +795,7 @@
       const button = byId("draw_lines");
       button.addEventListener("click", () => {
         button.setAttribute("aria-pressed", String(!this.on));
-        studio.say(this.on ? "draw along two edges of one direction and one of another: the ground follows; tap a line to remove it" : "", this.on);
+        studio.say(this.on ? "draw along edges: two of one direction, such as Upright, and one of another; drag an end of the chosen direction, tap the middle of a line to remove it" : "", this.on);
         this.draw();
       });
       for (const axis of AXES) {
@@ -824,7 +840,8 @@
         return Math.hypot(x1 + along * (x2 - x1) - x, y1 + along * (y2 - y1) - y);
       };
       const nearest = [...lines].sort((one, other) => away(one) - away(other))[0];
-      if (nearest && away(nearest) < NEAR * px) void studio.commit({ lines: lines.filter((each) => each !== nearest) });
+      const isAtEnd = nearest && Math.min(Math.hypot(x - nearest[0], y - nearest[1]), Math.hypot(x - nearest[2], y - nearest[3])) < NEAR * px;
+      if (nearest && !isAtEnd && away(nearest) < NEAR * px) void studio.commit({ lines: lines.filter((each) => each !== nearest) });
     }
     draw() {
       const photo = studio.told?.photo;
@@ -923,6 +940,10 @@
       const falls = this.ray(at_px)[1];
       return falls > 1e-6 ? this.high_m / falls : null;
     }
+    /** Length of so many pixels across the view, on the ground under a pixel. */
+    length_m(at_px, pixels) {
+      return pixels * (this.distance_m(at_px) ?? 0) / this.focal_px;
+    }
     /** The pixel, or the nearest below the horizon and within the photograph. */
     within([x, y]) {
       const { width_px, height_px } = this.photo;
@@ -1017,11 +1038,6 @@
   var LOUPE_PX = 240;
   var DRAWN_AGAIN_MS = 900;
   var LOOKS_MS = 150;
-  function scaledHeight(height, factor) {
-    if (height === null) return null;
-    const unit = height.endsWith("px") ? "px" : "";
-    return `${Number((parseFloat(height) * factor).toPrecision(6))}${unit}`;
-  }
   var within180 = (turn_deg) => ((turn_deg + 180) % 360 + 360) % 360 - 180;
   var PictureStage = class {
     stage = byId("stage");
@@ -1103,7 +1119,9 @@
         this.path("", ground.grid());
         this.path("horizon", `M0 ${ground.horizon_px(0)}L${photo.width_px} ${ground.horizon_px(photo.width_px)}`);
         studio.objects.forEach((each, number) => {
-          this.path(number === state.before.length ? "foot" : "foot other", ground.circle(each.at_px, ground.cell_m / 2));
+          const box2 = this.boxOf(number);
+          const radius_m = box2 ? ground.length_m(each.at_px, 0.5 * (box2[2] - box2[0]) * photo.width_px) : ground.cell_m / 2;
+          this.path(number === state.before.length ? "foot" : "foot other", ground.circle(each.at_px, radius_m));
         });
         this.words(`one square: ${ground.cell_m} m`, photo.width_px * 0.015, photo.height_px * 0.985, photo.width_px / this.stage.clientWidth);
       }
@@ -1289,7 +1307,10 @@
         this.stage.classList.toggle("focusing", on);
         studio.say(on ? "click what is to be in focus: the object, or a place on the ground" : "", on);
       });
-      pressed("magnify", (on) => this.loupe.hidden = !on);
+      pressed("magnify", (on) => {
+        this.loupe.hidden = !on;
+        this.loupe.style.left = "-9999px";
+      });
       this.stage.addEventListener("pointermove", (event) => {
         if (!this.loupe.hidden) this.magnify(event);
         if (this.brush.on && studio.told?.photo) this.brush.hover(this.pixel(event.clientX, event.clientY));

@@ -245,7 +245,12 @@ def _photo_told(opened: "OpenedPhotograph", state: StudioState) -> dict[str, Any
         }
     sun = opened.plate.sun
     by_file = None if sun is None or sun.right_deg is None or not sun.is_up else [round(sun.right_deg), round(sun.above_deg)]
-    shown |= {"sun_deg": by_file, "f_number": told.f_number, "focus_m": told.focus_distance_m, "focal_length_mm": told.focal_length_mm}
+    shown |= {
+        "sun_deg": by_file,
+        "f_number": told.f_number,
+        "focus_m": None if told.rough_focus_m else told.focus_distance_m,
+        "focal_length_mm": told.focal_length_mm,
+    }
     try:
         with apart():
             whole = anywhere(state, opened)

@@ -27,9 +27,9 @@ from mrbokeh.tracking.world_axes import upright_camera
 
 CATCHES = ("shadow", "light")
 _FEW_PX, _FEW_SAMPLES = 5_000, 16
-_MOST_PX, _UNEVEN, _WINDOW_PX = 10_000, 0.1, 5
+_MOST_PX, _UNEVEN, _WINDOW_PX, _NOISE_PX = 10_000, 0.1, 5, 3
 """Pixels in which the change of light is looked at as a whole; where it differs by more than this share within a window it is computed
-anew in twice as many rows and columns, until the picture has no more of them."""
+anew in twice as many rows and columns, until the picture has no more of them. Noise of soft shadows is averaged over NOISE_PX."""
 _COVERS = 0.99
 _UNSEEN = 0.004
 """Share of a surface's light whose loss nobody sees: half a code of 8 bits in bright places. So far the shadow fades out."""
@@ -108,8 +108,8 @@ def _without_noise(
 ) -> Float32[np.ndarray, "height width 3"]:
     """Return the mean of what is not covered in the window of each pixel: soft shadows are smooth, what was drawn of them is rough."""
     seen = (~covered).astype(np.float32)
-    share = cv2.blur(seen, (_WINDOW_PX, _WINDOW_PX))[..., None]
-    mean = cv2.blur(ratio * seen[..., None], (_WINDOW_PX, _WINDOW_PX)) / np.maximum(share, 1e-6)
+    share = cv2.blur(seen, (_NOISE_PX, _NOISE_PX))[..., None]
+    mean = cv2.blur(ratio * seen[..., None], (_NOISE_PX, _NOISE_PX)) / np.maximum(share, 1e-6)
     return np.where(share > 1e-3, mean, ratio).astype(np.float32)
 
 

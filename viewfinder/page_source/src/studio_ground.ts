@@ -49,6 +49,11 @@ export class Ground {
     return falls > 1e-6 ? this.high_m / falls : null;
   }
 
+  /** Length of so many pixels across the view, on the ground under a pixel. */
+  length_m(at_px: Point, pixels: number): number {
+    return (pixels * (this.distance_m(at_px) ?? 0)) / this.focal_px;
+  }
+
   /** The pixel, or the nearest below the horizon and within the photograph. */
   within([x, y]: Point): Point {
     const { width_px, height_px } = this.photo;

@@ -16,7 +16,7 @@ export class Lines {
     const button = byId<HTMLElement>("draw_lines");
     button.addEventListener("click", () => {
       button.setAttribute("aria-pressed", String(!this.on));
-      studio.say(this.on ? "draw along two edges of one direction and one of another: the ground follows; tap a line to remove it" : "", this.on);
+      studio.say(this.on ? "draw along edges: two of one direction, such as Upright, and one of another; drag an end of the chosen direction, tap the middle of a line to remove it" : "", this.on);
       this.draw();
     });
     for (const axis of AXES) {
@@ -66,7 +66,8 @@ export class Lines {
       return Math.hypot(x1 + along * (x2 - x1) - x, y1 + along * (y2 - y1) - y);
     };
     const nearest = [...lines].sort((one, other) => away(one) - away(other))[0];
-    if (nearest && away(nearest) < NEAR * px) void studio.commit({ lines: lines.filter((each) => each !== nearest) });
+    const isAtEnd = nearest && Math.min(Math.hypot(x - nearest[0], y - nearest[1]), Math.hypot(x - nearest[2], y - nearest[3])) < NEAR * px;
+    if (nearest && !isAtEnd && away(nearest) < NEAR * px) void studio.commit({ lines: lines.filter((each) => each !== nearest) });
   }
 
   private draw(): void {

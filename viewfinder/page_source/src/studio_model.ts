@@ -130,6 +130,7 @@ export class Studio extends EventTarget {
   private changes = 0;
   private finished = -1;
   private drafting = false;
+  private warned = false;
   private resting: ReturnType<typeof setTimeout> | undefined;
   private quiet: ReturnType<typeof setTimeout> | undefined;
 
@@ -312,7 +313,10 @@ export class Studio extends EventTarget {
     try {
       const answer = await fetch("/preview", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(message) });
       if (answer.status === 204) return;
-      if (!answer.ok) return this.say(await sentenceOf(answer), true);
+      if (!answer.ok) {
+        this.warned = true;
+        return this.say(await sentenceOf(answer), true);
+      }
       const body = await answer.arrayBuffer();
       const length = new DataView(body).getUint32(0);
       const shown = JSON.parse(new TextDecoder().decode(new Uint8Array(body, 4, length))) as Shown;
@@ -323,12 +327,14 @@ export class Studio extends EventTarget {
       if (draft && change <= this.finished) return;
       if (!draft) this.finished = change;
       this.shown = shown;
-      this.say(shown.warnings[0] ?? "", true);
+      if (shown.warnings[0] || this.warned) this.say(shown.warnings[0] ?? "", true);
+      this.warned = Boolean(shown.warnings[0]);
       this.counts[draft ? "drafts" : "whole"]++;
       this.counts[draft ? "draft_ms" : "whole_ms"] = Math.round(performance.now() - began);
       this.dispatchEvent(new CustomEvent("picture", { detail: bitmap }));
     } catch {
       this.say("the studio does not answer: nothing is lost, this page tries again", true);
+      this.warned = true;
     }
   }
 }
@@ -339,4 +345,11 @@ export const studio = new Studio();
 export function inPhoto([x, y]: Pair): Pair {
   const within = (value: number, most: number): number => Number(Math.min(most, Math.max(0, value)).toFixed(1));
   return [within(x, studio.told?.photo?.width_px ?? 0), within(y, studio.told?.photo?.height_px ?? 0)];
+}
+
+/** The height, scaled, with so many digits; its unit stays. */
+export function scaledHeight(height: string | null, factor: number, digits = 6): string | null {
+  if (height === null) return null;
+  const unit = height.endsWith("px") ? "px" : "";
+  return `${Number((parseFloat(height) * factor).toPrecision(digits))}${unit}`;
 }

@@ -1,5 +1,5 @@
 // The panel: fields for everything of the state, the light's dome, the command line and the saves.
-import { byId, type Pair, type Save, type State, studio } from "./studio_model";
+import { byId, type Pair, type Save, scaledHeight, type State, studio } from "./studio_model";
 
 const F_NUMBERS = [1, 1.2, 1.4, 1.8, 2, 2.2, 2.4, 2.8, 3.2, 3.5, 4, 4.5, 5, 5.6, 6.3, 7.1, 8, 9, 10, 11, 13, 14, 16, 18, 20, 22, 25, 29, 32];
 const LONG_FORMATS: Record<string, string> = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers" };
@@ -26,8 +26,8 @@ const SLIDERS: Slider[] = [
     write: (value) => ({ f_number: F_NUMBERS[Math.min(value, F_NUMBERS.length - 1)]! }),
     shown: (_v, s) => `f/${Number((s.f_number ?? studio.told?.photo?.lens_f_number ?? 8).toPrecision(3))}`,
   },
-  { id: "sun_right", read: (s) => sunOf(s)[0], write: (v) => sun([v, above()]), shown: (v, s) => (s.sun_deg ? degrees(v) : "") },
-  { id: "sun_above", read: (s) => sunOf(s)[1], write: (v) => sun([right(), v]), shown: (v, s) => (s.sun_deg ? degrees(v) : "") },
+  { id: "sun_right", read: (s) => sunOf(s)[0], write: (v) => sun([v, above()]), shown: (v, s) => (s.sun_deg ? `${Math.abs(Math.round(v))}° ${v < 0 ? "left" : "right"}` : "") },
+  { id: "sun_above", read: (s) => sunOf(s)[1], write: (v) => sun([right(), v]), shown: (v, s) => (s.sun_deg ? degrees(Math.round(v)) : "") },
   {
     id: "exposure",
     read: (s) => Math.log2(Math.max(s.exposure, 1e-3)),
@@ -88,6 +88,10 @@ export class Panel {
 
   private slider(each: Slider): void {
     const input = byId<HTMLInputElement>(each.id);
+    // A finger that only scrolls the panel over it leaves it as it was.
+    let before: number | null = null;
+    input.addEventListener("pointerdown", () => (before = studio.state ? each.read(studio.state) : null));
+    input.addEventListener("pointercancel", () => before !== null && void studio.commit(each.write(before)));
     if (each.id === "f_number") input.max = String(F_NUMBERS.length - 1);
     input.addEventListener("input", () => studio.change(each.write(input.valueAsNumber)));
     input.addEventListener("change", () => void studio.commit(each.write(input.valueAsNumber)));
@@ -161,7 +165,9 @@ export class Panel {
   private saveAtOnce(): void {
     byId("to_save").addEventListener("click", () => {
       if (!studio.isComplete) return studio.say("place an object first: then its picture can be saved");
-      void save(studio.told!.format);
+      if (studio.told!.saves.length) return void save(studio.told!.format);
+      studio.say("choose a format under Save: the next time this button takes the same");
+      byId<HTMLElement>("formats").querySelector("button")?.focus();
     });
   }
 
@@ -249,7 +255,7 @@ export class Panel {
       input.setAttribute("aria-valuetext", output.textContent);
     }
     for (const { id, name } of NUMBERS) this.fill(id, state[name] === null ? "" : String(state[name]));
-    this.fill("height", state.height ?? "");
+    this.fill("height", scaledHeight(state.height, 1, 3) ?? "");
     byId<HTMLSelectElement>("object").value = state.object ?? "";
     const objects = studio.objects;
     offer("chosen", objects.map((each, number): [string, string] => [String(number), `${number + 1}: ${nameOf(each.object)}`]));

@@ -3,19 +3,12 @@ import { listen } from "./gestures";
 import { Brush } from "./studio_brush";
 import { Lines, Shadow } from "./studio_lines";
 import { groundOf } from "./studio_ground";
-import { type Box, byId, type Pair, studio } from "./studio_model";
+import { type Box, byId, type Pair, scaledHeight, studio } from "./studio_model";
 
 const NUDGES_REST_MS = 500;
 const LOUPE_PX = 240;
 const DRAWN_AGAIN_MS = 900;
 const LOOKS_MS = 150;
-
-/** The height, scaled; its unit stays. */
-export function scaledHeight(height: string | null, factor: number): string | null {
-  if (height === null) return null;
-  const unit = height.endsWith("px") ? "px" : "";
-  return `${Number((parseFloat(height) * factor).toPrecision(6))}${unit}`;
-}
 
 /** Degrees from -180 to 180. */
 export const within180 = (turn_deg: number): number => ((((turn_deg + 180) % 360) + 360) % 360) - 180;
@@ -106,7 +99,9 @@ export class PictureStage {
       this.path("", ground.grid());
       this.path("horizon", `M0 ${ground.horizon_px(0)}L${photo.width_px} ${ground.horizon_px(photo.width_px)}`);
       studio.objects.forEach((each, number) => {
-        this.path(number === state.before.length ? "foot" : "foot other", ground.circle(each.at_px, ground.cell_m / 2));
+        const box = this.boxOf(number);
+        const radius_m = box ? ground.length_m(each.at_px, 0.5 * (box[2] - box[0]) * photo.width_px) : ground.cell_m / 2;
+        this.path(number === state.before.length ? "foot" : "foot other", ground.circle(each.at_px, radius_m));
       });
       this.words(`one square: ${ground.cell_m} m`, photo.width_px * 0.015, photo.height_px * 0.985, photo.width_px / this.stage.clientWidth);
     }
@@ -308,7 +303,10 @@ export class PictureStage {
       this.stage.classList.toggle("focusing", on);
       studio.say(on ? "click what is to be in focus: the object, or a place on the ground" : "", on);
     });
-    pressed("magnify", (on) => (this.loupe.hidden = !on));
+    pressed("magnify", (on) => {
+      this.loupe.hidden = !on;
+      this.loupe.style.left = "-9999px";  // until a pointer shows where
+    });
     this.stage.addEventListener("pointermove", (event) => {
       if (!this.loupe.hidden) this.magnify(event);
       if (this.brush.on && studio.told?.photo) this.brush.hover(this.pixel(event.clientX, event.clientY));
