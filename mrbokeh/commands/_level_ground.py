@@ -101,8 +101,10 @@ def sun_by_shadow(plate: Plate, top_px: Pixel, foot_px: Pixel, tip_px: Pixel) ->
 
     Printed with how far four pixels of error in any of them would turn it. Raises InputError for pixels that cannot be that.
     """
-    for pixel in (top_px, foot_px, tip_px):
-        plate.require_pixel(*pixel)
+    height_px, width_px = plate.rgb.shape[:2]
+    for x_px, y_px in (top_px, foot_px, tip_px):
+        if not (-3 * width_px <= x_px < 4 * width_px and -3 * height_px <= y_px < 4 * height_px):
+            raise InputError(f"--sun-by: pixel {x_px:g},{y_px:g} lies far outside the photograph of {width_px}x{height_px} px: check it")
     if math.dist(foot_px, tip_px) < _POINTED_PX:
         raise InputError("--sun-by: the foot and the shadow's tip are the same place: expected a shadow that has a length")
     pixels = np.array([top_px, foot_px, tip_px], np.float64)

@@ -115,15 +115,19 @@ def test_a_pixel_without_ground_is_refused(change: dict[str, object], words: str
 
 
 @pytest.mark.parametrize(("right_deg", "above_deg"), [(-60.0, 40.0), (35.0, 15.0), (170.0, 55.0), (-10.0, 70.0)])
-@pytest.mark.parametrize(("down_deg", "roll_deg"), [(0.0, 0.0), (25.0, -8.0)])
-def test_a_shadow_tells_where_the_sun_is(right_deg: float, above_deg: float, down_deg: float, roll_deg: float) -> None:
-    """A post of 0.5 m, 6 m in front of a camera 1.5 m high; its shadow ends where the sun's ray through its top meets the ground."""
+@pytest.mark.parametrize(("down_deg", "roll_deg", "ahead_m"), [(0.0, 0.0, 6.0), (25.0, -8.0, 6.0), (0.0, 0.0, 2.6)])
+def test_a_shadow_tells_where_the_sun_is(right_deg: float, above_deg: float, down_deg: float, roll_deg: float, ahead_m: float) -> None:
+    """A post of 0.5 m in front of a camera 1.5 m high; its shadow ends where the sun's ray through its top meets the ground.
+
+    At 2.6 m the ground lies below the frame.
+    """
     plate = replace(photograph(), world_from_camera=looking_down(np.radians(down_deg), np.radians(roll_deg)))
     right, above = np.radians([right_deg, above_deg])
     towards = np.array([np.sin(right) * np.cos(above), -np.sin(above), np.cos(right) * np.cos(above)])
-    foot, top = np.array([0.3, 1.5, 6.0]), np.array([0.3, 1.0, 6.0])
+    foot, top = np.array([0.3, 1.5, ahead_m]), np.array([0.3, 1.0, ahead_m])
     tip = top + towards * (1.5 - top[1]) / towards[1]
     pixels, _ = plate.camera.project(np.array([top, foot, tip]) @ plate.world_from_camera)
+    assert (pixels[1, 1] > plate.rgb.shape[0]) == (ahead_m < 6.0)
     told = sun_by_shadow(plate, *((float(x), float(y)) for x, y in pixels))
     np.testing.assert_allclose([float(each) for each in told.split(",")], (right_deg, above_deg), atol=0.01)
 
@@ -134,7 +138,7 @@ def test_a_shadow_tells_where_the_sun_is(right_deg: float, above_deg: float, dow
         (((400, 200), (400, 250), (500, 450)), "the foot lies above the horizon"),
         (((400, 200), (400, 450), (500, 299)), "the shadow's tip lies above the horizon"),
         (((400, 550), (400, 450), (500, 500)), "the top is not above the ground"),
-        (((400, 200), (400, 450), (900, 500)), "outside"),
+        (((400, 200), (400, 450), (3900, 500)), "far outside"),
         (((400, 200), (400, 450), (402, 451)), "are the same place"),
     ],
 )
