@@ -40,6 +40,7 @@ def composite(options: CompositeOptions, out: OutOption) -> None:
     from mrbokeh.commands._composited import composited, placed
     from mrbokeh.commands._level_ground import with_camera_of_file
     from mrbokeh.commands._preview import smaller, write_preview_of
+    from mrbokeh.images.carried_exif import carry_exif
     from mrbokeh.renderers.choose import lens_and_renderer
     from mrbokeh.stacks.capture_bundle import is_bundle, read_bundle
 
@@ -68,6 +69,7 @@ def composite(options: CompositeOptions, out: OutOption) -> None:
         tell(f"wrote the preview {out}: {write_preview_of(out, made.inserted, made.plate, objects, heights_m, scale)}")
         return
     write_results(out, made.inserted, made.plate, made.sharp, options.colour, options.result)
+    carry_exif(options.photo, out, made.plate.rgb.shape[1::-1])
     if lost := alpha_lost(out, made.plate):
         warn(lost)
     told, known, figures = blur_told(made.plate, made.sharp)

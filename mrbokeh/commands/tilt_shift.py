@@ -45,6 +45,7 @@ def tilt_shift_command(
 
     Example: mrbokeh tilt-shift street.jpg --map drawn.png --diameter 60 --lens bladed.json --out model.png
     """
+    from mrbokeh.images.carried_exif import carry_exif
     from mrbokeh.images.image_io import INTEGER_SUFFIXES, read_image, require_suffix, write_image
     from mrbokeh.optics.aperture import Aperture
     from mrbokeh.optics.lens_file import read_lens
@@ -75,6 +76,7 @@ def tilt_shift_command(
     with working("blurring"):
         blurred = tilt_shift(rgb, coc_px, opening)
     write_image(out, blurred)
+    carry_exif(photo, out, (width_px, height_px))
     tell(f"wrote {out} (blurred by up to {np.abs(coc_px).max():.0f} px)")
 
 
