@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 
+from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair
 from mrbokeh.lens_measuring.fitting.evidence import NOTHING, SIMPLEST_FIRST, Equations, Evidence, Knots, Pictures, Sharing, simplest_of
 from mrbokeh.lens_measuring.fitting.point_lights import PointLight, best_scale, equations_of_light, light_count
 from mrbokeh.lens_measuring.fitting.pupil_picture import PupilGrid
@@ -246,9 +247,9 @@ class LensFit:
 
 
 def fit_lens(
-    stacks: Sequence[FocalStack], lights: Sequence[PointLight], settings: FitSettings, frame: tuple[int, int] | None = None
+    stacks: Sequence[FocalStack | BlurPair], lights: Sequence[PointLight], settings: FitSettings, frame: tuple[int, int] | None = None
 ) -> LensFit:
-    """Find the kernels that explain slices and lights. frame: width and height if there are lights only.
+    """Find the kernels that explain slices, blurred pictures and lights. frame: width and height if there are lights only.
 
     Raises InputError if stacks are not merged, not metric, or not blurred enough.
     """

@@ -7,6 +7,7 @@ and Spirakis 2006) that see contrast, evenly over the field.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -18,6 +19,9 @@ from mrbokeh.lens_measuring.fitting.evidence import DARK, Equations, Knots
 from mrbokeh.lens_measuring.fitting.pupil_picture import EXTENT, PupilGrid
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.system.errors import InputError
+
+if TYPE_CHECKING:
+    from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair
 
 LEAST_DIAMETER_PX = 3.0
 """Smaller kernels are a few pixels and say little about their shape."""
@@ -129,16 +133,18 @@ def equations_of(view: SliceView, where: Int64[np.ndarray, "points 2"], grid: Pu
 
 @dataclass
 class StackSlices:
-    """Slices of all stacks, one after the other; pictures that a stack's slices share are kept while it is read."""
+    """Slices of all stacks, one after the other; pictures that a stack's slices share are kept while it is read. A pair is one slice."""
 
-    stacks: tuple[FocalStack, ...]
+    stacks: tuple["FocalStack | BlurPair", ...]
     longest: int
     _of_stack: dict[int, tuple[np.ndarray, ...]] = field(default_factory=dict, repr=False)
 
     @classmethod
-    def of(cls, stacks: Sequence[FocalStack]) -> "StackSlices":
-        """Open stacks. Raises InputError if one is not registered, merged and metric."""
+    def of(cls, stacks: "Sequence[FocalStack | BlurPair]") -> "StackSlices":
+        """Open stacks and pairs. Raises InputError if a stack is not registered, merged and metric."""
         for stack in stacks:
+            if not isinstance(stack, FocalStack):
+                continue
             if not stack.registered:
                 raise InputError(
                     f"{stack.folder} is not registered, so its slices do not lie on its depth: run `mrbokeh capture merge` on it"
@@ -153,10 +159,13 @@ class StackSlices:
     @property
     def size(self) -> tuple[int, int]:
         """Return width and height of the first stack."""
-        height, width = self.stacks[0].depth_m().shape
+        first = self.stacks[0]
+        if not isinstance(first, FocalStack):
+            return first.size
+        height, width = first.depth_m().shape
         return width, height
 
-    def place(self, number: int) -> tuple[FocalStack, int]:
+    def place(self, number: int) -> "tuple[FocalStack | BlurPair, int]":
         """Return the stack and slice of a number."""
         for stack in self.stacks:
             if number < len(stack):
@@ -166,6 +175,8 @@ class StackSlices:
 
     def view(self, number: int) -> SliceView:
         stack, index = self.place(number)
+        if not isinstance(stack, FocalStack):
+            return stack.view
         if id(stack) not in self._of_stack:
             self._of_stack = {id(stack): (stack.all_in_focus(), stack.depth_m(), stack.depth_confidence())}
         sharp, depth_m, confidence = self._of_stack[id(stack)]
@@ -173,7 +184,13 @@ class StackSlices:
         return SliceView(sharp, stack.slice_rgb(index), smoothed_coc(stack.coc_px(index, depth_m), confidence), known)
 
 
-def largest_diameter_px(stacks: Sequence[FocalStack]) -> float:
+def largest_diameter_px(stacks: "Sequence[FocalStack | BlurPair]") -> float:
     """Return the largest circle of confusion of any slice; 0 without stacks."""
-    maps = (np.abs(stack.coc_px(index, depth_m)) for stack in stacks for depth_m in [stack.depth_m()] for index in range(len(stack)))
-    return max((float(each.max()) for each in maps), default=0.0)
+    return max((_largest_px(stack) for stack in stacks), default=0.0)
+
+
+def _largest_px(stack: "FocalStack | BlurPair") -> float:
+    if not isinstance(stack, FocalStack):
+        return stack.largest_px
+    depth_m = stack.depth_m()
+    return max(float(np.abs(stack.coc_px(index, depth_m)).max()) for index in range(len(stack)))
