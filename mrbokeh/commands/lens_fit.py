@@ -150,7 +150,8 @@ def fit(
     evidence: EvidenceOptions,
     fitting: FittingOptions,
     stacks: Annotated[
-        list[Path] | None, typer.Argument(help="Merged focal stacks, or blur pairs (sharp.exr with coc.px, blurred.exr), or folders of them.")
+        list[Path] | None,
+        typer.Argument(help="Merged focal stacks, or blur pairs (sharp.exr with coc.px, blurred.exr), or folders of them."),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the bank where it exists.")] = False,
 ) -> None:

@@ -24,7 +24,9 @@ def write_pixel4_page(path: Path, results: "Sequence[Measured]", told: Sequence[
     for result in results:
         caption = f"{', '.join(_PANELS)}, photograph less published and less ours (times {_DIFFERENCE:g}, grey is none)"
         figure = inline_figure(cv2.imencode(".png", crops(result))[1].tobytes(), "png", caption)
-        blocks.append(section(f"Scene {result.scene.name}", "Where the published kernels do worst, and in the middle of what is judged.", [figure]))
+        blocks.append(
+            section(f"Scene {result.scene.name}", "Where the published kernels do worst, and in the middle of what is judged.", [figure])
+        )
     write_page(path, "A real lens: Pixel 4", blocks, _STYLE)
 
 

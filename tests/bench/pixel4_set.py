@@ -1,9 +1,9 @@
-"""The Pixel 4 set of Xin et al. (ICCV 2021): photographs, all-in-focus truth, maps of blur and measured kernels, as our renderers take them.
+"""The Pixel 4 set (Xin et al., ICCV 2021): photographs, all-in-focus truth, maps of blur and measured kernels, as our renderers take them.
 
-The photograph is the sum of the halves of its pixels (14 bits, linear, black 1024). The truths are its middle 1344x1008 pixels. Kernels are
-printed for the 8x6 parts of that, all behind the focus, for one amount of blur; a map is that amount times 187, as was measured: for 25
-surfaces of six scenes the kernel's scale that explains the photograph best is within 4 % of it, but for two of 7 %. Kernels lie off the middle
-of their array by up to 4 px, not as the truth does: each is centred.
+The photograph is the sum of the halves of its pixels (14 bits, linear, black 1024). The truths are its middle 1344x1008 pixels. Kernels
+are published for the 8x6 parts of that, all behind the focus, for one amount of blur; a map is that amount times 187, as was measured:
+for 22 of 25 surfaces of six scenes the kernel's scale that explains the photograph best is within 4 % of it, for the others within 8 %.
+Kernels lie off the middle of their array by up to 4 px, the truths do not: each is centred.
 """
 
 from collections.abc import Iterator
@@ -50,7 +50,9 @@ class Scene:
 def scenes(data: Path) -> list[str]:
     """Names of the scenes that have a photograph and both truths."""
     names = sorted(path.stem.removesuffix("_left") for path in (data / "DP_data_pixel_4").glob("*_left.png"))
-    return [name for name in names if all((data / folder / f"{name}_gt.png").is_file() for folder in ("gt_all_in_focus_im", "gt_defocus_map"))]
+    return [
+        name for name in names if all((data / folder / f"{name}_gt.png").is_file() for folder in ("gt_all_in_focus_im", "gt_defocus_map"))
+    ]
 
 
 def read_scene(data: Path, name: str) -> Scene:

@@ -38,9 +38,6 @@ class BlurPair:
     coc_px: Plane
 
     def __post_init__(self) -> None:
-        sizes = {each.shape[:2] for each in (self.sharp, self.blurred, self.coc_px)}
-        if len(sizes) > 1:
-            raise InputError(f"{self.folder}: sharp and blurred picture and {COC} must be of one size, got {sorted(sizes)} (height, width)")
         if not np.isfinite(self.coc_px).any():
             raise InputError(f"{self.folder}: expected {COC} with the diameters of blur in pixels, found none: NaN means unknown")
 
@@ -104,7 +101,12 @@ def read_blur_pair(folder: Path) -> BlurPair:
     part = read_exr(folder / SHARP)[0]
     if COC not in part.channels:
         raise InputError(f"{folder / SHARP}: expected a channel {COC} (signed diameters of blur in pixels), got {', '.join(part.channels)}")
-    return BlurPair(folder, part.stacked("RGB"), read_exr(folder / BLURRED)[0].stacked("RGB"), np.asarray(part.planes([COC])[0], np.float32))
+    sharp, blurred = part.stacked("RGB"), read_exr(folder / BLURRED)[0].stacked("RGB")
+    if sharp.shape != blurred.shape:
+        raise InputError(
+            f"{folder}: {SHARP} and {BLURRED} must be of one size, got {sharp.shape[:2]} and {blurred.shape[:2]} (height, width)"
+        )
+    return BlurPair(folder, sharp, blurred, np.asarray(part.planes([COC])[0], np.float32))
 
 
 def write_blur_pair(pair: BlurPair) -> None:

@@ -25,6 +25,7 @@ _STEPS = 5
 _MOST_PX = 20.0
 """Farther than this pictures of one scene do not lie apart: what is found beyond it is no registration."""
 _LEAST_PIXELS = 1000
+_LEAST_SLOPE, _LEAST_SHARE = 1e-3, 1e-4  # of the light, per pixel; and of the strongest equation: less is the rounding of flat surfaces
 
 
 @dataclass(frozen=True)
@@ -69,7 +70,10 @@ def match(sharp: Rgb, coc_px: Plane, blurred: Rgb, usable: Mask, seed: int = 0) 
     seen = blurred.mean(axis=2, dtype=np.float64).ravel()[where]
     problem = _Problem(np.stack([spread, *reversed(np.gradient(spread))]), np.stack([columns, rows], axis=1) + 0.5, seen)
     found = problem.solved()
-    gain, black = np.polyfit(problem.sampled(found)[0], seen, 1)
+    light = problem.sampled(found)[0]
+    if not light.std() > _LEAST_SLOPE * abs(light.mean()):
+        return Match(np.eye(2, 3))
+    gain, black = np.polyfit(light, seen, 1)
     return Match(found, float(gain), float(black))
 
 
@@ -93,8 +97,8 @@ class _Problem:
         for _ in range(_STEPS):
             light, along_x, along_y = self.sampled(self._map(moved_px, middle, scale))[..., None]
             columns = np.hstack([along_x * affine, along_y * affine, light * slow, ones])
-            size = np.maximum(np.abs(columns).mean(axis=0), 1e-12)
-            found = np.linalg.lstsq(columns / size, self.seen, rcond=1e-6)[0] / size
+            size = np.maximum(np.abs(columns).mean(axis=0), _LEAST_SLOPE * np.abs(light).mean() + 1e-12)
+            found = np.linalg.lstsq(columns / size, self.seen, rcond=_LEAST_SHARE)[0] / size
             moved_px = moved_px + found[:6].reshape(2, 3) / max(found[6], 1e-6)
             if not np.abs(moved_px).max() < _MOST_PX:
                 return np.eye(2, 3)
@@ -107,9 +111,7 @@ class _Problem:
         found = [cv2.remap(plane, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE) for plane in self.planes]
         return np.stack(found).reshape(3, -1)[:, : len(at)].astype(np.float64)
 
-    def _map(
-        self, moved_px: Float64[np.ndarray, "2 3"], middle: Float64[np.ndarray, " 2"], scale: float
-    ) -> Float64[np.ndarray, "2 3"]:
+    def _map(self, moved_px: Float64[np.ndarray, "2 3"], middle: Float64[np.ndarray, " 2"], scale: float) -> Float64[np.ndarray, "2 3"]:
         """Return the map that moves the middle by the first column, and grows by the others."""
         linear = np.eye(2) + moved_px[:, 1:] / scale
         return np.hstack([linear, (middle + moved_px[:, 0] - linear @ middle)[:, None]])
@@ -117,6 +119,7 @@ class _Problem:
 
 def even_light(seen: Rgb, expected: Rgb, usable: Mask, width_px: float) -> Plane:
     """Return by how much more light a picture has than expected, averaged over about this width; 1 where nothing is known."""
+
     def averaged(values: Plane) -> Plane:
         return np.asarray(cv2.GaussianBlur(np.where(usable, values, np.float32(0.0)), (0, 0), 0.5 * width_px))
 
