@@ -24,11 +24,10 @@ from mrbokeh.lens_measuring.fitting.pupil_picture import PupilGrid
 from mrbokeh.lens_measuring.fitting.stack_equations import (
     LEAST_DIAMETER_PX,
     SliceView,
-    StackSlices,
     drawn_pixels,
     equations_of,
-    largest_diameter_px,
 )
+from mrbokeh.lens_measuring.fitting.stack_slices import StackSlices, largest_diameter_px
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.system.console import track
