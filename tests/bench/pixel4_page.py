@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from mrbokeh.system.html_page import inline_figure, section, write_page
+from tests.bench.pixel4_measures import explained
 
 if TYPE_CHECKING:
     from tests.bench.bench_pixel4 import Measured
@@ -32,8 +33,6 @@ def write_pixel4_page(path: Path, results: "Sequence[Measured]", told: Sequence[
 
 def crops(result: "Measured") -> np.ndarray:
     """Two rows of panels at 100 %, encoded for display."""
-    from tests.bench.bench_pixel4 import explained
-
     scene = result.scene
     shown = {name: explained(picture, scene.photograph, scene.judged, 2) for name, picture in result.pictures.items()}
     shown["photograph"] = scene.photograph

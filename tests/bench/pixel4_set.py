@@ -25,6 +25,7 @@ GREY_OF_KERNEL = 187.0
 LARGEST_PX, STEPS = 46.0, 23
 _SAME_SURFACE = 8  # grey values
 _HOLE_PX = 20_000
+_RIM_PX = 5
 _REACH = 1.1  # of the radius: where kernels have lost their light
 _FINER = 4
 _LEAST = 1e-3  # of a kernel's brightest pixel
@@ -34,7 +35,8 @@ _LEAST = 1e-3  # of a kernel's brightest pixel
 class Scene:
     """photograph, sharp: linear, as shares of the photograph's white. coc_px: diameters; unknown ones are those of the next surface.
 
-    judged: pixels whose light all comes from known diameters of one surface, within the frame. known: those that the map knows.
+    judged: pixels whose light all comes from known diameters of one surface, within the frame. known: those that the map knows. rims: they
+    and what lies between surfaces, within the frame.
     white: brightness of the photograph that 0.1 % of its pixels exceed, over black.
     """
 
@@ -44,6 +46,7 @@ class Scene:
     coc_px: np.ndarray
     judged: np.ndarray
     known: np.ndarray
+    rims: np.ndarray
     white: float
 
 
@@ -59,7 +62,7 @@ def read_scene(data: Path, name: str) -> Scene:
     halves = [_read(data / "DP_data_pixel_4" / f"{name}_{side}.png") - BLACK for side in ("left", "right")]
     photograph = _middle(halves[0] + halves[1])
     white = float(np.percentile(photograph, 99.9))
-    grey = _read(data / "gt_defocus_map" / f"{name}_gt.png")
+    grey = _without_rims(_read(data / "gt_defocus_map" / f"{name}_gt.png"))
     surface, holes = _filled(grey)
     coc_px = (surface * (KERNEL_PX / GREY_OF_KERNEL)).astype(np.float32)
     sharp = _read(data / "gt_all_in_focus_im" / f"{name}_gt.png") / 2.0  # 16 bits for the sum of two of 15
@@ -70,6 +73,7 @@ def read_scene(data: Path, name: str) -> Scene:
         coc_px=coc_px,
         judged=_judged(surface, (grey == 0) & ~holes, coc_px),
         known=grey > 0,
+        rims=(grey > 0) & _within_reach(np.zeros_like(holes), coc_px),
         white=white,
     )
 
@@ -84,6 +88,11 @@ def _read(path: Path) -> np.ndarray:
 def _middle(picture: np.ndarray) -> np.ndarray:
     top, left = ((whole - part) // 2 for whole, part in zip(picture.shape, SIZE, strict=True))
     return picture[top : top + SIZE[0], left : left + SIZE[1]]
+
+
+def _without_rims(grey: np.ndarray) -> np.ndarray:
+    """The map with 0 next to what is 0: there it was scaled, and its values are of no surface."""
+    return np.where(cv2.erode((grey > 0).astype(np.uint8), np.ones((_RIM_PX, _RIM_PX), np.uint8)) > 0, grey, 0.0)
 
 
 def _filled(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -103,8 +112,13 @@ def _filled(grey: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _judged(surface: np.ndarray, unknown: np.ndarray, coc_px: np.ndarray) -> np.ndarray:
     square = np.ones((3, 3), np.uint8)
     edges = cv2.dilate(surface, square) - cv2.erode(surface, square) > _SAME_SURFACE
-    bad = np.pad(unknown | edges, 1, constant_values=True)
-    return distance_transform_edt(~bad)[1:-1, 1:-1] > 0.5 * _REACH * coc_px + 3.0
+    return _within_reach(unknown | edges, coc_px)
+
+
+def _within_reach(bad: np.ndarray, coc_px: np.ndarray) -> np.ndarray:
+    """Pixels to which no light comes from bad ones or from beyond the frame."""
+    around = np.pad(bad, 1, constant_values=True)
+    return distance_transform_edt(~around)[1:-1, 1:-1] > 0.5 * _REACH * coc_px + 3.0
 
 
 def published_kernels(data: Path) -> np.ndarray:
