@@ -65,7 +65,7 @@ def read_scene(data: Path, name: str) -> Scene:
     grey = _without_rims(_read(data / "gt_defocus_map" / f"{name}_gt.png"))
     surface, holes = _filled(grey)
     coc_px = (surface * (KERNEL_PX / GREY_OF_KERNEL)).astype(np.float32)
-    sharp = _read(data / "gt_all_in_focus_im" / f"{name}_gt.png") / 2.0  # 16 bits for the sum of two of 15
+    sharp = _read(data / "gt_all_in_focus_im" / f"{name}_gt.png") / 2.0  # its 16 bits stand for the 15 of the sum
     return Scene(
         name=name,
         photograph=(photograph / white).astype(np.float32),
