@@ -12,9 +12,11 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.system.typed_numbers import numbers_in
 
 if TYPE_CHECKING:
+    from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair
     from mrbokeh.lens_measuring.fitting.lens_fit import FitSettings, LensFit
     from mrbokeh.lens_measuring.fitting.point_lights import PointLight
     from mrbokeh.optics.psf_bank import PsfBank
+    from mrbokeh.stacks.focal_stack import FocalStack
 
 RINGS = 4
 _SIDES = {"behind": 1, "front": -1}
@@ -147,13 +149,18 @@ def fit(
     out: Annotated[Path, typer.Option(help="The folder to write: a bank of PSFs, kernels.png and evidence.png.")],
     evidence: EvidenceOptions,
     fitting: FittingOptions,
-    stacks: Annotated[list[Path] | None, typer.Argument(help="Merged focal stacks, or scenes of them.")] = None,
+    stacks: Annotated[
+        list[Path] | None,
+        typer.Argument(help="Merged focal stacks, or blur pairs (sharp.exr with coc.px, blurred.exr), or folders of them."),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace the bank where it exists.")] = False,
 ) -> None:
     """Measure the kernels of a lens over signed blur, field and colour.
 
     From merged focal stacks (every blurred pixel tells a little; kernels go by blur in pixels, so that metres need not be known), from
-    pictures of isolated points of light out of focus (each is its kernel), or from both. Use the bank as `--lens LENS`.
+    pairs of an all-in-focus picture with its diameters of blur (sharp.exr: R, G, B and coc.px, signed, NaN unknown) and the blurred
+    picture (blurred.exr), from pictures of isolated points of light out of focus (each is its kernel), or from all. Use the bank as
+    `--lens LENS`.
 
     Example: mrbokeh lens fit scene --out my_lens --regions 3x3
     """
@@ -165,10 +172,10 @@ def fit(
     refuse_existing_bank(out, overwrite)
     settings = fitting.parsed()
     found, frame = _lights(evidence)
-    given = _stacks(stacks or [])
+    given, pairs = _evidence_in(stacks or [])
     if note := metres_notes(given):
         guess(f"{note} (kernels are measured over blur in pixels, which needs no metres)")
-    fitted = fit_lens(given, found, settings, frame)
+    fitted = fit_lens([*given, *pairs], found, settings, frame)
     told = next((stack for stack in given if stack.lens and stack.metres_known and not is_lens_guessed(stack)), None)
     bank = bank_of(fitted, None if told is None else told.lens_of(told.reference))
     write_bank(out, bank, overwrite)
@@ -176,10 +183,14 @@ def fit(
     tell(f"wrote {out}: {len(bank.kernels)} kernels of up to {2 * bank.radius_px + 1} px, {_proof(fitted)}", kernels=len(bank.kernels))
 
 
-def _stacks(folders: list[Path]) -> list:  # type: ignore[type-arg]
-    from mrbokeh.stacks.focal_stack import find_focal_stacks
+def _evidence_in(folders: list[Path]) -> "tuple[list[FocalStack], list[BlurPair]]":
+    """Return the stacks and the pairs in these folders. Raises InputError for a folder that holds neither."""
+    from mrbokeh.lens_measuring.fitting.blur_pairs import find_blur_pairs
+    from mrbokeh.stacks.focal_stack import FILE_NAME, find_focal_stacks
 
-    return [stack for folder in folders for stack in find_focal_stacks(folder)]
+    pairs = {folder: find_blur_pairs(folder) for folder in folders}
+    with_stacks = [folder for folder in folders if not pairs[folder] or any(folder.rglob(FILE_NAME))]
+    return [stack for folder in with_stacks for stack in find_focal_stacks(folder)], [pair for found in pairs.values() for pair in found]
 
 
 def _lights(evidence: EvidenceOptions) -> "tuple[list[PointLight], tuple[int, int] | None]":

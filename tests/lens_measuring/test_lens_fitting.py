@@ -20,7 +20,8 @@ from mrbokeh.lens_measuring.fitting.fit_results import bank_of, picture_at
 from mrbokeh.lens_measuring.fitting.lens_fit import FitSettings, LensFit, fit_lens, on_simplex
 from mrbokeh.lens_measuring.fitting.point_lights import PointLight, find_lights
 from mrbokeh.lens_measuring.fitting.pupil_picture import PupilGrid, kernel_of
-from mrbokeh.lens_measuring.fitting.stack_equations import SliceView, StackSlices, drawn_pixels, equations_of, smoothed_coc, usable_pixels
+from mrbokeh.lens_measuring.fitting.stack_equations import SliceView, drawn_pixels, equations_of, smoothed_coc, usable_pixels
+from mrbokeh.lens_measuring.fitting.stack_slices import StackSlices
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.psf_bank import Axis, PsfBank

@@ -12,7 +12,7 @@ from capture.poses.lens_calibration import write_calibrated
 from mrbokeh.images.exr_io import read_exr, write_exr
 from mrbokeh.images.image_io import read_image, write_layer
 from mrbokeh.images.layer import Layer
-from mrbokeh.lens_measuring.fitting.stack_equations import StackSlices
+from mrbokeh.lens_measuring.fitting.stack_slices import StackSlices
 from mrbokeh.optics.lens_file import lens_to_json, write_lens
 from mrbokeh.refocus import leave_one_out
 from mrbokeh.renderers.scatter_reference import ScatterReference

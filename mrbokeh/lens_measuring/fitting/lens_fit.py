@@ -17,17 +17,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 
+from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair
 from mrbokeh.lens_measuring.fitting.evidence import NOTHING, SIMPLEST_FIRST, Equations, Evidence, Knots, Pictures, Sharing, simplest_of
 from mrbokeh.lens_measuring.fitting.point_lights import PointLight, best_scale, equations_of_light, light_count
 from mrbokeh.lens_measuring.fitting.pupil_picture import PupilGrid
 from mrbokeh.lens_measuring.fitting.stack_equations import (
     LEAST_DIAMETER_PX,
     SliceView,
-    StackSlices,
     drawn_pixels,
     equations_of,
-    largest_diameter_px,
 )
+from mrbokeh.lens_measuring.fitting.stack_slices import StackSlices, largest_diameter_px
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.system.console import track
@@ -246,9 +246,9 @@ class LensFit:
 
 
 def fit_lens(
-    stacks: Sequence[FocalStack], lights: Sequence[PointLight], settings: FitSettings, frame: tuple[int, int] | None = None
+    stacks: Sequence[FocalStack | BlurPair], lights: Sequence[PointLight], settings: FitSettings, frame: tuple[int, int] | None = None
 ) -> LensFit:
-    """Find the kernels that explain slices and lights. frame: width and height if there are lights only.
+    """Find the kernels that explain slices, blurred pictures and lights. frame: width and height if there are lights only.
 
     Raises InputError if stacks are not merged, not metric, or not blurred enough.
     """

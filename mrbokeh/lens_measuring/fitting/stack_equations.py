@@ -1,29 +1,24 @@
-"""Equations of focal stacks: pixels of their slices whose blur is known well enough to tell the shape of the kernel.
+"""Equations of slices and blurred pictures: pixels whose blur is known well enough to tell the shape of the kernel.
 
 Counted are pixels with a trusted depth, not clipped, and far from every edge of depth by more than light travels there: around edges, what
 is hidden and what hides mix, which a kernel cannot explain. Among them those are drawn (weighted sampling without replacement, Efraimidis
 and Spirakis 2006) that see contrast, evenly over the field.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from scipy.ndimage import distance_transform_edt
 
-from mrbokeh.images.camera_rgb import SliceMasks
 from mrbokeh.lens_measuring.fitting.evidence import DARK, Equations, Knots
 from mrbokeh.lens_measuring.fitting.pupil_picture import EXTENT, PupilGrid
-from mrbokeh.stacks.focal_stack import FocalStack
-from mrbokeh.system.errors import InputError
 
 LEAST_DIAMETER_PX = 3.0
 """Smaller kernels are a few pixels and say little about their shape."""
 
-_NO_TRUTH = ("moving", "border", "board")
-_LEAST_CONFIDENCE = 0.1
+LEAST_CONFIDENCE = 0.1
 _JUMP_PX, _JUMP_SHARE = 0.75, 0.1
 _CONTRAST_PX = 9
 _LEAST_CONTRAST = 0.01
@@ -49,14 +44,6 @@ class SliceView:
         return np.asarray((where[:, ::-1] - middle) / (0.5 * np.hypot(width, height)))
 
 
-def known_pixels(confidence: Plane, masks: SliceMasks, exclusions: Mapping[str, Mask]) -> Mask:
-    """Return the pixels with a trusted depth whose light was measured."""
-    known = (confidence >= _LEAST_CONFIDENCE) & masks.valid & ~masks.saturated
-    for reason in (*_NO_TRUTH, "low_confidence"):
-        known &= ~exclusions.get(reason, np.zeros_like(known))
-    return np.asarray(known)
-
-
 def smoothed_coc(coc_px: Plane, confidence: Plane) -> Plane:
     """Remove the noise of single pixels from a map of diameters, keeping its edges.
 
@@ -64,7 +51,7 @@ def smoothed_coc(coc_px: Plane, confidence: Plane) -> Plane:
     would be taken for theirs, and one light outshines all that tells of the kernel there.
     """
     smooth = cv2.medianBlur(np.ascontiguousarray(coc_px), 5)
-    thin = (np.abs(coc_px - smooth) > _jump_px(coc_px)) & (confidence >= _LEAST_CONFIDENCE)
+    thin = (np.abs(coc_px - smooth) > _jump_px(coc_px)) & (confidence >= LEAST_CONFIDENCE)
     return np.asarray(np.where(thin, coc_px, smooth), np.float32)
 
 
@@ -125,55 +112,3 @@ def equations_of(view: SliceView, where: Int64[np.ndarray, "points 2"], grid: Pu
     seen = view.blurred[where[:, 0], where[:, 1]].astype(np.float64)
     targets, weights = seen - mean, 1.0 / (DARK + np.maximum(mean, 0.0).astype(np.float64))
     return Equations(rows - mean[..., None], targets, weights, knots.at(view.coc_px[where[:, 0], where[:, 1]], field_xy))
-
-
-@dataclass
-class StackSlices:
-    """Slices of all stacks, one after the other; pictures that a stack's slices share are kept while it is read."""
-
-    stacks: tuple[FocalStack, ...]
-    longest: int
-    _of_stack: dict[int, tuple[np.ndarray, ...]] = field(default_factory=dict, repr=False)
-
-    @classmethod
-    def of(cls, stacks: Sequence[FocalStack]) -> "StackSlices":
-        """Open stacks. Raises InputError if one is not registered, merged and metric."""
-        for stack in stacks:
-            if not stack.registered:
-                raise InputError(
-                    f"{stack.folder} is not registered, so its slices do not lie on its depth: run `mrbokeh capture merge` on it"
-                )
-            stack.depth_m()
-            stack.stated_lens_of(0)
-        return cls(tuple(stacks), max((len(stack) for stack in stacks), default=1))
-
-    def __len__(self) -> int:
-        return sum(len(stack) for stack in self.stacks)
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Return width and height of the first stack."""
-        height, width = self.stacks[0].depth_m().shape
-        return width, height
-
-    def place(self, number: int) -> tuple[FocalStack, int]:
-        """Return the stack and slice of a number."""
-        for stack in self.stacks:
-            if number < len(stack):
-                return stack, number
-            number -= len(stack)
-        raise IndexError(number)
-
-    def view(self, number: int) -> SliceView:
-        stack, index = self.place(number)
-        if id(stack) not in self._of_stack:
-            self._of_stack = {id(stack): (stack.all_in_focus(), stack.depth_m(), stack.depth_confidence())}
-        sharp, depth_m, confidence = self._of_stack[id(stack)]
-        known = known_pixels(confidence, stack.slice_masks(index), stack.exclusions()) & (depth_m > 0.0)
-        return SliceView(sharp, stack.slice_rgb(index), smoothed_coc(stack.coc_px(index, depth_m), confidence), known)
-
-
-def largest_diameter_px(stacks: Sequence[FocalStack]) -> float:
-    """Return the largest circle of confusion of any slice; 0 without stacks."""
-    maps = (np.abs(stack.coc_px(index, depth_m)) for stack in stacks for depth_m in [stack.depth_m()] for index in range(len(stack)))
-    return max((float(each.max()) for each in maps), default=0.0)
