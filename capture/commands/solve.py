@@ -21,14 +21,15 @@ HELP = "\n\n".join(
         "A focal length that EXIF or --focal-length states is taken, and compared with what the lines say. Without either it is solved, "
         "and guessed where the lines do not tell it. The whole picture is needed: one that was cropped has another middle.",
         "Where lines are few, give some by hand: --line X1,Y1,X2,Y2,y for an upright edge, x and z for level edges along two directions "
-        "that are square to one another (which is which is yours to choose). They decide; what is found counts where it agrees.",
+        "that are square to one another (which is which is yours to choose), h for the horizon. They decide; what is found counts where it "
+        "agrees.",
         "--out is read by `mrbokeh.solving`; look at --picture before you trust a camera of low confidence.",
         "Example:  mrbokeh capture solve room.jpg --out camera.json --picture grid.png",
         "Example:  mrbokeh capture solve room.jpg --out camera.json --height 1.6",
         "Example:  mrbokeh capture solve old.png --focal-length 35 --sensor-width 36 --length 410,900,980,905,2.4 --out camera.json",
     )
 )
-_LINE = "--line must be two pixels and a direction, X1,Y1,X2,Y2,x or y or z"
+_LINE = "--line must be two pixels and a direction, X1,Y1,X2,Y2,x or y or z, or h for the horizon"
 
 
 def solve_command(
@@ -41,7 +42,9 @@ def solve_command(
     sensor_width: Annotated[float | None, typer.Option(metavar="MM", help="sensor width in mm, instead of EXIF's")] = None,
     line: Annotated[
         list[str] | None,
-        typer.Option(metavar="X1,Y1,X2,Y2,x|y|z", help="an edge by hand, upright (y) or level (x, z); may be repeated"),
+        typer.Option(
+            metavar="X1,Y1,X2,Y2,x|y|z|h", help="an edge by hand, upright (y) or level (x, z), or the horizon (h); may be repeated"
+        ),
     ] = None,
     height: Annotated[float | None, typer.Option(metavar="METRES", help="of the camera above the ground, else 1.5 is guessed")] = None,
     length: Annotated[
@@ -76,11 +79,11 @@ def solve_command(
 
 
 def parse_line(text: str) -> "Line":
-    """Return an edge from X1,Y1,X2,Y2,x or y or z. Raises InputError."""
-    from mrbokeh.solving.solve_camera import AXES, Line
+    """Return an edge from X1,Y1,X2,Y2 and its direction. Raises InputError."""
+    from mrbokeh.solving.solve_camera import AXES, HORIZON, Line
 
     ends, _, axis = text.rpartition(",")
-    if axis not in AXES:
+    if axis not in (*AXES, HORIZON):
         raise InputError(f"{_LINE}, got {text!r}")
     x1, y1, x2, y2 = numbers_in(ends, _LINE, (4,))
     return Line((x1, y1, x2, y2), axis)

@@ -132,7 +132,7 @@ class ObjectOptions:
         list[float] | None,
         typer.Option(
             help="Turn of the object about the vertical in degrees, clockwise from above. Once for all, or once for each --object. "
-            "Default: 0, the front of the GLB towards the camera."
+            "Default: 0, the front of the GLB against the view."
         ),
     ] = None
     pitch: Annotated[

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _NEARER, _MUCH_HIDDEN, _ALL_HIDDEN = 0.03, 0.4, 0.99
 _RASTER, _COLOURLESS = 200, 0.004
 _WIDEST = 2.0
-"""Circle of confusion, in diagonals of the picture, of what is left out: a sixth of its light at most would be in the picture."""
+"""Largest circle of confusion, in diagonals of the picture: of what has a larger one a sixth of the light at most would be seen."""
 
 
 @dataclass(frozen=True)
@@ -83,9 +83,12 @@ def composited(
     """
     mode, insertion = insertion_by(options, plate)
     drawn = layers_by(options, plate, bundle, kept)(plate)
-    sharp = [_before_the_lens(layer, plate) for layer in drawn]
+    sharp = [without_what_touches_the_lens(layer, plate) for layer in drawn]
     if asked is not None and not any((layer.alpha > 0).any() for layer in drawn):
         _nothing_seen(asked, options.virtual)
+    touching = 1.0 - sum(float(each.alpha.sum()) for each in sharp) / max(1e-9, sum(float(each.alpha.sum()) for each in drawn))
+    if asked is not None and touching > 0.0:
+        warn(f"{touching:.0%} of what is put in all but touches the lens, where its blur is wider than two pictures: it is left out")
     if options.standing.at_pixel:
         plate = with_ground_behind(plate, options.standing.pixels, sharp)
     if asked is not None and asked.object_ and (warning := placing_warning(drawn, plate, mode, " ".join(asked.height or ()))):
@@ -100,15 +103,17 @@ def composited(
     return Composited(inserted, plate, sharp, mode)
 
 
-def _before_the_lens(layer: Layer, plate: Plate) -> Layer:
-    """Return the layer without what all but touches the lens: its light goes everywhere, and would take any amount of memory."""
+def without_what_touches_the_lens(layer: Layer, plate: Plate) -> Layer:
+    """Return the layer without what is so near that its light goes everywhere: it would take any amount of memory."""
     least_px = -_WIDEST * math.hypot(layer.width_px, layer.height_px)
     nearest_m = float(np.min(layer.depth_m, initial=np.inf, where=layer.alpha > 0.0))
     if nearest_m == np.inf or plate.lens.coc_px(nearest_m, layer.width_px) >= least_px:
         return layer
     touching = (layer.alpha > 0.0) & (plate.lens.coc_px(np.where(layer.alpha > 0.0, layer.depth_m, np.inf), layer.width_px) < least_px)
     clear = np.where(touching, np.float32(0.0), np.float32(1.0))
-    return replace(layer, rgb=layer.rgb * clear[..., None], alpha=layer.alpha * clear, depth_m=np.where(touching, np.inf, layer.depth_m))
+    extra = {name: values * clear[..., None] for name, values in layer.extra.items()}
+    depth_m = np.where(touching, np.float32(np.inf), layer.depth_m)
+    return Layer(layer.rgb * clear[..., None], layer.alpha * clear, depth_m, extra)
 
 
 def is_monochrome(plate: Plate) -> bool:

@@ -20,9 +20,7 @@ if TYPE_CHECKING:
 class BankOptions:
     """Options of the models; None leaves a model's default."""
 
-    lens: Annotated[
-        Path | None, typer.Option(help="Lens file, or a name of `lens list`, whose opening is used (model simple; a disc without).")
-    ] = None
+    lens: Annotated[Path | None, typer.Option(help="Lens file whose opening is used (model simple; a disc without).")] = None
     image: Annotated[Path | None, typer.Option("--psf-picture", help="The picture of a PSF (model stylized).")] = None
     diameter_px: Annotated[
         float | None, typer.Option("--diameter", max=4096.0, help="Largest circle of confusion in px (simple, combined, stylized).")
@@ -75,7 +73,6 @@ class BankOptions:
                 "counts": counts,
                 "device": self.device or None,
                 "vignetting": False if self.vignetting else None,
-                "sharpest": self.sharpest or None,
             }
         )
 

@@ -8,7 +8,7 @@ import numpy as np
 import typer
 from jaxtyping import Float32
 
-from mrbokeh.system.channel import guess, tell
+from mrbokeh.system.channel import guess, tell, warn
 from mrbokeh.system.console import working
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.typed_numbers import numbers_in
@@ -45,7 +45,9 @@ def tilt_shift_command(
 
     Example: mrbokeh tilt-shift street.jpg --map drawn.png --diameter 60 --lens bladed.json --out model.png
     """
+    from mrbokeh.images.alpha_io import read_alpha
     from mrbokeh.images.carried_exif import carry_exif
+    from mrbokeh.images.exif import stored_orientation, upright
     from mrbokeh.images.image_io import INTEGER_SUFFIXES, read_image, require_suffix, write_image
     from mrbokeh.optics.aperture import Aperture
     from mrbokeh.optics.lens_file import read_lens
@@ -58,7 +60,10 @@ def tilt_shift_command(
     if along is not None and map_ is not None:
         raise InputError("--along and --map both say where the picture stays sharp: give one of them")
     opening = Aperture.disc() if lens is None else read_lens(lens).aperture.seen(+1)
-    rgb = read_photograph(photo).rgb
+    photograph = read_photograph(photo)
+    rgb = photograph.rgb
+    if read_alpha(photo, photograph.orientation) is not None:
+        warn(f"{photo} is transparent in places, which the result is not: black shows there")
     height_px, width_px = rgb.shape[:2]
     largest_px = _USUAL_SHARE * width_px if diameter is None else diameter
     if not 0.0 < largest_px <= _WIDEST_SHARE * width_px:
@@ -66,10 +71,10 @@ def tilt_shift_command(
     if diameter is None:
         guess(f"the largest circle of confusion is {largest_px:.0f} px (--diameter PX)")
     if map_ is not None:
-        told = read_image(map_, "linear")[..., 1]
+        told = upright(read_image(map_, "linear")[..., 1], stored_orientation(map_))
         if told.shape != (height_px, width_px):
             raise InputError(f"the map {map_} has {told.shape[1]}x{told.shape[0]} px, but {photo} {width_px}x{height_px}: resize it")
-        coc_px = np.maximum(told, np.float32(0.0)) * np.float32(largest_px)
+        coc_px = np.clip(told, np.float32(0.0), np.float32(1.0)) * np.float32(largest_px)
     else:
         ends = _typed_line(along) if along is not None else ((0.0, height_px / 2), (float(width_px), height_px / 2))
         coc_px = blur_beside(ends, (width_px, height_px), largest_px)

@@ -27,6 +27,7 @@ from mrbokeh.depth.stereo_depth import stereo_depth
 from mrbokeh.images.alpha_io import is_straight, read_alpha
 from mrbokeh.images.apple_notes import held_by_phone
 from mrbokeh.images.exif import TIFF_SUFFIXES, header_of
+from mrbokeh.images.heif import HEIF_SUFFIXES
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer
 from mrbokeh.images.xmp import jpeg_xmp
@@ -43,7 +44,7 @@ from mrbokeh.system.errors import InputError, require_file
 
 _log = logging.getLogger(__name__)
 
-_DEVELOPED, _SHADOW_CONTRAST = (".jpg", ".jpeg", ".heic", ".heif"), 1.3
+_DEVELOPED, _SHADOW_CONTRAST = (".jpg", ".jpeg", *HEIF_SUFFIXES), 1.3
 """Files that cameras write, and the slope of their tones over those of the light, both as logarithms: 1.14 to 1.36 in JPEGs of four cameras
 beside their RAW (from 1 to 50 % of white), and 1.4 by the light that was left in seven cast shadows of sunny days."""
 
@@ -272,7 +273,8 @@ def with_blur_in_metres(plate: Plate, before_m: Float32[np.ndarray, "height widt
     dioptres = new[0] + factor * (1.0 / lens.focus_distance_m - old[0])
     focused = lens.focused_at(focus_m or (1.0 / dioptres if dioptres > 0 else float("inf")))
     wanted = lens.coc_px_per_dioptre(width_px) / factor
-    return replace(plate, lens=replace(focused, f_number=focused.f_number * focused.coc_px_per_dioptre(width_px) / wanted))
+    f_number = focused.f_number * focused.coc_px_per_dioptre(width_px) / wanted
+    return replace(plate, lens=replace(focused, f_number=f_number, widest_f_number=None))
 
 
 def plate_of(rgb: Float32[np.ndarray, "height width 3"], lens: Lens, depth_m: Float32[np.ndarray, "height width"] | None = None) -> Plate:

@@ -51,7 +51,7 @@ _SUNLIT_LUX = 40_000.0
 """What an overcast sky seldom gives, and the sun does from 30 degrees up."""
 _SUNLIT_SHARE = 0.5
 """Share of a clear day's light that an overcast sky, which gives 0.13 to 0.25 of it in the mean (RP-21), and shade seldom have."""
-_USUAL_SUN, _SPOT_POWER = (-125.0, 50.0), 24.0
+_USUAL_RIGHT_DEG, _USUAL_ABOVE_DEG, _SPOT_POWER = -125.0, 50.0, 24.0
 """Where the sun is taken to be if only the exposure tells of it: behind the photographer, so far to the left that the shadow is seen.
 It is made 27 degrees wide (to half its brightness), so that its direction, which is a guess, tells less than that of a sharp shadow."""
 _SUN_RGB, _SKY_RGB = (1.130, 0.983, 0.783), (0.824, 1.012, 1.403)
@@ -77,9 +77,10 @@ class Surroundings:
     def light(self, sun_degrees: tuple[float, float] | None = None) -> tuple[Environment, tuple[Light, ...]]:
         """Return the panorama with light from above, and the main light where it is told; see `picture_light`."""
         seen, white = self.seen, self.white
-        if sun_degrees is None and self.sun_above_deg is None:
+        guessed = None if self.sun_above_deg is None else (_USUAL_RIGHT_DEG, self.sun_above_deg)
+        if (taken := sun_degrees or guessed) is None:
             return Environment(_lit_from_above(seen, white)), ()
-        right, above = (math.radians(each or 0.0) for each in sun_degrees or (_USUAL_SUN[0], self.sun_above_deg))
+        right, above = (math.radians(each) for each in taken)
         travels = (-math.sin(right) * math.cos(above), math.sin(above), -math.cos(right) * math.cos(above))
         by_sky = sky_share(above) * np.array(_SKY_RGB)
         by_sky /= by_sky + (1.0 - sky_share(above)) * np.array(_SUN_RGB)
@@ -106,7 +107,7 @@ def surroundings_of(plate: Plate, foot_px: tuple[float, float], world_from_camer
     small = _small(plate)
     white = white_at(small, foot_px[0] / plate.rgb.shape[1], foot_px[1] / plate.rgb.shape[0])
     seen = _panorama_of(small, plate, world_from_camera, white / luminance(white[None])[0])
-    known = _USUAL_SUN[1] if plate.sun is None else plate.sun.above_deg
+    known = _USUAL_ABOVE_DEG if plate.sun is None else plate.sun.above_deg
     return Surroundings(seen, white, known if is_sunlit(plate, foot_px) else None)
 
 

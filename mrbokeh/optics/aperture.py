@@ -138,7 +138,7 @@ class Aperture:
         return self if squeeze == 1.0 else replace(self, outlines=tuple(outline / np.array([squeeze, 1.0]) for outline in self.outlines))
 
     def stopped_down(self, ratio: float) -> "Aperture":
-        """Return the opening of a smaller pupil, `ratio` times (1 or more) as far closed: rims stay in the barrel and aberrations fade.
+        """Return the opening of a pupil whose diameter is `ratio` (at least 1) times smaller: rims stay in the barrel and aberrations fade.
 
         Rims grow in units of the pupil. Defocus bends a wave by rho^2 and spherical aberration by rho^4 (Born and Wolf 5.3), so that the
         weight over the pupil that it causes falls with the square of the ratio, as the share by which it changes the size of green does;

@@ -135,6 +135,12 @@ class Lens:
                 f"the lens opens to f/{self.widest_f_number:.3g}: expected an f-number of at least that, got {stated.f_number:g}"
             )
         stated = replace(stated, f_number=max(stated.f_number, self.widest_f_number))
+        if stated.f_number < self.f_number * (1.0 - _MARKED_WITHIN):
+            raise InputError(
+                f"the lens is described as closed to f/{self.f_number:.3g}: expected an f-number of at least that, got "
+                f"{stated.f_number:g}; describe it fully open"
+            )
+        stated = replace(stated, f_number=max(stated.f_number, self.f_number))
         wider = width_mm / self.sensor_width_mm * self.focal_length_mm / stated.focal_length_mm
         return replace(stated, aperture=_closed(self.aperture, stated.f_number / self.f_number, wider))
 

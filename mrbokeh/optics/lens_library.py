@@ -1,4 +1,4 @@
-"""LensLibrary: lenses by name, shipped as lens files (mrbokeh/lens_data/NAME.json) with the prescription that each was described from.
+"""Lens library: lenses by name, shipped as lens files (mrbokeh/lens_data/NAME.json) with the prescription that each was described from.
 
 A prescription states: `about` what the lens is for; `patent`, `inventors`, `year` and `source`, from where its figures come; the focal
 length and f-number that the patent states (scaled as the surfaces are); `closest_focus_m`, from the sensor, of a lens built to it, or
@@ -57,7 +57,7 @@ def shipped(path: Path | str) -> Path:
     if path.suffix or path.exists():
         return path
     known = names()
-    if path.name in known:
+    if path.name in known:  # in whatever folder: a scene file names lenses beside itself
         return FOLDER / f"{path.name}.json"
     if len(path.parts) != 1:
         return path

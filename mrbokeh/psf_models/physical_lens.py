@@ -80,8 +80,9 @@ def read_prescription(path: Path | str) -> LensPrescription:
 
 def _of_lens_file(path: Path) -> LensPrescription:
     document = read_json(path, "a lens file with a prescription")
-    rows = document.get("prescription", {}).get("surfaces") if isinstance(document, dict) else None
-    if not rows:
+    held = document.get("prescription") if isinstance(document, dict) else None
+    rows = held.get("surfaces") if isinstance(held, dict) else None
+    if not isinstance(rows, list) or not rows or not all(isinstance(row, list) for row in rows):
         raise InputError(f"expected a lens file with the surfaces of a prescription, as `mrbokeh lens list` names them, got {path} without")
     surfaces: list[Surface] = []
     for row in rows:
@@ -199,9 +200,10 @@ class PhysicalLens:
         self.mm_per_px = width_mm / check_positive("the picture's width in pixels", float(image_width_px))
         self._depth = Axis("depth_m", check_positive("the nearest depth", nearest_m), farthest_m, EXPONENTS[0])
         half_diagonal_mm = 0.5 * float(np.hypot(width_mm, height_mm))
-        self.beam = LensBeam(self.lens, self.lens.paraxial_at(GREEN_UM).sensor_mm(focus_distance_m), half_diagonal_mm)
         if sharpest:
             self.beam = Bench(self.lens, focus_distance_m, half_diagonal_mm).beam
+        else:
+            self.beam = LensBeam(self.lens, self.lens.paraxial_at(GREEN_UM).sensor_mm(focus_distance_m), half_diagonal_mm)
         if not self.beam.sensor_at_mm > self.lens.vertices_mm[-1]:
             raise InputError(f"{self.lens.name} forms its image inside its own glass: no sensor fits there")
         self._ends_per_mm = self._per_mm(np.array([nearest_m, farthest_m]))

@@ -188,7 +188,10 @@ class SimpleLens:
         self.device, self.lens = device, lens
         self.aperture = Aperture.disc() if aperture is None else aperture
         if self.aperture.varies_over_field:
-            raise InputError("a simple lens looks the same all over the frame: give a lens without cat_eye and lateral_chromatic")
+            raise InputError(
+                "a simple lens looks the same all over the frame: give a lens without cat_eye, rims and lateral_chromatic, or trace a "
+                "prescription by `lens psf physical`"
+            )
         self._signed = not self.aperture.is_plain
         largest = check_positive("the largest diameter of a simple lens", diameter_px)
         self.axes = (Axis("diameter_px", -largest if self._signed else 0.0, largest, EXPONENT),)

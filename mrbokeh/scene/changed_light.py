@@ -44,7 +44,7 @@ class LightChange:
         return replace(self, ratio=1 - factor * (1 - self.ratio), added=factor * self.added)
 
     def deepened(self, contrast: float) -> "LightChange":
-        """Return the change as a camera shows it whose tones rise by a power of the light."""
+        """Return the change as shown by a camera whose tones are a power of the light."""
         return self if contrast == 1.0 else replace(self, ratio=self.ratio ** np.float32(contrast))
 
     def enlarged(self, height_px: int, width_px: int) -> "LightChange":

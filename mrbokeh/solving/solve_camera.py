@@ -23,13 +23,13 @@ from mrbokeh.solving.vanishing_points import (
 )
 from mrbokeh.system.errors import InputError
 
-AXES = ("x", "y", "z")
-_ADVICE = "give --line X1,Y1,X2,Y2,x|y|z for edges that are straight and level (x, z) or upright (y) in the world"
+AXES, HORIZON = ("x", "y", "z"), "h"
+_ADVICE = "give --line X1,Y1,X2,Y2,x|y|z|h for edges that are straight and level (x, z) or upright (y) in the world, or for the horizon (h)"
 _WIDEST = 2.4
 _FEWEST, _REFUSED, _LITTLE, _MUCH = 8, 25.0, 50.0, 90.0
 """Segments, and evidence in nats, below which a camera is refused, doubtful, and not sure."""
 _MOST_ROLL_DEG, _MOST_SD_DEG, _LOW_SD_DEG, _HIGH_SD_DEG = 20.0, 4.0, 1.5, 0.7
-_TRIED, _ALONE = 8, 2
+_TRIED, _ALONE, _POINTED_PX = 8, 2, 3.0
 _TOLD = 0.2
 """Standard deviation of the logarithm of a focal length beyond which segments do not tell it."""
 _SHORT_FOCAL, _LONG_FOCAL, _LONGEST_TOLD = 0.45, 1.9, 3.0
@@ -41,14 +41,16 @@ _MOST_DISTORTION, _TOLD_DISTORTION = 7.0, 1.0
 
 @dataclass(frozen=True)
 class Line:
-    """Edge told by hand. ends_px: x1, y1, x2, y2 in pixels of the picture. axis: "x" or "z" if it is level in the world, "y" if upright."""
+    """Edge told by hand. ends_px: x1, y1, x2, y2 in pixels of the picture. axis: "x" or "z" if it is level in the world, "y" if upright;
+    "h" is the horizon itself.
+    """
 
     ends_px: tuple[float, float, float, float]
     axis: str
 
     def __post_init__(self) -> None:
-        if self.axis not in AXES:
-            raise InputError(f"expected x, y or z as the direction of a line, got {self.axis!r}")
+        if self.axis not in (*AXES, HORIZON):
+            raise InputError(f"expected x, y, z or h (the horizon) as the direction of a line, got {self.axis!r}")
         if not np.isfinite(self.ends_px).all() or np.hypot(self.ends_px[2] - self.ends_px[0], self.ends_px[3] - self.ends_px[1]) < 1.0:
             raise InputError(f"expected a line between two pixels, got {self.ends_px}: give two ends")
 
@@ -69,6 +71,8 @@ def solve_camera(
             f"the lens's: give the whole picture"
         )
     known = None if focal_length_px is None else _usable(focal_length_px / side_px)
+    if horizons := [each for each in lines if each.axis == HORIZON]:
+        return _from_horizon(horizons[-1], known, (width_px, height_px), alone=len(lines) == 1)
     segments = find_segments(working_copy(rgb))
     if lines:
         return _from_lines(lines, segments, known, (width_px, height_px))
@@ -196,6 +200,32 @@ def _compared(found: SolvedCamera, best: Frame, free: Frame | None) -> SolvedCam
     sd_deg = float(np.hypot(*_held_sd_deg(free)))
     agrees = _apart_deg(best, free) < 2.0 + 2.0 * min(sd_deg, 2.0) or _sd(free, 4) > _TOLD
     return found if agrees else replace(found, confidence=LOW)
+
+
+def _from_horizon(line: Line, known: float | None, size_px: tuple[int, int], *, alone: bool) -> SolvedCamera:
+    """Return the camera that sees the horizon along a line: up is square to the plane of its rays. alone: no other lines were told."""
+    focal_px = (known or USUAL_FOCAL) * max(size_px)
+    x1, y1, x2, y2 = line.ends_px
+    one, other = (np.array([x - size_px[0] / 2, y - size_px[1] / 2, focal_px]) for x, y in ((x1, y1), (x2, y2)))
+    down = np.cross(one, other)
+    down *= (1.0 if down[1] > 0.0 else -1.0) / np.linalg.norm(down)
+    ahead = np.array([0.0, 0.0, 1.0]) - down[2] * down
+    ahead /= np.linalg.norm(ahead)
+    guessed = "guessed: the focal length of 29 mm on full frame (--focal-length MM --sensor-width MM), as a horizon does not tell it"
+    assumed = ((guessed,) if known is None else ()) + (() if alone else ("left out: the other lines, as the horizon is told",))
+    return SolvedCamera(
+        width_px=size_px[0],
+        height_px=size_px[1],
+        focal_length_px=focal_px,
+        focal_length_source=GUESSED if known is None else KNOWN,
+        camera_from_world=np.stack([np.cross(down, ahead), down, ahead], axis=1),
+        roll_sd_deg=float(np.degrees(_POINTED_PX * np.sqrt(2.0) / np.hypot(x2 - x1, y2 - y1))),
+        pitch_sd_deg=float(np.degrees(_POINTED_PX / focal_px)),
+        confidence=FAIR if known is None else HIGH,
+        assumed=assumed,
+        segments_px=np.array([line.ends_px], np.float64),
+        axes=np.array([0]),
+    )
 
 
 def _from_lines(lines: Sequence[Line], segments: Segments, known: float | None, size_px: tuple[int, int]) -> SolvedCamera:

@@ -165,6 +165,7 @@ def test_a_shadow_ends_where_the_table_ends() -> None:
     [
         ("0,0.15,1.5", "0.001", "smaller than a pixel; --height 0.001"),
         ("0,2,1.5", "4", "across the whole picture; --height 4"),
+        ("0,0.0015,0.008", "0.002", "100% of what is put in all but touches the lens"),
         ("0,0.15,1.5", "0.3", ""),
     ],
 )

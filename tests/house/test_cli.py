@@ -99,7 +99,6 @@ def test_extras_are_those_of_the_package() -> None:
     assert all(listed[module] == extra for module, extra in EXTRA_OF_MODULE.items())
 
 
-@pytest.mark.slow
 def test_shell_completion() -> None:
     script = [sys.executable, "-c", "import sys; sys.argv[0] = 'mrbokeh'; from mrbokeh.cli import main; main()"]
     for words, expected in (

@@ -128,6 +128,32 @@ def test_the_sharpest_focus_is_sharper_than_the_paraxial_one() -> None:
     assert spots_px[1] < spots_px[0] / 3.0
 
 
+@pytest.mark.parametrize("name", ["sonnar-50", "primoplan-58", "portrait-85", "tele-300"])
+def test_the_sharpest_place_lies_within_the_search(name: str) -> None:
+    """The place, looked for in steps of 0.0075 mm and f-numbers, is no end of the search."""
+    lens = read_prescription(name)
+    bench = Bench(lens, FOCUS_IN_FOCAL_LENGTHS * lens.focal_length_mm / 1000.0, HALF_DIAGONAL_MM)
+    assert abs(bench.focus_shift_mm) < 0.9 * lens_description._FOCUS_SEARCH * lens.f_number
+
+
+@pytest.mark.parametrize(
+    "damaged", [{"prescription": 5}, {"prescription": {"surfaces": [1, 2]}}, {"prescription": {"surfaces": 7}}, [], {}]
+)
+def test_a_lens_file_without_surfaces_is_told(tmp_path: Path, damaged: object) -> None:
+    (tmp_path / "lens.json").write_text(json.dumps(damaged))
+    with pytest.raises(InputError, match="the surfaces of a prescription"):
+        read_prescription(tmp_path / "lens.json")
+
+
+def test_a_lens_that_is_described_closed_is_not_opened_again(tmp_path: Path) -> None:
+    """What its opening was is not in the file: blades, rims and bright rims of the closed one say nothing of it."""
+    write_lens(tmp_path / "closed.json", read_lens("biotar-58").stating({"f_number": 5.6}))
+    closed = read_lens(tmp_path / "closed.json")
+    assert closed.stating({"f_number": 8.0}).f_number == 8.0
+    with pytest.raises(InputError, match=r"described as closed to f/5\.6"):
+        closed.stating({"f_number": 1.8})
+
+
 def test_light_of_an_ideal_lens_is_all_in_its_place() -> None:
     """Even rays over the unit disc: what is left is their grain on the kernel's pixels, and the rim's polygon."""
     rng = np.random.default_rng(0)

@@ -57,6 +57,10 @@ def test_a_map_says_where_and_a_lens_how(photo: Path, tmp_path: Path) -> None:
     write_lens(tmp_path / "lens.json", Lens(50.0, 2.0, 1.0, 36.0))
     words = ("tilt-shift", photo, "--map", tmp_path / "map.png", "--lens", tmp_path / "lens.json", "--diameter", "8")
     assert mrbokeh(*words, "--out", tmp_path / "out.exr").returncode == 0
+    write_image(tmp_path / "bright.exr", np.repeat(drawn[..., None].astype(np.float32), 3, axis=2))
+    again = mrbokeh(*words[:3], tmp_path / "bright.exr", *words[4:], "--out", tmp_path / "same.exr")
+    same = np.array_equal(read_image(tmp_path / "same.exr"), read_image(tmp_path / "out.exr"))
+    assert again.returncode == 0 and same, "white is 1 or more"
     sharp, blurred = read_image(photo), read_image(tmp_path / "out.exr")
     np.testing.assert_allclose(blurred[:, : WIDTH // 2 - 6], sharp[:, : WIDTH // 2 - 6], atol=1e-3)
     assert blurred[:, WIDTH // 2 + 6 :].var() < 0.05 * sharp.var()

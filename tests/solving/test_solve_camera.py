@@ -1,5 +1,6 @@
 """The camera from one picture against pictures whose camera is known, and what is refused. The bars are those of the issue."""
 
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.images.image_io import write_image
+from mrbokeh.scene.staging.scene_description import looking_down
 from mrbokeh.solving.solve_camera import Line, solve_camera
 from mrbokeh.solving.solved_camera import SolvedCamera, read_solved_camera, write_solved_camera
 from mrbokeh.system.errors import InputError
@@ -114,6 +116,20 @@ def test_lines_by_hand_are_enough() -> None:
     assert horizon_off_deg(upright, made) < 0.5 and any("no level lines" in each for each in upright.assumed)
     with pytest.raises(InputError, match=r"fit no camera|too little"):
         solve_camera(np.full((1000, 1500, 3), 0.2, np.float32), lines=lines[:1])
+
+
+@pytest.mark.parametrize(("down_deg", "roll_deg"), [(0.0, 0.0), (12.0, -7.0), (-20.0, 25.0)])
+def test_a_horizon_alone_tells_how_the_camera_was_held(down_deg: float, roll_deg: float) -> None:
+    """The horizon of a known camera, drawn from either end; without a focal length the tilt goes by the usual one."""
+    turn = looking_down(np.radians(down_deg), np.radians(roll_deg)).T
+    (x1, y1), (x2, y2) = replace(camera_of_room(), focal_length_px=1200.0, width_px=1500, height_px=1000, camera_from_world=turn).horizon_px
+    empty = np.full((1000, 1500, 3), 0.2, np.float32)
+    for ends in ((x1, y1, x2, y2), (x2, y2, x1, y1)):
+        found = solve_camera(empty, 1200.0, [Line(ends, "h")])
+        assert found.pitch_deg == pytest.approx(-down_deg, abs=1e-6) and found.roll_deg == pytest.approx(roll_deg, abs=1e-6)
+        assert np.linalg.det(found.camera_from_world) == pytest.approx(1.0) and found.confidence == "high" and not found.assumed
+    guessed = solve_camera(empty, lines=[Line((x1, y1, x2, y2), "h"), Line((1.0, 2.0, 3.0, 400.0), "y")])
+    assert guessed.focal_length_source == "guessed" and guessed.roll_deg == pytest.approx(roll_deg, abs=2.0) and len(guessed.assumed) == 2
 
 
 def test_the_ground_lies_where_it_is() -> None:

@@ -263,6 +263,14 @@ async def test_lines_are_drawn_corrected_and_removed(tmp_path: Path, size_px: tu
         await page.comes_true("Math.abs(studio.told.photo.pitch_deg) < 1.0")
         await page.tap("#stage", 0.5, 0.83)
         await page.comes_true("studio.told.state.lines.length === 2 && studio.told.busy === ''", 30.0)
+        await page.tap("#axis_h")
+        for y in (0.4, 0.25):
+            await dragged(page, (left + 0.1 * width, top + y * height), (0.8 * width, 0.0), mouse=size_px == DESK)
+            await page.comes_true(f"Math.abs(studio.told.state.lines.at(-1)[1] - {y * HEIGHT}) < 2 && studio.told.busy === ''", 30.0)
+        assert [each[4] for each in made.desk.state.lines].count("h") == 1, "there is one horizon"
+        # The camera looks down by how far the horizon lies above the middle.
+        down_px = "Math.tan(studio.told.photo.pitch_deg / 57.2958) * studio.told.photo.focal_px"
+        await page.comes_true(f"Math.abs({down_px} - {0.25 * HEIGHT}) < 3")
         await page.tap("#brush")
         assert await page.value("document.getElementById('lines_row').hidden && document.getElementById('lines').childElementCount === 0")
         assert page.errors == []

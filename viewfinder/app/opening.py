@@ -160,7 +160,7 @@ class LensBook:
         told = {"f_number": state.f_number, "focal_length_mm": state.focal_length_mm}
         facts = {name: value for name, value in told.items() if value}
         if lens.widest_f_number is not None and "f_number" in facts:
-            facts["f_number"] = max(facts["f_number"], lens.widest_f_number)
+            facts["f_number"] = max(facts["f_number"], lens.widest_f_number, lens.f_number)
         return lens.stating({"focus_distance_m": float(focus_m), **facts})
 
 

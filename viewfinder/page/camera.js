@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 76e5812187800afc3cc08817493b061f40eda058938b525aa706f4c00a3fab34
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: f728a5df334901a74bb8c2965dd3685e6ea3515680f4d3dc3514ea64e5ea7100
 "use strict";
 (() => {
   // src/model.ts

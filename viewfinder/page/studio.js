@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 76e5812187800afc3cc08817493b061f40eda058938b525aa706f4c00a3fab34
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: f728a5df334901a74bb8c2965dd3685e6ea3515680f4d3dc3514ea64e5ea7100
 "use strict";
 (() => {
   // src/model.ts
@@ -314,7 +314,7 @@
   // src/studio_panel.ts
   var F_NUMBERS = [1, 1.2, 1.4, 1.8, 2, 2.2, 2.4, 2.8, 3.2, 3.5, 4, 4.5, 5, 5.6, 6.3, 7.1, 8, 9, 10, 11, 13, 14, 16, 18, 20, 22, 25, 29, 32];
   var LONG_FORMATS = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers" };
-  var DEFAULT_SUN = [-60, 40];
+  var DEFAULT_SUN = [-125, 50];
   var nearestF = (f_number) => {
     const apart = F_NUMBERS.map((each) => Math.abs(Math.log(each / f_number)));
     return apart.indexOf(Math.min(...apart));
@@ -548,7 +548,7 @@
       document.querySelectorAll("input[name=lens]").forEach((each) => each.checked = each.value === (state.lens ?? ""));
       const [turn, high] = sunOf(state);
       const byFile = studio.told?.photo?.sun_deg;
-      byId("sun_told").textContent = byFile ? `By place, time and compass in the file the sun stood ${byFile[0]}° to the right and ${byFile[1]}° high, if it shone.` : "";
+      byId("sun_told").textContent = byFile ? `By place, time and compass in the file the sun stood ${Math.abs(byFile[0])}° to the ${byFile[0] < 0 ? "left" : "right"} and ${byFile[1]}° high, if it shone.` : "";
       byId("height_note").textContent = heightNote(state);
       const reach = (90 - high) / 0.9;
       const lamp = byId("lamp");
@@ -782,7 +782,7 @@
   };
 
   // src/studio_lines.ts
-  var AXES = ["y", "x", "z"];
+  var AXES = ["y", "x", "z", "h"];
   var NEAR = 16;
   var SHORTEST = 12;
   var Lines = class {
@@ -795,7 +795,7 @@
       const button = byId("draw_lines");
       button.addEventListener("click", () => {
         button.setAttribute("aria-pressed", String(!this.on));
-        studio.say(this.on ? "draw along edges: two of one direction, such as Upright, and one of another; drag an end of the chosen direction, tap the middle of a line to remove it" : "", this.on);
+        studio.say(this.on ? "draw along the horizon where it is seen, or along edges: two of one direction, such as Upright, and one of another; drag an end of the chosen direction, tap the middle of a line to remove it" : "", this.on);
         this.draw();
       });
       for (const axis of AXES) {
@@ -817,7 +817,7 @@
       const ends = this.lines.flatMap((each, line) => [0, 2].map((i) => ({ line, i, away: Math.hypot(each[i] - at_px[0], each[i + 1] - at_px[1]) })));
       const nearest = ends.sort((one, other) => one.away - other.away).find((each) => this.lines[each.line][4] === this.axis);
       if (nearest && nearest.away < NEAR * px) this.end = [nearest.line, nearest.i];
-      else this.end = [this.lines.push([at_px[0], at_px[1], at_px[0], at_px[1], this.axis]) - 1, 2];
+      else this.end = [(this.lines = this.lines.filter((each) => this.axis !== "h" || each[4] !== "h")).push([at_px[0], at_px[1], at_px[0], at_px[1], this.axis]) - 1, 2];
     }
     move(at_px) {
       const line = this.lines?.[this.end[0]];
@@ -868,7 +868,13 @@
     button = byId("sun_by");
     drawn = byId("pointed");
     points = [];
+    photo = "";
     constructor() {
+      studio.addEventListener("told", () => {
+        const photo = `${studio.told?.state.photo} ${studio.told?.state.slice}`;
+        if (photo !== this.photo && this.on) this.button.click();
+        this.photo = photo;
+      });
       this.button.addEventListener("click", () => {
         this.button.setAttribute("aria-pressed", String(!this.on));
         this.begin();
@@ -1213,7 +1219,7 @@
           this.stage.classList.remove("dragging");
           void studio.commit();
         },
-        pinch: (factor, _x, _y, _dx, _dy, turn_deg) => this.brush.on ? this.brush.scale(factor) : this.lines.on || this.shape(factor, turn_deg)
+        pinch: (factor, _x, _y, _dx, _dy, turn_deg) => this.brush.on ? this.brush.scale(factor) : this.lines.on || this.shadow.on || this.shape(factor, turn_deg)
       });
     }
     tapped(x, y) {
@@ -1317,7 +1323,7 @@
       });
       const hold = byId("hold_before");
       const show = (on) => {
-        this.before.hidden = !on;
+        this.before.hidden = !on && byId("brush_hide").getAttribute("aria-pressed") !== "true";
       };
       hold.addEventListener("pointerdown", () => show(true));
       for (const end of ["pointerup", "pointercancel", "pointerleave", "blur"]) hold.addEventListener(end, () => show(false));

@@ -10,6 +10,7 @@ from typing import Any, get_args, get_type_hints
 
 from mrbokeh.commands._composite_options import CompositeOptions, LensOptions, ObjectOptions, PlateOptions
 from mrbokeh.commands._insertion_options import LensFacts, LookGroup, VirtualOptions
+from mrbokeh.optics.lens_library import FOLDER as LIBRARY
 from mrbokeh.system.errors import InputError
 from viewfinder.studio.state import StudioState
 
@@ -88,6 +89,8 @@ def _word(value: Any) -> str:
 
 def _file(path: Path) -> str:
     """Return a path in the working folder by its short name; one that looks like an option is whole."""
+    if path.parent == LIBRARY and not Path(path.stem).exists():
+        return path.stem
     shown = os.path.relpath(path) if path.is_absolute() and path.is_relative_to(Path.cwd()) else str(path)
     return str(path.absolute()) if shown.startswith("-") else shown
 

@@ -189,6 +189,8 @@ class Desk:
         if (opened := self.photograph) is None:
             raise InputError("there is no photograph with a shadow yet: drop one on the page")
         sun_deg, said = await asyncio.to_thread(sun_by_pixels, self.state, opened, pixels)
+        if self.photograph is not opened:
+            raise InputError("another photograph was opened meanwhile: point at a shadow in that")
         self.project.add(replace(self.state, sun_deg=sun_deg, plain=False))
         self._keep()
         return said

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from mrbokeh.optics.lens_library import FOLDER as LIBRARY
-from mrbokeh.optics.lens_library import shipped
 from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError
 from viewfinder.studio.state import StudioState, state_of
@@ -16,6 +15,8 @@ FORMAT, VERSION = "mrbokeh studio", 1
 _EXPECTED = "a project file of `mrbokeh studio`"
 _MOST_STORED = 500
 """States of the history that a file keeps: half a megabyte; while the studio runs there is no limit."""
+_OF_LIBRARY = "library:"
+"""Before the name of a lens of the library, which no folder beside the project may take the place of."""
 _PATHS = ("photo", "depth", "matte", "object", "lens", "camera")
 
 
@@ -106,11 +107,13 @@ def _by_paths(state: StudioState, change: Callable[[Path], Path]) -> StudioState
 def _stored(path: Path, folder: Path) -> Path:
     whole = path.absolute()
     if whole.parent == LIBRARY:
-        return Path(path.stem)
+        return Path(f"{_OF_LIBRARY}{path.stem}")
     return whole.relative_to(folder) if whole.is_relative_to(folder) else whole
 
 
 def _found(path: Path, folder: Path) -> Path:
     """Return where a stored path leads, as one would type it from the working folder."""
-    whole = shipped(path if path.is_absolute() else folder / path)
+    if str(path).startswith(_OF_LIBRARY):
+        return LIBRARY / f"{str(path).removeprefix(_OF_LIBRARY)}.json"
+    whole = path if path.is_absolute() else folder / path
     return Path(os.path.relpath(whole)) if whole.is_relative_to(Path.cwd()) else whole

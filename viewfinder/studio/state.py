@@ -10,7 +10,7 @@ from mrbokeh.system.errors import InputError
 
 Pair = tuple[float, float]
 DrawnLine = tuple[float, float, float, float, str]
-"""Both ends of an edge in pixels, and its direction in the world: "y" upright, "x" and "z" the two level ones."""
+"""Both ends of an edge in pixels, and its direction in the world: "y" upright, "x" and "z" the two level ones; "h" is the horizon."""
 
 _DIGITS = 6
 """Significant digits of numbers: the command line shows them all, so that it makes the very same picture."""
@@ -208,8 +208,8 @@ def _lines(name: str, value: Any) -> tuple[DrawnLine, ...]:
         raise InputError(f"expected {name} to be a list of at most {_MOST_LINES} lines, got {_shown(value)}")
     pixel, lines = _number(*_PIXELS), []
     for each in value:
-        if not isinstance(each, list | tuple) or len(each) != 5 or each[4] not in ("x", "y", "z"):
-            raise InputError(f"expected each of {name} as x1, y1, x2, y2 and its direction x, y or z, got {_shown(each)}")
+        if not isinstance(each, list | tuple) or len(each) != 5 or each[4] not in ("x", "y", "z", "h"):
+            raise InputError(f"expected each of {name} as x1, y1, x2, y2 and its direction x, y, z or h, got {_shown(each)}")
         x1, y1, x2, y2 = (pixel(name, one) for one in each[:4])
         if math.hypot(x2 - x1, y2 - y1) < 1.0:
             raise InputError(f"expected each of {name} between two pixels, got {_shown(each)}: draw along an edge")

@@ -95,7 +95,8 @@ class OneObject:
 
     stands_at_m: in camera axes (x right, y down, z forward). world_from_camera: (3, 3) turns them into upright ones (`looking_down`).
     height_m: scaled to it; None keeps the size of the file. turn_rad: about the vertical, clockwise seen from above; at 0 the front of a
-    GLB, which is where +z of its file points, looks at the camera. shadow: darkness of the shadow, 0 to 1.
+    GLB, which is where +z of its file points, faces against the view (a scene file's yaw of 180 degrees). shadow: darkness of
+    the shadow, 0 to 1.
     """
 
     glb: Path

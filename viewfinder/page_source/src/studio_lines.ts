@@ -1,7 +1,7 @@
 // Lines drawn along edges, by which the server solves the camera, and a shadow that is pointed at, by which it finds the sun.
 import { byId, type DrawnLine, type Pair, type Told, inPhoto, studio } from "./studio_model";
 
-const AXES = ["y", "x", "z"] as const;
+const AXES = ["y", "x", "z", "h"] as const;
 const NEAR = 16;
 const SHORTEST = 12;
 
@@ -16,7 +16,7 @@ export class Lines {
     const button = byId<HTMLElement>("draw_lines");
     button.addEventListener("click", () => {
       button.setAttribute("aria-pressed", String(!this.on));
-      studio.say(this.on ? "draw along edges: two of one direction, such as Upright, and one of another; drag an end of the chosen direction, tap the middle of a line to remove it" : "", this.on);
+      studio.say(this.on ? "draw along the horizon where it is seen, or along edges: two of one direction, such as Upright, and one of another; drag an end of the chosen direction, tap the middle of a line to remove it" : "", this.on);
       this.draw();
     });
     for (const axis of AXES) {
@@ -40,7 +40,7 @@ export class Lines {
     const ends = this.lines.flatMap((each, line) => ([0, 2] as const).map((i) => ({ line, i, away: Math.hypot(each[i] - at_px[0], each[i + 1 as 1 | 3] - at_px[1]) })));
     const nearest = ends.sort((one, other) => one.away - other.away).find((each) => this.lines![each.line]![4] === this.axis);
     if (nearest && nearest.away < NEAR * px) this.end = [nearest.line, nearest.i];
-    else this.end = [this.lines.push([at_px[0], at_px[1], at_px[0], at_px[1], this.axis]) - 1, 2];
+    else this.end = [(this.lines = this.lines.filter((each) => this.axis !== "h" || each[4] !== "h")).push([at_px[0], at_px[1], at_px[0], at_px[1], this.axis]) - 1, 2];
   }
 
   move(at_px: Pair): void {
@@ -100,8 +100,15 @@ export class Shadow {
   private readonly button = byId<HTMLElement>("sun_by");
   private readonly drawn = byId<SVGSVGElement>("pointed");
   private points: Pair[] = [];
+  private photo = "";
 
   constructor() {
+    // Points on one photograph say nothing of the next.
+    studio.addEventListener("told", () => {
+      const photo = `${studio.told?.state.photo} ${studio.told?.state.slice}`;
+      if (photo !== this.photo && this.on) this.button.click();
+      this.photo = photo;
+    });
     this.button.addEventListener("click", () => {
       this.button.setAttribute("aria-pressed", String(!this.on));
       this.begin();

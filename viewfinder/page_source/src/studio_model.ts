@@ -6,8 +6,8 @@ export const byId = <T extends Element>(id: string): T => document.getElementByI
 
 export type Pair = [number, number];
 
-/** Both ends of an edge in pixels, and its direction in the world: y upright, x and z the two level ones. */
-export type DrawnLine = [number, number, number, number, "x" | "y" | "z"];
+/** Both ends of an edge in pixels, and its direction in the world: y upright, x and z the two level ones; h is the horizon. */
+export type DrawnLine = [number, number, number, number, "x" | "y" | "z" | "h"];
 
 /** An object that stands in the photograph. */
 export interface Placed {

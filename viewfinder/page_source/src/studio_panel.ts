@@ -3,7 +3,8 @@ import { byId, type Pair, type Save, scaledHeight, type State, studio } from "./
 
 const F_NUMBERS = [1, 1.2, 1.4, 1.8, 2, 2.2, 2.4, 2.8, 3.2, 3.5, 4, 4.5, 5, 5.6, 6.3, 7.1, 8, 9, 10, 11, 13, 14, 16, 18, 20, 22, 25, 29, 32];
 const LONG_FORMATS: Record<string, string> = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers" };
-const DEFAULT_SUN: Pair = [-60, 40];
+/** As the server guesses where only the exposure tells of the sun. */
+const DEFAULT_SUN: Pair = [-125, 50];
 
 interface Slider {
   id: string;
@@ -268,7 +269,7 @@ export class Panel {
     document.querySelectorAll<HTMLInputElement>("input[name=lens]").forEach((each) => (each.checked = each.value === (state.lens ?? "")));
     const [turn, high] = sunOf(state);
     const byFile = studio.told?.photo?.sun_deg;
-    byId("sun_told").textContent = byFile ? `By place, time and compass in the file the sun stood ${byFile[0]}° to the right and ${byFile[1]}° high, if it shone.` : "";
+    byId("sun_told").textContent = byFile ? `By place, time and compass in the file the sun stood ${Math.abs(byFile[0])}° to the ${byFile[0] < 0 ? "left" : "right"} and ${byFile[1]}° high, if it shone.` : "";
     byId("height_note").textContent = heightNote(state);
     const reach = (90 - high) / 0.9;
     const lamp = byId<SVGCircleElement>("lamp");

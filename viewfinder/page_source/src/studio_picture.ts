@@ -202,7 +202,7 @@ export class PictureStage {
         this.stage.classList.remove("dragging");
         void studio.commit();
       },
-      pinch: (factor, _x, _y, _dx, _dy, turn_deg) => (this.brush.on ? this.brush.scale(factor) : this.lines.on || this.shape(factor, turn_deg)),
+      pinch: (factor, _x, _y, _dx, _dy, turn_deg) => (this.brush.on ? this.brush.scale(factor) : this.lines.on || this.shadow.on || this.shape(factor, turn_deg)),
     });
   }
 
@@ -313,7 +313,7 @@ export class PictureStage {
     });
     const hold = byId<HTMLElement>("hold_before");
     const show = (on: boolean): void => {
-      this.before.hidden = !on;
+      this.before.hidden = !on && byId("brush_hide").getAttribute("aria-pressed") !== "true";
     };
     hold.addEventListener("pointerdown", () => show(true));
     for (const end of ["pointerup", "pointercancel", "pointerleave", "blur"]) hold.addEventListener(end, () => show(false));
