@@ -296,7 +296,9 @@ def test_options_of_the_command_are_checked_before_anything_listens(photo: Path,
     project.write()
     again = read_project(project.path)
     assert again.state.lens == lenses[1] and again.lenses[:2] == [*lenses] and "path" in bokeh_svg(lenses[1])
-    assert again.lenses[2].resolve() == LIBRARY / "biotar-58.json" and '"biotar-58"' in project.path.read_text(encoding="utf-8")
+    assert '"library:biotar-58"' in project.path.read_text(encoding="utf-8")
+    (tmp_path / "biotar-58").mkdir()
+    assert read_project(project.path).lenses[2] == LIBRARY / "biotar-58.json", "a folder of that name beside the project is another thing"
 
 
 async def asked(session: aiohttp.ClientSession, url: str, message: Any = None) -> tuple[int, Any]:

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: f728a5df334901a74bb8c2965dd3685e6ea3515680f4d3dc3514ea64e5ea7100
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 4cd5808fb120ca2e424b788dd7a9a68726740273d4ac1440fff02c937a6d9b7f
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: f728a5df334901a74bb8c2965dd3685e6ea3515680f4d3dc3514ea64e5ea7100
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 4cd5808fb120ca2e424b788dd7a9a68726740273d4ac1440fff02c937a6d9b7f
 "use strict";
 (() => {
   // src/model.ts
@@ -852,11 +852,11 @@
       if (!photo || !this.on) return;
       this.drawn.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
       const size = photo.width_px / this.drawn.clientWidth;
-      for (const [x1, y1, x2, y2, axis] of lines) this.drawn.append(drawnLine([[x1, y1], [x2, y2]], axis, size));
+      for (const [x1, y1, x2, y2, axis] of lines) this.drawn.append(drawnLine(this.drawn, [[x1, y1], [x2, y2]], axis, size));
     }
   };
-  function drawnLine(points, kind, size) {
-    const line = document.createElementNS("http://www.w3.org/2000/svg", "path");
+  function drawnLine(drawing, points, kind, size) {
+    const line = document.createElementNS(drawing.namespaceURI, "path");
     const ring = ([x, y]) => `M${x - 5 * size} ${y}a${5 * size} ${5 * size} 0 1 0 ${10 * size} 0a${5 * size} ${5 * size} 0 1 0 ${-10 * size} 0`;
     line.setAttribute("d", points.map(([x, y], i) => `${i ? "L" : "M"}${x} ${y}`).join("") + points.map(ring).join(""));
     line.setAttribute("class", kind);
@@ -890,7 +890,7 @@
       this.points.push(inPhoto(at_px));
       const photo = studio.told.photo;
       this.drawn.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
-      this.drawn.replaceChildren(drawnLine(this.points, "sun", px));
+      this.drawn.replaceChildren(drawnLine(this.drawn, this.points, "sun", px));
       if (this.points.length < POINTS.length) return studio.say(POINTS[this.points.length], true);
       await studio.commit();
       const told = await studio.post("/sun", { points: this.points });

@@ -79,13 +79,13 @@ export class Lines {
     if (!photo || !this.on) return;
     this.drawn.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
     const size = photo.width_px / this.drawn.clientWidth;
-    for (const [x1, y1, x2, y2, axis] of lines) this.drawn.append(drawnLine([[x1, y1], [x2, y2]], axis, size));
+    for (const [x1, y1, x2, y2, axis] of lines) this.drawn.append(drawnLine(this.drawn, [[x1, y1], [x2, y2]], axis, size));
   }
 }
 
 /** A line through points with a ring about each. size: pixels of the photograph in one of the window. */
-function drawnLine(points: Pair[], kind: string, size: number): SVGPathElement {
-  const line = document.createElementNS("http://www.w3.org/2000/svg", "path");
+function drawnLine(drawing: SVGElement, points: Pair[], kind: string, size: number): Element {
+  const line = document.createElementNS(drawing.namespaceURI, "path");
   const ring = ([x, y]: Pair): string => `M${x - 5 * size} ${y}a${5 * size} ${5 * size} 0 1 0 ${10 * size} 0a${5 * size} ${5 * size} 0 1 0 ${-10 * size} 0`;
   line.setAttribute("d", points.map(([x, y], i) => `${i ? "L" : "M"}${x} ${y}`).join("") + points.map(ring).join(""));
   line.setAttribute("class", kind);
@@ -126,7 +126,7 @@ export class Shadow {
     this.points.push(inPhoto(at_px));
     const photo = studio.told!.photo!;
     this.drawn.setAttribute("viewBox", `0 0 ${photo.width_px} ${photo.height_px}`);
-    this.drawn.replaceChildren(drawnLine(this.points, "sun", px));
+    this.drawn.replaceChildren(drawnLine(this.drawn, this.points, "sun", px));
     if (this.points.length < POINTS.length) return studio.say(POINTS[this.points.length]!, true);
     await studio.commit();
     const told = (await studio.post("/sun", { points: this.points })) as (Told & { said: string }) | null;
