@@ -295,6 +295,26 @@ async def test_the_sun_is_found_by_a_shadow_that_is_pointed_at(tmp_path: Path, s
         assert page.errors == []
 
 
+async def test_objects_keep_their_size_in_the_picture_when_the_ground_moves(tmp_path: Path) -> None:
+    """With the camera twice as high the ground is twice as far, and all metres are twice as many; metres that were typed stay."""
+
+    async def typed(page: Page, field: str, text: str) -> None:
+        told = f"const field = document.getElementById('{field}'); field.value = '{text}'; field.dispatchEvent(new Event('change'))"
+        await page.value(f"(() => {{ {told} }})()")
+        await page.comes_true("!studio.isChanging")
+
+    async with opened(tmp_path, DESK) as (page, made):
+        await placed(page, made)
+        await page.comes_true("studio.told.state.height !== null && !studio.isChanging")
+        height, high_m = float(made.desk.state.height or 0), made.desk.state.camera_height_m
+        assert high_m == 1.5
+        await typed(page, "camera_height", "3")
+        assert float(made.desk.state.height or 0) == pytest.approx(2.0 * height, rel=1e-4) and made.desk.state.camera_height_m == 3.0
+        await typed(page, "height", "0.5")
+        await typed(page, "camera_height", "1.5")
+        assert made.desk.state.height == "0.5" and page.errors == []
+
+
 async def test_light_lens_and_before_are_shown(tmp_path: Path) -> None:
     photo = write_floor(tmp_path / "floor.png")
     async with opened(tmp_path, DESK, StudioState(photo=photo, pitch_deg=0.0)) as (page, made):

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 4cd5808fb120ca2e424b788dd7a9a68726740273d4ac1440fff02c937a6d9b7f
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: eb7b7f9515c4be73fa8e0c3f8e857e5965657ac4d26c9adaf0a8965fbd418ae1
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 4cd5808fb120ca2e424b788dd7a9a68726740273d4ac1440fff02c937a6d9b7f
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: eb7b7f9515c4be73fa8e0c3f8e857e5965657ac4d26c9adaf0a8965fbd418ae1
 "use strict";
 (() => {
   // src/model.ts
@@ -73,6 +73,8 @@
     /** Pictures that reached the screen, and how long the last draft took from the change to the screen. */
     counts = { drafts: 0, whole: 0, draft_ms: 0, whole_ms: 0 };
     pixels = 1e6;
+    /** Whether the height of the object was typed in metres, which then stay. */
+    metresTyped = false;
     local = {};
     sending = {};
     sends = Promise.resolve();
@@ -311,6 +313,139 @@
     }
   };
 
+  // src/studio_ground.ts
+  var ACROSS = 5;
+  var WIDE = 40;
+  var DEEP = 50;
+  var LEVELS2 = 4;
+  var LEAST_APART = 8e-3;
+  var EYES_M = 1.5;
+  var BELOW_DEG = 10;
+  function lookingDown(pitch_deg) {
+    const [cos, sin] = [Math.cos(pitch_deg * Math.PI / 180), Math.sin(pitch_deg * Math.PI / 180)];
+    return [[1, 0, 0], [0, cos, sin], [0, -sin, cos]];
+  }
+  var Ground = class {
+    constructor(photo, focal_px, state) {
+      this.photo = photo;
+      this.focal_px = focal_px;
+      this.turn = state.pitch_deg === null ? photo.world_from_camera ?? lookingDown(0) : lookingDown(state.pitch_deg);
+      this.high_m = state.camera_height_m ?? photo.camera_height_m ?? EYES_M;
+    }
+    photo;
+    focal_px;
+    turn;
+    high_m;
+    /** The ray of a pixel, of length 1 along the view, in upright axes. */
+    ray([x_px, y_px]) {
+      const seen = [(x_px - this.photo.width_px / 2) / this.focal_px, (y_px - this.photo.height_px / 2) / this.focal_px, 1];
+      const along = (row) => row[0] * seen[0] + row[1] * seen[1] + row[2] * seen[2];
+      return [along(this.turn[0]), along(this.turn[1]), along(this.turn[2])];
+    }
+    /** Row of the horizon in a column. */
+    horizon_px(x_px) {
+      const [right2, down, ahead] = this.turn[1];
+      const across = (x_px - this.photo.width_px / 2) / this.focal_px;
+      return this.photo.height_px / 2 - this.focal_px * (ahead + right2 * across) / down;
+    }
+    /** Distance along the view of the ground under a pixel, null above the horizon. */
+    distance_m(at_px) {
+      const falls = this.ray(at_px)[1];
+      return falls > 1e-6 ? this.high_m / falls : null;
+    }
+    /** Length of so many pixels across the view, on the ground under a pixel. */
+    length_m(at_px, pixels) {
+      return pixels * (this.distance_m(at_px) ?? 0) / this.focal_px;
+    }
+    /** The pixel, or the nearest below the horizon and within the photograph. */
+    within([x, y]) {
+      const { width_px, height_px } = this.photo;
+      const column = Math.min(width_px - 1, Math.max(0, x));
+      const top = Math.max(0, this.horizon_px(column) + 4e-3 * height_px);
+      return [column, Math.min(height_px - 1, Math.max(Math.min(top, height_px - 1), y))];
+    }
+    /** Middle of the lowest row. */
+    get lowest_px() {
+      return [this.photo.width_px / 2, this.photo.height_px];
+    }
+    /** Distance ahead on the ground, level, of what the lowest row shows; null where it shows no ground. */
+    get nearest_m() {
+      const z_m = this.distance_m(this.lowest_px);
+      return z_m === null ? null : z_m * this.ray(this.lowest_px)[2];
+    }
+    /** Whether the picture shows ground at all. */
+    get isInSight() {
+      return this.distance_m(this.lowest_px) !== null && this.horizon_px(this.photo.width_px / 2) < 0.97 * this.photo.height_px;
+    }
+    /** How far a camera looks down, in degrees, for which the ground at a pixel lies as deep below the horizon as it usually does. */
+    usualTilt_deg([, y_px]) {
+      const below_deg = Math.atan((y_px - this.photo.height_px / 2) / this.focal_px) * 180 / Math.PI;
+      return Number(Math.max(0, BELOW_DEG - below_deg).toFixed(1));
+    }
+    /** Side of a cell of the grid, metres: 1, 2 or 5 of a power of ten, about five of which fit into the lowest row. */
+    get cell_m() {
+      const z_m = this.distance_m(this.lowest_px) ?? this.high_m;
+      const wanted = z_m * this.photo.width_px / this.focal_px / ACROSS;
+      const power = 10 ** Math.floor(Math.log10(wanted));
+      return Number((power * (wanted / power >= 5 ? 5 : wanted / power >= 2 ? 2 : 1)).toPrecision(1));
+    }
+    /** The grid as the path of an SVG in pixels of the photograph. */
+    grid() {
+      const [cell, nearest_m] = [this.cell_m, this.nearest_m];
+      if (nearest_m === null) return "";
+      const lines = [];
+      const cut_m = 0.02 * this.high_m;
+      let [first, row_px] = [Math.floor(nearest_m / cell) - 1, Infinity];
+      for (let side = cell, level = 0; level < LEVELS2; side *= 5, level++) {
+        let last = first;
+        for (; last <= first + DEEP; last++) {
+          const [, y, z] = this.seen(0, last * side);
+          if (z > cut_m && row_px - y < LEAST_APART * this.photo.height_px) break;
+          row_px = z > cut_m ? y : row_px;
+          this.line(lines, [-WIDE * side, last * side], [WIDE * side, last * side], cut_m);
+        }
+        for (let i = -WIDE; i <= WIDE; i++) this.line(lines, [i * side, first * side], [i * side, last * side], cut_m);
+        first = Math.ceil(last / 5);
+      }
+      return lines.join("");
+    }
+    /** A circle on the ground about a pixel, as the path of an SVG. */
+    circle(at_px, radius_m) {
+      const z_m = this.distance_m(at_px);
+      if (z_m === null) return "";
+      const [x, , ahead] = this.ray(at_px);
+      const points = Array.from({ length: 33 }, (_, i) => {
+        const turn = i / 32 * 2 * Math.PI;
+        return this.seen(x * z_m + radius_m * Math.cos(turn), ahead * z_m + radius_m * Math.sin(turn));
+      });
+      if (points.some((each) => each[2] <= 0)) return "";
+      return points.map(([across, down], i) => `${i ? "L" : "M"}${across.toFixed(1)} ${down.toFixed(1)}`).join("");
+    }
+    /** Pixel and depth of a point of the ground. */
+    seen(x_m, ahead_m) {
+      const z = this.depth(x_m, ahead_m);
+      const column = (i) => this.turn[0][i] * x_m + this.turn[1][i] * this.high_m + this.turn[2][i] * ahead_m;
+      return [this.photo.width_px / 2 + this.focal_px * column(0) / z, this.photo.height_px / 2 + this.focal_px * column(1) / z, z];
+    }
+    depth(x_m, ahead_m) {
+      return this.turn[0][2] * x_m + this.turn[1][2] * this.high_m + this.turn[2][2] * ahead_m;
+    }
+    line(lines, [x0, a0], [x1, a1], nearest_m) {
+      const [z0, z1] = [this.depth(x0, a0), this.depth(x1, a1)];
+      if (z0 < nearest_m && z1 < nearest_m) return;
+      const cut = (x, a, z, x2, a2, z2) => {
+        if (z >= nearest_m) return [x, a];
+        const share = (nearest_m - z) / (z2 - z);
+        return [x + share * (x2 - x), a + share * (a2 - a)];
+      };
+      const [p, q] = [this.seen(...cut(x0, a0, z0, x1, a1, z1)), this.seen(...cut(x1, a1, z1, x0, a0, z0))];
+      lines.push(`M${p[0].toFixed(1)} ${p[1].toFixed(1)}L${q[0].toFixed(1)} ${q[1].toFixed(1)}`);
+    }
+  };
+  function groundOf(photo, state) {
+    return photo && state && photo.focal_px !== null && !photo.has_depth && !state.plain ? new Ground(photo, photo.focal_px, state) : null;
+  }
+
   // src/studio_panel.ts
   var F_NUMBERS = [1, 1.2, 1.4, 1.8, 2, 2.2, 2.4, 2.8, 3.2, 3.5, 4, 4.5, 5, 5.6, 6.3, 7.1, 8, 9, 10, 11, 13, 14, 16, 18, 20, 22, 25, 29, 32];
   var LONG_FORMATS = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers" };
@@ -337,7 +472,7 @@
       shown: (v) => `${v > 0 ? "+" : ""}${v.toFixed(1)} stops`
     },
     { id: "shadow", read: (s) => s.shadow ?? 1, write: (v) => ({ shadow: v === 1 ? null : v }), shown: (v) => `${Math.round(100 * v)} %` },
-    { id: "pitch", read: (s) => s.pitch_deg ?? studio.told?.photo?.pitch_deg ?? 0, write: (pitch_deg) => ({ pitch_deg }), shown: (v) => degrees(v) }
+    { id: "pitch", read: (s) => s.pitch_deg ?? studio.told?.photo?.pitch_deg ?? 0, write: (pitch_deg) => keepingSizes({ pitch_deg }), shown: (v) => degrees(v) }
   ];
   var sunOf = (state) => state?.sun_deg ?? studio.told?.photo?.sun_deg ?? DEFAULT_SUN;
   var right = () => sunOf(studio.state)[0];
@@ -396,12 +531,16 @@
       input.addEventListener("change", () => {
         const value = input.value === "" ? null : input.valueAsNumber;
         if (value !== null && !(value > 0)) return studio.say("give a number above 0, or nothing for automatic");
-        void studio.commit({ [name]: value, ...also });
+        const changes = { [name]: value, ...also };
+        void studio.commit(id === "camera_height" ? keepingSizes(changes) : changes);
       });
     }
     height() {
       const input = byId("height");
-      input.addEventListener("change", () => void studio.commit({ height: input.value.trim().replace(",", ".") || null }));
+      input.addEventListener("change", () => {
+        studio.metresTyped = !input.value.trim().endsWith("px");
+        void studio.commit({ height: input.value.trim().replace(",", ".") || null });
+      });
     }
     /** Another picture of the stack is opened once the hand lets the handle go. */
     slices() {
@@ -572,6 +711,17 @@
       if (studio.state) byId("focus_told").textContent = focusTold(studio.state);
     }
   };
+  function keepingSizes(changes) {
+    const [photo, state] = [studio.told?.photo ?? null, studio.state];
+    const [from, to] = [groundOf(photo, state), state && groundOf(photo, { ...state, ...changes })];
+    if (!state || !from || !to || studio.metresTyped) return changes;
+    const scaled = ({ at_px, height }) => {
+      const factor = (to.distance_m(at_px) ?? 0) / (from.distance_m(at_px) ?? 0);
+      return height?.endsWith("px") || !Number.isFinite(factor) || !factor ? height : scaledHeight(height, factor);
+    };
+    const all = (placed) => placed.map((each) => ({ ...each, height: scaled(each) }));
+    return { ...changes, height: state.at_px && scaled({ at_px: state.at_px, height: state.height }), before: all(state.before), after: all(state.after) };
+  }
   function heightNote(state) {
     const guessed = state.camera_height_m && !studio.told?.photo?.has_depth ? ` for a camera ${state.camera_height_m} m above the ground (see below)` : "";
     return `Metres${guessed}, or pixels such as 120px. Wheel, pinch, + and - scale it.`;
@@ -906,139 +1056,6 @@
     }
   };
 
-  // src/studio_ground.ts
-  var ACROSS = 5;
-  var WIDE = 40;
-  var DEEP = 50;
-  var LEVELS2 = 4;
-  var LEAST_APART = 8e-3;
-  var EYES_M = 1.5;
-  var BELOW_DEG = 10;
-  function lookingDown(pitch_deg) {
-    const [cos, sin] = [Math.cos(pitch_deg * Math.PI / 180), Math.sin(pitch_deg * Math.PI / 180)];
-    return [[1, 0, 0], [0, cos, sin], [0, -sin, cos]];
-  }
-  var Ground = class {
-    constructor(photo, focal_px, state) {
-      this.photo = photo;
-      this.focal_px = focal_px;
-      this.turn = state.pitch_deg === null ? photo.world_from_camera ?? lookingDown(0) : lookingDown(state.pitch_deg);
-      this.high_m = state.camera_height_m ?? photo.camera_height_m ?? EYES_M;
-    }
-    photo;
-    focal_px;
-    turn;
-    high_m;
-    /** The ray of a pixel, of length 1 along the view, in upright axes. */
-    ray([x_px, y_px]) {
-      const seen = [(x_px - this.photo.width_px / 2) / this.focal_px, (y_px - this.photo.height_px / 2) / this.focal_px, 1];
-      const along = (row) => row[0] * seen[0] + row[1] * seen[1] + row[2] * seen[2];
-      return [along(this.turn[0]), along(this.turn[1]), along(this.turn[2])];
-    }
-    /** Row of the horizon in a column. */
-    horizon_px(x_px) {
-      const [right2, down, ahead] = this.turn[1];
-      const across = (x_px - this.photo.width_px / 2) / this.focal_px;
-      return this.photo.height_px / 2 - this.focal_px * (ahead + right2 * across) / down;
-    }
-    /** Distance along the view of the ground under a pixel, null above the horizon. */
-    distance_m(at_px) {
-      const falls = this.ray(at_px)[1];
-      return falls > 1e-6 ? this.high_m / falls : null;
-    }
-    /** Length of so many pixels across the view, on the ground under a pixel. */
-    length_m(at_px, pixels) {
-      return pixels * (this.distance_m(at_px) ?? 0) / this.focal_px;
-    }
-    /** The pixel, or the nearest below the horizon and within the photograph. */
-    within([x, y]) {
-      const { width_px, height_px } = this.photo;
-      const column = Math.min(width_px - 1, Math.max(0, x));
-      const top = Math.max(0, this.horizon_px(column) + 4e-3 * height_px);
-      return [column, Math.min(height_px - 1, Math.max(Math.min(top, height_px - 1), y))];
-    }
-    /** Middle of the lowest row. */
-    get lowest_px() {
-      return [this.photo.width_px / 2, this.photo.height_px];
-    }
-    /** Distance ahead on the ground, level, of what the lowest row shows; null where it shows no ground. */
-    get nearest_m() {
-      const z_m = this.distance_m(this.lowest_px);
-      return z_m === null ? null : z_m * this.ray(this.lowest_px)[2];
-    }
-    /** Whether the picture shows ground at all. */
-    get isInSight() {
-      return this.distance_m(this.lowest_px) !== null && this.horizon_px(this.photo.width_px / 2) < 0.97 * this.photo.height_px;
-    }
-    /** How far a camera looks down, in degrees, for which the ground at a pixel lies as deep below the horizon as it usually does. */
-    usualTilt_deg([, y_px]) {
-      const below_deg = Math.atan((y_px - this.photo.height_px / 2) / this.focal_px) * 180 / Math.PI;
-      return Number(Math.max(0, BELOW_DEG - below_deg).toFixed(1));
-    }
-    /** Side of a cell of the grid, metres: 1, 2 or 5 of a power of ten, about five of which fit into the lowest row. */
-    get cell_m() {
-      const z_m = this.distance_m(this.lowest_px) ?? this.high_m;
-      const wanted = z_m * this.photo.width_px / this.focal_px / ACROSS;
-      const power = 10 ** Math.floor(Math.log10(wanted));
-      return Number((power * (wanted / power >= 5 ? 5 : wanted / power >= 2 ? 2 : 1)).toPrecision(1));
-    }
-    /** The grid as the path of an SVG in pixels of the photograph. */
-    grid() {
-      const [cell, nearest_m] = [this.cell_m, this.nearest_m];
-      if (nearest_m === null) return "";
-      const lines = [];
-      const cut_m = 0.02 * this.high_m;
-      let [first, row_px] = [Math.floor(nearest_m / cell) - 1, Infinity];
-      for (let side = cell, level = 0; level < LEVELS2; side *= 5, level++) {
-        let last = first;
-        for (; last <= first + DEEP; last++) {
-          const [, y, z] = this.seen(0, last * side);
-          if (z > cut_m && row_px - y < LEAST_APART * this.photo.height_px) break;
-          row_px = z > cut_m ? y : row_px;
-          this.line(lines, [-WIDE * side, last * side], [WIDE * side, last * side], cut_m);
-        }
-        for (let i = -WIDE; i <= WIDE; i++) this.line(lines, [i * side, first * side], [i * side, last * side], cut_m);
-        first = Math.ceil(last / 5);
-      }
-      return lines.join("");
-    }
-    /** A circle on the ground about a pixel, as the path of an SVG. */
-    circle(at_px, radius_m) {
-      const z_m = this.distance_m(at_px);
-      if (z_m === null) return "";
-      const [x, , ahead] = this.ray(at_px);
-      const points = Array.from({ length: 33 }, (_, i) => {
-        const turn = i / 32 * 2 * Math.PI;
-        return this.seen(x * z_m + radius_m * Math.cos(turn), ahead * z_m + radius_m * Math.sin(turn));
-      });
-      if (points.some((each) => each[2] <= 0)) return "";
-      return points.map(([across, down], i) => `${i ? "L" : "M"}${across.toFixed(1)} ${down.toFixed(1)}`).join("");
-    }
-    /** Pixel and depth of a point of the ground. */
-    seen(x_m, ahead_m) {
-      const z = this.depth(x_m, ahead_m);
-      const column = (i) => this.turn[0][i] * x_m + this.turn[1][i] * this.high_m + this.turn[2][i] * ahead_m;
-      return [this.photo.width_px / 2 + this.focal_px * column(0) / z, this.photo.height_px / 2 + this.focal_px * column(1) / z, z];
-    }
-    depth(x_m, ahead_m) {
-      return this.turn[0][2] * x_m + this.turn[1][2] * this.high_m + this.turn[2][2] * ahead_m;
-    }
-    line(lines, [x0, a0], [x1, a1], nearest_m) {
-      const [z0, z1] = [this.depth(x0, a0), this.depth(x1, a1)];
-      if (z0 < nearest_m && z1 < nearest_m) return;
-      const cut = (x, a, z, x2, a2, z2) => {
-        if (z >= nearest_m) return [x, a];
-        const share = (nearest_m - z) / (z2 - z);
-        return [x + share * (x2 - x), a + share * (a2 - a)];
-      };
-      const [p, q] = [this.seen(...cut(x0, a0, z0, x1, a1, z1)), this.seen(...cut(x1, a1, z1, x0, a0, z0))];
-      lines.push(`M${p[0].toFixed(1)} ${p[1].toFixed(1)}L${q[0].toFixed(1)} ${q[1].toFixed(1)}`);
-    }
-  };
-  function groundOf(photo, state) {
-    return photo && state && photo.focal_px !== null && !photo.has_depth && !state.plain ? new Ground(photo, photo.focal_px, state) : null;
-  }
-
   // src/studio_picture.ts
   var NUDGES_REST_MS = 500;
   var LOUPE_PX = 240;
@@ -1244,6 +1261,7 @@
     shape(factor, turn_deg) {
       const state = studio.state;
       if (!state?.at_px) return;
+      if (factor !== 1) studio.metresTyped = false;
       const turned = turn_deg ? { turn_deg: Number(within180(state.turn_deg + turn_deg).toFixed(2)) } : {};
       studio.change({ height: scaledHeight(state.height, factor), ...turned });
       this.commitLater();

@@ -124,6 +124,8 @@ export class Studio extends EventTarget {
   /** Pictures that reached the screen, and how long the last draft took from the change to the screen. */
   counts = { drafts: 0, whole: 0, draft_ms: 0, whole_ms: 0 };
   pixels = 1e6;
+  /** Whether the height of the object was typed in metres, which then stay. */
+  metresTyped = false;
   private local: Partial<State> = {};
   private sending: Partial<State> = {};
   private sends: Promise<void> = Promise.resolve();

@@ -1,5 +1,6 @@
 // The panel: fields for everything of the state, the light's dome, the command line and the saves.
-import { byId, type Pair, type Save, scaledHeight, type State, studio } from "./studio_model";
+import { groundOf } from "./studio_ground";
+import { byId, type Pair, type Placed, type Save, scaledHeight, type State, studio } from "./studio_model";
 
 const F_NUMBERS = [1, 1.2, 1.4, 1.8, 2, 2.2, 2.4, 2.8, 3.2, 3.5, 4, 4.5, 5, 5.6, 6.3, 7.1, 8, 9, 10, 11, 13, 14, 16, 18, 20, 22, 25, 29, 32];
 const LONG_FORMATS: Record<string, string> = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers" };
@@ -36,7 +37,7 @@ const SLIDERS: Slider[] = [
     shown: (v) => `${v > 0 ? "+" : ""}${v.toFixed(1)} stops`,
   },
   { id: "shadow", read: (s) => s.shadow ?? 1, write: (v) => ({ shadow: v === 1 ? null : v }), shown: (v) => `${Math.round(100 * v)} %` },
-  { id: "pitch", read: (s) => s.pitch_deg ?? studio.told?.photo?.pitch_deg ?? 0, write: (pitch_deg) => ({ pitch_deg }), shown: (v) => degrees(v) },
+  { id: "pitch", read: (s) => s.pitch_deg ?? studio.told?.photo?.pitch_deg ?? 0, write: (pitch_deg) => keepingSizes({ pitch_deg }), shown: (v) => degrees(v) },
 ];
 
 /** Where the sun is, or would be: as told, as the file tells, or somewhere. */
@@ -103,13 +104,17 @@ export class Panel {
     input.addEventListener("change", () => {
       const value = input.value === "" ? null : input.valueAsNumber;
       if (value !== null && !(value > 0)) return studio.say("give a number above 0, or nothing for automatic");
-      void studio.commit({ [name]: value, ...also });
+      const changes = { [name]: value, ...also };
+      void studio.commit(id === "camera_height" ? keepingSizes(changes) : changes);
     });
   }
 
   private height(): void {
     const input = byId<HTMLInputElement>("height");
-    input.addEventListener("change", () => void studio.commit({ height: input.value.trim().replace(",", ".") || null }));
+    input.addEventListener("change", () => {
+      studio.metresTyped = !input.value.trim().endsWith("px");
+      void studio.commit({ height: input.value.trim().replace(",", ".") || null });
+    });
   }
 
   /** Another picture of the stack is opened once the hand lets the handle go. */
@@ -294,6 +299,19 @@ export class Panel {
     if (studio.isChanging) byId("command").textContent = shown.command ?? "";
     if (studio.state) byId("focus_told").textContent = focusTold(studio.state);
   }
+}
+
+/** The changes, with heights by which objects keep their size in the picture where the ground moves away under them; typed metres stay. */
+function keepingSizes(changes: Partial<State>): Partial<State> {
+  const [photo, state] = [studio.told?.photo ?? null, studio.state];
+  const [from, to] = [groundOf(photo, state), state && groundOf(photo, { ...state, ...changes })];
+  if (!state || !from || !to || studio.metresTyped) return changes;
+  const scaled = ({ at_px, height }: { at_px: Pair; height: string | null }): string | null => {
+    const factor = (to.distance_m(at_px) ?? 0) / (from.distance_m(at_px) ?? 0);
+    return height?.endsWith("px") || !Number.isFinite(factor) || !factor ? height : scaledHeight(height, factor);
+  };
+  const all = (placed: Placed[]): Placed[] => placed.map((each) => ({ ...each, height: scaled(each) }));
+  return { ...changes, height: state.at_px && scaled({ at_px: state.at_px, height: state.height }), before: all(state.before), after: all(state.after) };
 }
 
 /** What the number of the height counts. */

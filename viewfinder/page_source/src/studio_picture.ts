@@ -229,6 +229,7 @@ export class PictureStage {
   private shape(factor: number, turn_deg: number): void {
     const state = studio.state;
     if (!state?.at_px) return;
+    if (factor !== 1) studio.metresTyped = false;
     const turned = turn_deg ? { turn_deg: Number(within180(state.turn_deg + turn_deg).toFixed(2)) } : {};
     studio.change({ height: scaledHeight(state.height, factor), ...turned });
     this.commitLater();
