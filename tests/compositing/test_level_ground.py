@@ -77,6 +77,24 @@ def test_where_nothing_tells_ground_lies_as_deep_as_it_usually_does(focus_m: flo
         assert plate.lens.focus_distance_m == pytest.approx(place_m(standing)[2])
 
 
+@pytest.mark.parametrize(("rows", "down_deg"), [(240, 4.41), (390, -6.6), (60, 0.0), (20, 0.0)])
+def test_blue_sky_ends_no_lower_than_the_horizon(rows: int, down_deg: float) -> None:
+    """Ground 30 px below the end of the sky would have a horizon 10 degrees over it. A horizon 60 px over the middle is 4.4 degrees, one
+    90 px below it is looking up; little sky tells nothing, and ground in row 450 is 11 degrees below a level view, which is enough.
+    """
+    rgb = np.random.default_rng(1).uniform(0.15, 0.25, (600, 800, 3)).astype(np.float32)
+    rgb[:rows] = np.linspace(0.6, 0.9, rows, dtype=np.float32)[:, None, None] * np.float32([0.3, 0.5, 0.9])
+    rgb[:, 700:] = 0.1  # a tower
+    standing = replace(FOOT, at_pixel=[f"400,{rows + 30 if down_deg else 450}"])
+    plate, _ = on_level_ground(replace(photograph(focus_known=False), rgb=rgb), standing)
+    assert plate.world_from_camera is not None
+    found_deg = np.degrees(np.arcsin(plate.world_from_camera[1, 2]))
+    assert found_deg == pytest.approx(down_deg, abs=0.3)
+    if down_deg:
+        with pytest.raises(InputError, match="above the horizon"):
+            on_level_ground(replace(photograph(focus_known=False), rgb=rgb), replace(FOOT, at_pixel=[f"400,{rows - 10}"]))
+
+
 def test_straight_lines_tell_how_the_camera_was_held_and_its_field_of_view() -> None:
     made = place("room", 101, 24.0)
     rgb = made.linear()

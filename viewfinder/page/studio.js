@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: eb7b7f9515c4be73fa8e0c3f8e857e5965657ac4d26c9adaf0a8965fbd418ae1
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 76575218f629e3c44f494318e1e4b9132afedcdc4ca2011e143070df11146353
 "use strict";
 (() => {
   // src/model.ts
@@ -729,7 +729,7 @@
   function groundTold() {
     const [told, state] = [studio.told, studio.state];
     if (!told?.photo || told.photo.has_depth || !state?.camera_height_m) return [];
-    const tilt = state.camera === null && state.pitch_deg !== null ? [`The camera looks down by ${state.pitch_deg}°, which nothing in the picture tells: see Camera and ground, or draw Lines.`] : [];
+    const tilt = state.camera === null && state.pitch_deg !== null ? [`The camera looks down by ${state.pitch_deg}°, which little in the picture tells: see Camera and ground, or draw Lines.`] : [];
     return [...tilt, `The camera is ${state.camera_height_m} m above the ground; all metres hang on that.`];
   }
   async function save(format) {

@@ -145,7 +145,7 @@ class OpenedPhotograph:
         elif plate.world_from_camera is None:
             foot_px = self.small(options, most_px).standing.first_px
             down_rad = usual_tilt_rad(plate, plate.camera.unproject(np.array(foot_px), np.array(1.0)))
-            plate = replace(plate, world_from_camera=looking_down(down_rad if down_rad >= np.radians(_LEAST_TILT_DEG) else 0.0))
+            plate = replace(plate, world_from_camera=looking_down(down_rad if abs(down_rad) >= np.radians(_LEAST_TILT_DEG) else 0.0))
         return plate, renderer, known_height_m
 
     def _small_px(self, most_px: float) -> tuple[int, int]:

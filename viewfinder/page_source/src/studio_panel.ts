@@ -324,7 +324,7 @@ function heightNote(state: State): string {
 function groundTold(): string[] {
   const [told, state] = [studio.told, studio.state];
   if (!told?.photo || told.photo.has_depth || !state?.camera_height_m) return [];
-  const tilt = state.camera === null && state.pitch_deg !== null ? [`The camera looks down by ${state.pitch_deg}°, which nothing in the picture tells: see Camera and ground, or draw Lines.`] : [];
+  const tilt = state.camera === null && state.pitch_deg !== null ? [`The camera looks down by ${state.pitch_deg}°, which little in the picture tells: see Camera and ground, or draw Lines.`] : [];
   return [...tilt, `The camera is ${state.camera_height_m} m above the ground; all metres hang on that.`];
 }
 
