@@ -1,6 +1,5 @@
 """One picture of `mrbokeh composite` from an opened plate: the camera held, the object placed, all put in and finished."""
 
-import math
 from collections.abc import Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -12,7 +11,7 @@ from mrbokeh.commands._composite_layers import held_upright, layers_by
 from mrbokeh.commands._composite_options import CompositeOptions, ObjectOptions, typed_shadow
 from mrbokeh.commands._insertion_options import VirtualOptions
 from mrbokeh.commands._level_ground import focused_on_foot, held_told, on_level_ground, sun_by_shadow
-from mrbokeh.compositing.choose import best_mode, insertion_of
+from mrbokeh.compositing.choose import best_mode, insertion_of, without_what_touches_the_lens
 from mrbokeh.compositing.ground import with_ground_behind
 from mrbokeh.compositing.near_and_far import nearer_than
 from mrbokeh.compositing.plate import Inserted, Insertion, Plate
@@ -30,8 +29,6 @@ if TYPE_CHECKING:
 
 _NEARER, _MUCH_HIDDEN, _ALL_HIDDEN = 0.03, 0.4, 0.99
 _RASTER, _COLOURLESS = 200, 0.004
-_WIDEST = 2.0
-"""Largest circle of confusion, in diagonals of the picture: of what has a larger one a sixth of the light at most would be seen."""
 
 
 @dataclass(frozen=True)
@@ -101,19 +98,6 @@ def composited(
             inserted = replace(inserted, virtual=replace(inserted.virtual, rgb=grey))
         inserted = finished(inserted, plate, finishing)
     return Composited(inserted, plate, sharp, mode)
-
-
-def without_what_touches_the_lens(layer: Layer, plate: Plate) -> Layer:
-    """Return the layer without what is so near that its light goes everywhere: it would take any amount of memory."""
-    least_px = -_WIDEST * math.hypot(layer.width_px, layer.height_px)
-    nearest_m = float(np.min(layer.depth_m, initial=np.inf, where=layer.alpha > 0.0))
-    if nearest_m == np.inf or plate.lens.coc_px(nearest_m, layer.width_px) >= least_px:
-        return layer
-    touching = (layer.alpha > 0.0) & (plate.lens.coc_px(np.where(layer.alpha > 0.0, layer.depth_m, np.inf), layer.width_px) < least_px)
-    clear = np.where(touching, np.float32(0.0), np.float32(1.0))
-    extra = {name: values * clear[..., None] for name, values in layer.extra.items()}
-    depth_m = np.where(touching, np.float32(np.inf), layer.depth_m)
-    return Layer(layer.rgb * clear[..., None], layer.alpha * clear, depth_m, extra)
 
 
 def is_monochrome(plate: Plate) -> bool:

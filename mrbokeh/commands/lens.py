@@ -1,6 +1,6 @@
 """`mrbokeh lens`: make, inspect and draw lens files and banks of PSFs, and what a renderer splats of them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -282,6 +282,9 @@ def new(
     tell(f"wrote {out}")
 
 
+_LEAST_SENSOR_MM, _LARGEST_SENSOR_MM = 2.0, 400.0
+
+
 @app.command()
 def describe(
     prescription: Annotated[Path, typer.Argument(help="A .dat file of lens surfaces, or a name of `lens list`.")],
@@ -297,6 +300,7 @@ def describe(
     Example: mrbokeh lens describe dgauss.50mm.dat --blades 8 --out double_gauss.json
     """
     from mrbokeh.images.image_io import require_suffix
+    from mrbokeh.optics.aperture import Aperture
     from mrbokeh.optics.lens_file import write_lens
     from mrbokeh.psf_models.lens_description import describe as described
     from mrbokeh.psf_models.lens_description import held_out_error
@@ -306,6 +310,10 @@ def describe(
 
     require_suffix(out, (".json",), "LENS")
     require_safe_outputs((out,), (prescription,), overwrite)
+    replace(Aperture.disc(), iris_blades=blades)  # refused here rather than after the work
+    for name, size_mm in (("--sensor-width", sensor_width), ("--sensor-height", sensor_height)):
+        if not _LEAST_SENSOR_MM <= size_mm <= _LARGEST_SENSOR_MM:
+            raise InputError(f"expected {name} from {_LEAST_SENSOR_MM:g} to {_LARGEST_SENSOR_MM:g} mm, got {size_mm:g}: give the sensor's")
     traced = read_prescription(prescription)
     traced = traced if f_number is None else traced.stopped_down(f_number)
     with working("tracing"):

@@ -1,5 +1,6 @@
 """Ways of inserting layers into a photograph, by name; each works only in the dirty rectangle that virtual light can reach."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -23,6 +24,8 @@ from mrbokeh.system.errors import InputError
 Plane = Float32[np.ndarray, "height width"]
 
 _SPARE_PX = 4
+_WIDEST = 2.0
+"""Largest circle of confusion, in diagonals of the picture: of what has a larger one a sixth of the light at most would be seen."""
 
 DEFAULT_MODE = "over"
 
@@ -39,6 +42,7 @@ class InDirtyRectangle:
     insertion: Insertion
 
     def insert(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> Inserted:
+        layers = [without_what_touches_the_lens(layer, plate) for layer in layers]
         bank = getattr(renderer, "bank", None)
         tables = None if bank is None else reach_tables(bank)
         if bank is not None:
@@ -56,6 +60,19 @@ class InDirtyRectangle:
         photo_rgb = plate.rgb.copy()
         box.paste(found.photo_rgb, photo_rgb)
         return Inserted(photo_rgb, box.placed(found.virtual, plate.rgb.shape))
+
+
+def without_what_touches_the_lens(layer: Layer, plate: Plate) -> Layer:
+    """Return the layer without what is so near that its light goes everywhere: it would take any amount of memory."""
+    least_px = -_WIDEST * math.hypot(layer.width_px, layer.height_px)
+    nearest_m = float(np.min(layer.depth_m, initial=np.inf, where=layer.alpha > 0.0))
+    if nearest_m == np.inf or plate.lens.coc_px(nearest_m, layer.width_px) >= least_px:
+        return layer
+    touching = (layer.alpha > 0.0) & (plate.lens.coc_px(np.where(layer.alpha > 0.0, layer.depth_m, np.inf), layer.width_px) < least_px)
+    clear = np.where(touching, np.float32(0.0), np.float32(1.0))
+    extra = {name: values * clear[..., None] for name, values in layer.extra.items()}
+    depth_m = np.where(touching, np.float32(np.inf), layer.depth_m)
+    return Layer(layer.rgb * clear[..., None], layer.alpha * clear, depth_m, extra)
 
 
 def dirty_rectangle(plate: Plate, layers: Sequence[Layer]) -> Box:

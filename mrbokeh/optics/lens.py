@@ -61,6 +61,10 @@ class Lens:
                 f"a lens of {self.focal_length_mm} mm cannot focus at {self.focus_distance_m} m: "
                 f"expected more than {self.focal_length_mm / MM_PER_M} m (is the distance in metres?)"
             )
+        if self.widest_f_number is not None and not 0.0 < self.widest_f_number <= self.f_number * (1.0 + _MARKED_WITHIN):
+            raise InputError(
+                f"widest_f_number must be above 0 and no more than the f_number of {self.f_number:g}, got {self.widest_f_number:g}"
+            )
         if len(self.tilt_rad) != 2 or not all(abs(angle) < _STEEPEST_TILT_RAD for angle in self.tilt_rad):
             raise InputError(f"a lens can be tilted by two angles of less than 45 degrees, got {self.tilt_rad} rad (are these degrees?)")
         if not self.focus_distance_m * MM_PER_M * self._lens_axis[2] > self.focal_length_mm:
@@ -127,20 +131,15 @@ class Lens:
         """
         width_mm = facts.get("sensor_width_mm", self.sensor_width_mm)
         height_mm = self.sensor_height_mm and self.sensor_height_mm * width_mm / self.sensor_width_mm
-        stated = replace(self, **{"sensor_height_mm": height_mm, **facts})  # type: ignore[arg-type]
         if self.widest_f_number is None:
-            return stated
-        if stated.f_number < self.widest_f_number * (1.0 - _MARKED_WITHIN):
-            raise InputError(
-                f"the lens opens to f/{self.widest_f_number:.3g}: expected an f-number of at least that, got {stated.f_number:g}"
-            )
-        stated = replace(stated, f_number=max(stated.f_number, self.widest_f_number))
-        if stated.f_number < self.f_number * (1.0 - _MARKED_WITHIN):
-            raise InputError(
-                f"the lens is described as closed to f/{self.f_number:.3g}: expected an f-number of at least that, got "
-                f"{stated.f_number:g}; describe it fully open"
-            )
-        stated = replace(stated, f_number=max(stated.f_number, self.f_number))
+            return replace(self, **{"sensor_height_mm": height_mm, **facts})  # type: ignore[arg-type]
+        f_number, least = facts.get("f_number", self.f_number), max(self.widest_f_number, self.f_number)
+        if f_number < least * (1.0 - _MARKED_WITHIN):
+            opens = least == self.widest_f_number
+            how = f"opens to f/{least:.3g}" if opens else f"is described as closed to f/{least:.3g}"
+            raise InputError(f"the lens {how}: expected an f-number of at least that, got {f_number:g}")
+        told_facts = {"sensor_height_mm": height_mm, **facts, "f_number": max(f_number, least)}
+        stated = replace(self, **told_facts)  # type: ignore[arg-type]
         wider = width_mm / self.sensor_width_mm * self.focal_length_mm / stated.focal_length_mm
         return replace(stated, aperture=_closed(self.aperture, stated.f_number / self.f_number, wider))
 

@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from mrbokeh.compositing.between import Between, Rerendered
-from mrbokeh.compositing.choose import DEFAULT_MODE, MODES, InDirtyRectangle, dirty_rectangle, insertion_of
+from mrbokeh.compositing.choose import (
+    DEFAULT_MODE,
+    MODES,
+    InDirtyRectangle,
+    dirty_rectangle,
+    insertion_of,
+    without_what_touches_the_lens,
+)
 from mrbokeh.compositing.over import OverPhotograph, SmoothedMatte
 from mrbokeh.compositing.plate import Inserted, Plate, plate_of
 from mrbokeh.images.layer import Layer, opaque
@@ -179,3 +186,14 @@ def test_blurring_anew_needs_the_sharp_scene_and_shows_near_things_before_the_la
     np.testing.assert_allclose(picture[24, 35:38], np.broadcast_to(np.float32(RED), (3, 3)), atol=2e-2)
     assert DEFAULT_MODE in MODES
     refused("front, over, matte, between, rerender, got 'under'", insertion_of, "under")
+
+
+@pytest.mark.parametrize("mode", sorted(MODES))
+def test_what_touches_the_lens_is_left_out_everywhere(mode: str) -> None:
+    """At 1 mm a circle is 20,000 px wide, and padding for it would take petabytes; light of it would be no 1000th in the picture."""
+    photo, layer = plate(), card(0.001)
+    layer = replace(layer, extra={"matte": layer.alpha[..., None]})
+    left = without_what_touches_the_lens(layer, photo)
+    assert not left.alpha.any() and not left.rgb.any() and not left.extra["matte"].any() and np.isinf(left.depth_m).all()
+    assert without_what_touches_the_lens(card(0.5), photo).alpha.any()
+    np.testing.assert_array_equal(insertion_of(mode).insert(photo, [layer], PolygonDifferences()).rgb, photo.rgb)

@@ -150,6 +150,12 @@ def test_mistakes_in_an_aperture_are_named(aperture: dict[str, Any], message: st
         aperture_of(**aperture)
 
 
+@pytest.mark.parametrize("widest", [-1.0, 0.0, 8.0])
+def test_a_lens_opens_no_less_far_than_it_is_open(widest: float) -> None:
+    with pytest.raises(InputError, match="no more than the f_number of 4"):
+        Lens(50.0, 4.0, 2.0, widest_f_number=widest)
+
+
 def test_rims_and_the_widest_f_number_are_written_and_read(tmp_path: Path) -> None:
     opening = replace(Aperture.disc(), rims=((0.4, 1.1), (-0.3, 0.9)), iris_blades=9)
     lens = Lens(85.0, 1.5, 3.0, aperture=opening, widest_f_number=1.4)

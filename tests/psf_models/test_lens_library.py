@@ -145,6 +145,12 @@ def test_a_lens_file_without_surfaces_is_told(tmp_path: Path, damaged: object) -
         read_prescription(tmp_path / "lens.json")
 
 
+@pytest.mark.parametrize(("option", "why"), [("--blades=2", "iris_blades from 3"), ("--sensor-width=nan", "from 2 to 400 mm")])
+def test_describe_refuses_before_it_traces(tmp_path: Path, option: str, why: str) -> None:
+    done = mrbokeh("lens", "describe", "biotar-58", option, "--out", tmp_path / "lens.json")
+    assert done.returncode == 2 and why in done.stderr and not (tmp_path / "lens.json").exists(), done.stderr
+
+
 def test_a_lens_that_is_described_closed_is_not_opened_again(tmp_path: Path) -> None:
     """What its opening was is not in the file: blades, rims and bright rims of the closed one say nothing of it."""
     write_lens(tmp_path / "closed.json", read_lens("biotar-58").stating({"f_number": 5.6}))

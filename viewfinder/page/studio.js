@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 76575218f629e3c44f494318e1e4b9132afedcdc4ca2011e143070df11146353
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: df7c23ac0b409e09087dbde18cd8650f7a2d4c13bf01db0d3af1c6113b854d8f
 "use strict";
 (() => {
   // src/model.ts
@@ -460,7 +460,7 @@
     {
       id: "f_number",
       read: (s) => nearestF(s.f_number ?? studio.told?.photo?.lens_f_number ?? 8),
-      write: (value) => ({ f_number: F_NUMBERS[Math.min(value, F_NUMBERS.length - 1)] }),
+      write: (value) => ({ f_number: Math.max(F_NUMBERS[Math.min(value, F_NUMBERS.length - 1)], studio.told?.photo?.widest_f_number ?? 0) }),
       shown: (_v, s) => `f/${Number((s.f_number ?? studio.told?.photo?.lens_f_number ?? 8).toPrecision(3))}`
     },
     { id: "sun_right", read: (s) => sunOf(s)[0], write: (v) => sun([v, above()]), shown: (v, s) => s.sun_deg ? `${Math.abs(Math.round(v))}° ${v < 0 ? "left" : "right"}` : "" },

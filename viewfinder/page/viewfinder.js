@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 76575218f629e3c44f494318e1e4b9132afedcdc4ca2011e143070df11146353
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: df7c23ac0b409e09087dbde18cd8650f7a2d4c13bf01db0d3af1c6113b854d8f
 "use strict";
 (() => {
   // src/model.ts

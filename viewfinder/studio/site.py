@@ -258,6 +258,7 @@ def _photo_told(opened: "OpenedPhotograph", state: StudioState) -> dict[str, Any
             eyes_m = placed_state(whole, opened).camera_height_m or known_height_m
         held = plate.world_from_camera
         shown |= {"focal_px": plate.lens.focal_px(width_px), "lens_f_number": plate.lens.f_number}
+        shown |= {"widest_f_number": plate.lens.widest_f_number}
         shown |= {"camera_height_m": eyes_m, "world_from_camera": None if held is None else held.tolist()}
         shown |= {"pitch_deg": None if held is None else round(looks_down_deg(plate), 2)}
     except InputError as problem:

@@ -58,6 +58,8 @@ export interface Photo {
   world_from_camera: Matrix3 | null;
   pitch_deg: number | null;
   lens_f_number: number | null;
+  /** How far the lens opens; null: as far as one likes. */
+  widest_f_number?: number | null;
   /** Where the sun stood by the file: degrees to the right of the view, and above the horizon. */
   sun_deg: Pair | null;
   /** Of a focal stack: which picture this is, how many there are, and where each is focused. */

@@ -25,7 +25,7 @@ const SLIDERS: Slider[] = [
   {
     id: "f_number",
     read: (s) => nearestF(s.f_number ?? studio.told?.photo?.lens_f_number ?? 8),
-    write: (value) => ({ f_number: F_NUMBERS[Math.min(value, F_NUMBERS.length - 1)]! }),
+    write: (value) => ({ f_number: Math.max(F_NUMBERS[Math.min(value, F_NUMBERS.length - 1)]!, studio.told?.photo?.widest_f_number ?? 0) }),
     shown: (_v, s) => `f/${Number((s.f_number ?? studio.told?.photo?.lens_f_number ?? 8).toPrecision(3))}`,
   },
   { id: "sun_right", read: (s) => sunOf(s)[0], write: (v) => sun([v, above()]), shown: (v, s) => (s.sun_deg ? `${Math.abs(Math.round(v))}° ${v < 0 ? "left" : "right"}` : "") },
