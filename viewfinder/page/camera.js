@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: df7c23ac0b409e09087dbde18cd8650f7a2d4c13bf01db0d3af1c6113b854d8f
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 78dec699af0ee159284529b425d4af1e7eb9c4f8919bdc5bcdedf92f77a4e690
 "use strict";
 (() => {
   // src/model.ts

@@ -325,7 +325,7 @@ function groundTold(): string[] {
   const [told, state] = [studio.told, studio.state];
   if (!told?.photo || told.photo.has_depth || !state?.camera_height_m) return [];
   const tilt = state.camera === null && state.pitch_deg !== null ? [`The camera looks down by ${state.pitch_deg}°, which little in the picture tells: see Camera and ground, or draw Lines.`] : [];
-  return [...tilt, `The camera is ${state.camera_height_m} m above the ground; all metres hang on that.`];
+  return [...tilt, `The camera is ${state.camera_height_m} m above the ground, or the table that it stands on; all metres hang on that.`];
 }
 
 async function save(format: string): Promise<void> {
