@@ -1,5 +1,6 @@
 """`mrbokeh composite`: virtual objects into a photograph, or into all slices of a focal stack."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -68,12 +69,17 @@ def composite(options: CompositeOptions, out: OutOption) -> None:
         heights_m = [each.height_m for each in objects_of(options.standing, made.plate)]
         tell(f"wrote the preview {out}: {write_preview_of(out, made.inserted, made.plate, objects, heights_m, scale)}")
         return
-    write_results(out, made.inserted, made.plate, made.sharp, options.colour, options.result)
-    carry_exif(options.photo, out, made.plate.rgb.shape[1::-1])
-    if lost := alpha_lost(out, made.plate):
-        warn(lost)
     told, known, figures = blur_told(made.plate, made.sharp)
-    tell(f"wrote {out} ({made.mode}; {told})", known, mode=made.mode, **figures)
+    mode, inserted, plate, sharp = made.mode, made.inserted, made.plate, made.sharp
+    if out.suffix.lower() != ".exr" and options.result.save_deep is None:
+        # What only layered files hold is half of all memory.
+        plate, sharp = replace(plate, depth_m=None, sharp_rgb=None), []
+    del made
+    write_results(out, inserted, plate, sharp, options.colour, options.result)
+    carry_exif(options.photo, out, plate.rgb.shape[1::-1])
+    if lost := alpha_lost(out, plate):
+        warn(lost)
+    tell(f"wrote {out} ({mode}; {told})", known, mode=mode, **figures)
 
 
 def _opened(options: CompositeOptions, bundle: "CaptureBundle | None", lens: "Lens | None") -> "Plate":
