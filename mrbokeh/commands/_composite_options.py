@@ -10,7 +10,7 @@ import typer
 
 from mrbokeh.commands import _insertion_options as shared
 from mrbokeh.system.errors import InputError, require_file
-from mrbokeh.system.typed_numbers import numbers_in
+from mrbokeh.system.typed_numbers import numbers_in, pixels_in
 
 PhotoArgument = Annotated[
     Path,
@@ -284,11 +284,7 @@ def typed_sun(text: str) -> tuple[float, float]:
 
 def typed_shadow(text: str) -> tuple[tuple[float, float], ...]:
     """Return three pixels of --sun-by: top, foot, and tip of the shadow."""
-    words = "--sun-by expects three pixels X,Y with colons between, such as 410,120:405,520:630,560"
-    pixels = [numbers_in(each, words, (2,)) for each in text.split(":")]
-    if len(pixels) != 3:
-        raise InputError(f"{words}, got {text!r}")
-    return tuple((x_px, y_px) for x_px, y_px in pixels)
+    return pixels_in(text, "--sun-by expects three pixels X,Y with colons between, such as 410,120:405,520:630,560", 3)
 
 
 def typed_height(text: str) -> tuple[float, bool]:

@@ -1,5 +1,6 @@
 """Words of options in --help and in shell completion, by their names: unit, panel and choices are the same in all commands."""
 
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -115,8 +116,6 @@ CHOICES = {
     "viewfinder calibrate-phone source": "gphoto2 whip test folder:",
     "capture ingest white-balance": "camera",
     "lens psf model": "simple combined physical volume stylized",
-    "lens": " ".join(names()),
-    "prescription": " ".join(names()),
 }
 """Values that the shell completes, of an option in all commands or in one; where none fits, it completes files."""
 
@@ -132,7 +131,9 @@ def with_words(command: Any, path: str) -> None:
         name = parameter.opts[0].removeprefix("--") if parameter.param_type_name == "option" else parameter.name
         choices = CHOICES.get(f"{path} {name}") or CHOICES.get(name)
         if choices and not parameter.type_descriptor.is_choice:
-            parameter.shell_complete = _completing(choices.split())
+            parameter.shell_complete = _completing(choices.split)
+        elif name in ("lens", "prescription"):
+            parameter.shell_complete = _completing(names)
         if parameter.param_type_name == "option":
             parameter.metavar = metavars.get(name, parameter.metavar)
             if len(command.params) > FEW and name not in first:
@@ -141,7 +142,7 @@ def with_words(command: Any, path: str) -> None:
     command.params.sort(key=lambda each: order.get(each.opts[0].removeprefix("--"), len(order)))
 
 
-def _completing(choices: list[str]) -> Any:
+def _completing(choices: Callable[[], list[str]]) -> Any:
     return lambda _context, incomplete: [
-        SimpleNamespace(value=each, type="plain", help=None) for each in choices if each.startswith(incomplete)
+        SimpleNamespace(value=each, type="plain", help=None) for each in choices() if each.startswith(incomplete)
     ]

@@ -158,9 +158,10 @@ def list_lenses() -> None:
 
     Example: mrbokeh lens list
     """
-    from mrbokeh.optics.lens_library import all_lenses
+    from mrbokeh.optics.lens_library import facts as facts_of
+    from mrbokeh.optics.lens_library import names
 
-    lenses = [each.facts for each in all_lenses()]
+    lenses = [facts_of(name) for name in names()]
     rows = [(each["name"], f"{each['focal_length_mm']:.0f} mm", f"f/{each['widest_f_number']:.2g}", each["about"]) for each in lenses]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     for row, facts in zip(rows, lenses, strict=True):

@@ -11,10 +11,12 @@ from jaxtyping import Float32
 from mrbokeh.system.channel import guess, tell, warn
 from mrbokeh.system.console import working
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.typed_numbers import numbers_in
+from mrbokeh.system.typed_numbers import pixels_in
 
 _USUAL_SHARE, _WIDEST_SHARE = 0.03, 0.5
 """Largest circle, in widths of the picture, where none is told; and the widest that is taken for meant."""
+
+_LINE = "--along expects two pixels X,Y with a colon between, such as 0,1500:4000,1350"
 
 Pixel = tuple[float, float]
 
@@ -76,8 +78,9 @@ def tilt_shift_command(
             raise InputError(f"the map {map_} has {told.shape[1]}x{told.shape[0]} px, but {photo} {width_px}x{height_px}: resize it")
         coc_px = np.clip(told, np.float32(0.0), np.float32(1.0)) * np.float32(largest_px)
     else:
-        ends = _typed_line(along) if along is not None else ((0.0, height_px / 2), (float(width_px), height_px / 2))
-        coc_px = blur_beside(ends, (width_px, height_px), largest_px)
+        level = ((0.0, height_px / 2), (float(width_px), height_px / 2))
+        one, other = level if along is None else pixels_in(along, _LINE, 2)
+        coc_px = blur_beside((one, other), (width_px, height_px), largest_px)
     with working("blurring"):
         blurred = tilt_shift(rgb, coc_px, opening)
     write_image(out, blurred)
@@ -99,11 +102,3 @@ def blur_beside(line: tuple[Pixel, Pixel], size_px: tuple[int, int], largest_px:
     y, x = np.mgrid[:height_px, :width_px].astype(np.float32) + np.float32(0.5)
     beside = ((x - x0) * (y1 - y0) - (y - y0) * (x1 - x0)) / length
     return (beside * (largest_px / np.abs(beside).max())).astype(np.float32)
-
-
-def _typed_line(text: str) -> tuple[Pixel, Pixel]:
-    words = "--along expects two pixels X,Y with a colon between, such as 0,1500:4000,1350"
-    ends = [numbers_in(each, words, (2,)) for each in text.split(":")]
-    if len(ends) != 2:
-        raise InputError(f"{words}, got {text!r}")
-    return (ends[0][0], ends[0][1]), (ends[1][0], ends[1][1])

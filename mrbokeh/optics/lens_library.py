@@ -8,7 +8,6 @@ as a share of the middle's, distortion in the corner, axial colour, and how much
 """
 
 import difflib
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,33 +18,16 @@ FOLDER = Path(__file__).resolve().parents[1] / "lens_data"
 _NEAREST_NAMES = 3
 
 
-@dataclass(frozen=True)
-class LibraryLens:
-    """A lens of the library: its name, the document of its lens file, and the prescription in that."""
-
-    name: str
-    document: dict[str, Any]
-
-    @property
-    def prescription(self) -> dict[str, Any]:
-        return dict(self.document["prescription"])
-
-    @property
-    def facts(self) -> dict[str, Any]:
-        """Return what `mrbokeh lens list --json` says of it."""
-        told = {key: value for key, value in self.prescription.items() if key != "surfaces"}
-        described = {key: self.document[key] for key in ("focal_length_mm", "widest_f_number", "sensor_width_mm")}
-        return {"name": self.name, **described, **told}
-
-
 def names() -> list[str]:
     """Return the names of all lenses, by focal length."""
     return sorted((path.stem for path in FOLDER.glob("*.json")), key=lambda name: (int(name.rpartition("-")[2]), name))
 
 
-def all_lenses() -> list[LibraryLens]:
-    """Return all lenses, by focal length."""
-    return [LibraryLens(name, read_json(FOLDER / f"{name}.json", "a lens of the library")) for name in names()]
+def facts(name: str) -> dict[str, Any]:
+    """Return what `mrbokeh lens list --json` says of a lens: sizes, and its prescription without the surfaces."""
+    document = read_json(FOLDER / f"{name}.json", "a lens of the library")
+    described = {key: document[key] for key in ("focal_length_mm", "widest_f_number", "sensor_width_mm")}
+    return {"name": name, **described} | {key: value for key, value in document["prescription"].items() if key != "surfaces"}
 
 
 def shipped(path: Path | str) -> Path:

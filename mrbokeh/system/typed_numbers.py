@@ -8,6 +8,14 @@ from mrbokeh.system.errors import InputError
 _Number = TypeVar("_Number")
 
 
+def pixels_in(text: str, expected: str, count: int) -> tuple[tuple[float, float], ...]:
+    """Return so many pixels X,Y in a text, with colons between. Raises InputError if they are others."""
+    pixels = [numbers_in(each, expected, (2,)) for each in text.split(":")]
+    if len(pixels) != count:
+        raise InputError(f"{expected}, got {text!r}")
+    return tuple((x_px, y_px) for x_px, y_px in pixels)
+
+
 @overload
 def numbers_in(text: str, expected: str, counts: Collection[int] = ..., *, separator: str = ...) -> tuple[float, ...]: ...
 @overload
