@@ -103,7 +103,7 @@ def _snapped(coc_px: np.ndarray, y: int, x: int, step_px: float) -> np.float32:
     return result
 
 
-_LARGEST_SHARE = 0.6
+LARGEST_SHARE = 0.6
 
 
 @njit(cache=True, nogil=True)
@@ -139,7 +139,7 @@ def unmix_rims(
         if along > most:
             continue
         explained = along * along / (most * off) if off > 0.0 and along > 0.0 else 0.0
-        share = min(_LARGEST_SHARE, explained * along / most)
+        share = min(LARGEST_SHARE, explained * along / most)
         front_coc_px[i] = coc_px[fy, fx]
         for c in range(channels):
             rest = (values[y, x, c] - share * values[fy, fx, c]) / (1.0 - share)

@@ -22,9 +22,9 @@ from mrbokeh.system.resources import in_bands
 
 _CLOSED_BY = 5
 _SAME_DEPTH = 0.02
-_STEP_PX = 1.0  # less than this difference of circles of confusion between neighbours is one surface
-_SURFACE_PX = 2.0  # the same, for pixels some way apart
-_RIM_PX = 3
+STEP_PX = 1.0  # less than this difference of circles of confusion between neighbours is one surface
+SURFACE_PX = 2.0  # the same, for pixels some way apart
+RIM_PX = 3
 _DIRECTIONS = 8
 _BAND_ROWS = 32
 _BAND_PIXELS = 256
@@ -59,10 +59,10 @@ def _edges(layer: PaddedLayer, pool: Executor) -> _Edges:
 
     def look(top: int, bottom: int) -> None:
         mark_highlights(lit, layer.values, top, bottom)
-        snap(coc_px, layer.coc_px, lit, _STEP_PX, top, bottom)
+        snap(coc_px, layer.coc_px, lit, STEP_PX, top, bottom)
 
     in_bands(pool, len(rim), _BAND_ROWS, look)
-    in_bands(pool, len(rim), _BAND_ROWS, lambda top, bottom: find_rims(rim, coc_px, _STEP_PX, top, bottom))
+    in_bands(pool, len(rim), _BAND_ROWS, lambda top, bottom: find_rims(rim, coc_px, STEP_PX, top, bottom))
     return _Edges(coc_px, np.flatnonzero(rim).astype(np.int32), ~(rim | lit), lit)
 
 
@@ -72,9 +72,9 @@ def _sources(edges: _Edges) -> tuple[Places, Places, Places]:
     """
     from mrbokeh.layering._hidden_background_numba import Front, nearest_behind, pure_neighbours
 
-    pure = pure_neighbours(edges.rims, edges.coc_px, edges.pure, _STEP_PX, _RIM_PX)
+    pure = pure_neighbours(edges.rims, edges.coc_px, edges.pure, STEP_PX, RIM_PX)
     front = Front.over(edges.coc_px.size)
-    nearest_behind(front, edges.coc_px, edges.rims, pure, _STEP_PX)
+    nearest_behind(front, edges.coc_px, edges.rims, pure, STEP_PX)
     seeds = front.seeds
     rims = edges.rims[pure >= 0]
     seeds[rims] = pure[pure >= 0] + 1
@@ -91,7 +91,7 @@ def _filled(values: Values, edges: _Edges, places: Places, seeds: Places, pool: 
     paths = _paths(places, seeds, values.shape[1])
 
     def fill(first: int, end: int) -> None:
-        interpolate(filled.values, filled.coc_px, places, seeds, values, pure_coc_px, paths, _SURFACE_PX, first, end)
+        interpolate(filled.values, filled.coc_px, places, seeds, values, pure_coc_px, paths, SURFACE_PX, first, end)
 
     in_bands(pool, len(places), _BAND_PIXELS, fill)
     return filled
@@ -113,7 +113,7 @@ def _unmix(values: Values, edges: _Edges, rims: Places, behind: Pixels) -> None:
     flat_values, flat_coc_px = values.reshape(-1, values.shape[2]), edges.coc_px.reshape(-1)
     front, front_coc_px = flat_values[rims], flat_coc_px[rims]
     of_behind = np.searchsorted(behind.places, rims)
-    unmix_rims(front, front_coc_px, behind.values, rims, of_behind, values, edges.coc_px, edges.lit, _STEP_PX)
+    unmix_rims(front, front_coc_px, behind.values, rims, of_behind, values, edges.coc_px, edges.lit, STEP_PX)
     flat_values[rims], flat_coc_px[rims] = front, front_coc_px
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Bool, Float32
 
-_LIGHT_OVER_SURROUNDINGS = np.float32(4.0)
+LIGHT_OVER_SURROUNDINGS = np.float32(4.0)
 
 Values = Float32[np.ndarray, "height width channels"]
 Mask = Bool[np.ndarray, "height width"]
@@ -20,7 +20,7 @@ def mark_highlights(lit: Mask, values: Values, top: int, bottom: int) -> None:
     """Set rows top to bottom of a mask, as `find_highlights` does for all."""
     from mrbokeh.layering._pixels_numba import mark_rows
 
-    mark_rows(lit, values, _LIGHT_OVER_SURROUNDINGS, top, bottom)
+    mark_rows(lit, values, LIGHT_OVER_SURROUNDINGS, top, bottom)
 
 
 def without_highlights(values: Values) -> Values:

@@ -37,7 +37,7 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import ZeroedMemory, cores
 
 _ONE_SURFACE_PX = 1.0
-_NOTHING_TAKEN = np.float32(1e-6)
+NOTHING_TAKEN = np.float32(1e-6)
 _KEPT = ZeroedMemory(most_bytes=64 << 20)
 """From frame to frame, as long as these are not larger than about 1920x1080: fresh memory takes a tenth of a small frame's time."""
 
@@ -125,7 +125,7 @@ def _shared_out(colour: Channels, taken: Channels) -> tuple[Channels, Channels]:
     """Return the colour of a scene without holes: the unclaimed pupil belongs to those who claimed."""
     from mrbokeh.layering._slices_numba import share_out
 
-    share_out(colour, taken, _NOTHING_TAKEN)
+    share_out(colour, taken, NOTHING_TAKEN)
     return colour, taken
 
 

@@ -12,7 +12,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import in_bands
 
-_BORDER_PX = 5
+BORDER_PX = 5
 _BAND_ROWS = 32
 
 Plane = Float32[np.ndarray, "height width"]
@@ -108,7 +108,7 @@ def pad_layer(layer: Layer, coc_px: Plane, margin_px: int, pool: Executor) -> Pa
 def _dark_border(picture: Float32[np.ndarray, "height width channels"]) -> Float32[np.ndarray, "height width channels"]:
     """Return the picture, a copy of it if need be, without highlights on the border."""
     dark = picture
-    for border in (np.s_[:_BORDER_PX], np.s_[-_BORDER_PX:], np.s_[:, :_BORDER_PX], np.s_[:, -_BORDER_PX:]):
+    for border in (np.s_[:BORDER_PX], np.s_[-BORDER_PX:], np.s_[:, :BORDER_PX], np.s_[:, -BORDER_PX:]):
         strip = np.ascontiguousarray(dark[border])
         without = without_highlights(strip)
         if without is not strip:

@@ -25,13 +25,13 @@ _LEAST_CELL_PX = 16
 _MOST_CELLS = 64
 _PIXELS_PER_BLUR = 1 << 14
 """Cost of blurring once more, in pixels of a window."""
-_LEAST_STEP_PX = 0.5
+LEAST_STEP_PX = 0.5
 _HALF_A_SLICE = 0.501  # and what rounding may add
 _BAND_PIXELS = 1 << 16
 _FEWEST_PIXELS = 1 << 19
 _FEW_PIXELS = 1 << 20
 _MANY_PIXELS = 1 << 22
-_SHARP_PX = np.float32(6.0)  # up to this diameter what is seen is worth more than what may hide: measured on traced scenes
+SHARP_PX = np.float32(6.0)  # up to this diameter what is seen is worth more than what may hide: measured on traced scenes
 Plane = Float32[np.ndarray, "height width"]
 Channels = Float32[np.ndarray, "height width _"]
 _Shown = tuple[list[Shares], list[Shares]]
@@ -128,7 +128,7 @@ def _components_in_turn(layers: Sequence[Pixels], shown: _Shown | None, slicing:
     shown: shares of the pixels of several layers.
     """
     nearest, farthest = _range_px(layers, slicing.size[0] * slicing.size[1])
-    step_px = max((farthest - nearest) / slicing.slices, _LEAST_STEP_PX)
+    step_px = max((farthest - nearest) / slicing.slices, LEAST_STEP_PX)
     cut = partial(sorted_slices, layers, step_px=step_px, width=slicing.size[1], pool=slicing.pool)
     for together in _shares_in_turn(layers, shown):
         for k, parts in merge(*map(cut, together), key=itemgetter(0)):
@@ -172,7 +172,7 @@ def _shown_in_order(layers: Sequence[Pixels], slicing: Slicing) -> _Shown:
 
     def cover_band(first: int, end: int) -> None:
         for each, across, layer in zip(shown, crossing, layers, strict=True):
-            cover(each, across, free, nearest_px, layer.places, layer.values, layer.coc_px, _SHARP_PX, first, end)
+            cover(each, across, free, nearest_px, layer.places, layer.values, layer.coc_px, SHARP_PX, first, end)
 
     in_bands(slicing.pool, pixels, _BAND_PIXELS, cover_band)
     return shown, crossing
@@ -189,7 +189,7 @@ def _shown_by_depth(layers: Sequence[Pixels], size: tuple[int, int]) -> _Shown:
                 there_px, over = coc_px[layer.places], coverage[layer.places]
                 nearer = there_px <= layer.coc_px if j < i else there_px < layer.coc_px
                 shown[i] *= np.where(nearer, np.float32(1.0) - over, np.float32(1.0))
-                crossing[i][(over > 0) & (there_px < -_SHARP_PX) & (layer.coc_px > _SHARP_PX)] = 1.0
+                crossing[i][(over > 0) & (there_px < -SHARP_PX) & (layer.coc_px > SHARP_PX)] = 1.0
     return shown, [across * (np.float32(1.0) - each) for across, each in zip(crossing, shown, strict=True)]
 
 

@@ -45,12 +45,12 @@ def drawn_diameters_px(coc_px: Plane, aperture: Aperture) -> Plane:
     from mrbokeh.optics._aperture_numba import look_up
 
     drawn = np.empty(coc_px.shape, np.float32)
-    look_up(drawn.reshape(-1), np.ascontiguousarray(coc_px).reshape(-1), _table(aperture), STEPS_PER_PX)
+    look_up(drawn.reshape(-1), np.ascontiguousarray(coc_px).reshape(-1), drawn_table(aperture), STEPS_PER_PX)
     return drawn
 
 
 @lru_cache(maxsize=64)
-def _table(aperture: Aperture) -> Float32[np.ndarray, " steps"]:
+def drawn_table(aperture: Aperture) -> Float32[np.ndarray, " steps"]:
     """Return the diameters to draw for 0, 1 / STEPS_PER_PX, ... px of blur; the last one determines how it continues.
 
     It takes half a second and is kept where compiled kernels are.
@@ -64,7 +64,7 @@ def _table(aperture: Aperture) -> Float32[np.ndarray, " steps"]:
     with suppress(OSError, ValueError, EOFError):
         if path is not None and path.is_file():
             return np.load(path)
-    made = _made_table(aperture)
+    made = _madedrawn_table(aperture)
     with suppress(OSError):
         if path is not None:
             with atomic_path(path, is_result=False) as temporary, temporary.open("wb") as file:

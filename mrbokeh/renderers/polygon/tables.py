@@ -127,13 +127,19 @@ _NOTHING = 1e-9
 Groups = Int64[np.ndarray, "groups 4"]
 
 
+def small_kernels(aperture: Aperture, to_px: float) -> Float32[np.ndarray, "2 kernels size size"]:
+    """Return kernels of diameters from 1 px to at least `to_px`, LEVELS_PER_PX to a pixel, behind the focus and, turned, in front."""
+    levels = int(np.ceil((to_px - 1.0) * LEVELS_PER_PX)) + 1
+    behind = _stacked([aperture.rasterize(1.0 + level / LEVELS_PER_PX).kernel.astype(np.float32) for level in range(levels + 1)])
+    return np.stack([behind, behind[:, ::-1, ::-1]])
+
+
 def whole_kernels(aperture: Aperture, below_px: float) -> Exact:
     """Return kernels up to a little more than this diameter, behind the focus and, turned, in front, and the aperture for all others."""
     above_px = below_px * 7.0 / 6.0
-    levels = int(np.ceil((above_px - 1.0) * LEVELS_PER_PX)) + 1
-    behind = _stacked([aperture.rasterize(1.0 + level / LEVELS_PER_PX).kernel.astype(np.float32) for level in range(levels + 1)])
-    kernels = np.stack([behind, behind[:, ::-1, ::-1]])
-    low, high, radius = kernels[:, :-1], kernels[:, 1:], behind.shape[1] // 2
+    kernels = small_kernels(aperture, above_px)
+    levels, radius = kernels.shape[1] - 1, kernels.shape[2] // 2
+    low, high = kernels[:, :-1], kernels[:, 1:]
     groups, counts = _groups((np.abs(low) > _NOTHING) | (np.abs(high) > _NOTHING))
     row, column = _laid(groups, radius)
     vertices, starts, weights = aperture.packed()

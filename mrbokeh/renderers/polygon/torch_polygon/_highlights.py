@@ -1,0 +1,57 @@
+"""Highlights on a device: pixels that give much of the light around them are spread by the kernel of the aperture itself.
+
+The rule is that of `mrbokeh.renderers.polygon._survey_numba`: a pixel that gives more than HIGHLIGHT of the light in the square of four radii
+around it, in any channel.
+"""
+
+import torch
+from jaxtyping import Float32, Int64
+from torch import Tensor
+from torch.nn.functional import pad
+
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.renderers.polygon._survey_numba import HIGHLIGHT, TILE_PX
+
+Picture = Float32[Tensor, "height width 4"]
+Plane = Float32[Tensor, "height width"]
+
+
+def shares_of_highlights(values: Picture, coc_px: Plane, from_px: float) -> Plane | None:
+    """Return how much of each pixel is spread by its exact kernel; None if there is no highlight."""
+    at = _suspects(values, coc_px, from_px)
+    if len(at) == 0:
+        return None
+    y, x = at.T
+    height, width = coc_px.shape
+    integral = pad(values.abs().double().cumsum(0).cumsum(1), (0, 0, 1, 0, 1, 0))
+    reach = coc_px[y, x].abs().long()
+    top, bottom = (y - reach).clamp(min=0), (y + reach + 1).clamp(max=height)
+    left, right = (x - reach).clamp(min=0), (x + reach + 1).clamp(max=width)
+    around = integral[bottom, right] - integral[top, right] - integral[bottom, left] + integral[top, left]
+    light = values[y, x].abs().double()
+    ratio = torch.where(light > 0, light / around.clamp(min=1e-300), 0.0).amax(dim=1)
+    found = (ratio / HIGHLIGHT - 1.0).clamp(0.0, 1.0).float()
+    shares = torch.zeros_like(coc_px)
+    shares[y, x] = found
+    return shares if bool((found > 0).any()) else None
+
+
+def _suspects(values: Picture, coc_px: Plane, from_px: float) -> Int64[Tensor, "suspects 2"]:
+    """Return rows and columns of pixels that give much of their own tile's light, which their window holds."""
+    height, width = coc_px.shape
+    light = pad(values.abs().permute(2, 0, 1)[None], (0, -width % TILE_PX, 0, -height % TILE_PX))[0]
+    tiles = light.unflatten(2, (-1, TILE_PX)).unflatten(1, (-1, TILE_PX))
+    least = HIGHLIGHT * tiles.sum(dim=(2, 4), keepdim=True)
+    high = (tiles > least).any(dim=0).flatten(2, 3).flatten(0, 1)[:height, :width]
+    return torch.nonzero(high & (coc_px.abs() > from_px))
+
+
+def stamp(out: Picture, values: Picture, coc_px: Plane, shares: Plane, aperture: Aperture) -> None:
+    """Add the share of each pixel's light to the picture, by the exact kernel of the aperture at its diameter."""
+    height, width = coc_px.shape
+    for y, x in torch.nonzero(shares > 0.0).tolist():
+        kernel = torch.from_numpy(aperture.rasterize(float(coc_px[y, x])).kernel).to(out)
+        reach = kernel.shape[0] // 2
+        top, bottom, left, right = max(0, y - reach), min(height, y + reach + 1), max(0, x - reach), min(width, x + reach + 1)
+        part = kernel[top - y + reach : bottom - y + reach, left - x + reach : right - x + reach]
+        out[top:bottom, left:right] += part[..., None] * (shares[y, x] * values[y, x])
