@@ -19,6 +19,8 @@ if "PYTEST_XDIST_WORKER" in os.environ:
 import jaxtyping
 import pytest
 
+import tests
+
 PACKAGES = ("mrbokeh", "capture", "training", "viewfinder", "datasets_scripts")
 ROOT = Path(__file__).resolve().parent.parent
 SHARED_DATA = ROOT.parent / "shared" / "data"
@@ -71,8 +73,9 @@ class _ChecksOfFirstCalls:
         return either
 
 
-jaxtyping.jaxtyped = _ChecksOfFirstCalls()
-jaxtyping.install_import_hook(_modules(), "tests.checked")
+if tests.checked is not None:
+    jaxtyping.jaxtyped = _ChecksOfFirstCalls()
+    jaxtyping.install_import_hook(_modules(), "tests.checked")
 
 
 def pytest_collection() -> None:

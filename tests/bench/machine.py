@@ -38,7 +38,7 @@ def tell() -> None:
 
 def machine_line() -> str:
     """Processor, cores, Python and commit in one line."""
-    return f"{_processor()}, {os.cpu_count()} cores, Python {platform.python_version()}, commit {_commit()}"
+    return f"{processor_name()}, {os.cpu_count()} cores, Python {platform.python_version()}, commit {_commit()}"
 
 
 def memory_line() -> str:
@@ -46,7 +46,8 @@ def memory_line() -> str:
     return f"largest memory of the process: {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB"
 
 
-def _processor() -> str:
+def processor_name() -> str:
+    """Return the name of the processor, as Linux knows it."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:

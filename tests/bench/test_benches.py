@@ -1,9 +1,16 @@
 """Benchmarks are run by hand: that they still find what they measure is asked of them with the tests."""
 
+import json
+import sys
+import time
+from collections.abc import Iterator
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+
+from tests.bench import bench_device
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in Path(__file__).parent.glob("bench_*.py")))
@@ -11,3 +18,32 @@ def test_a_benchmark_finds_all_that_it_imports(name: str) -> None:
     if "torch" in name or "network" in name:
         pytest.importorskip("torch")
     import_module(f"tests.bench.{name}")
+
+
+def test_the_device_benchmark_writes_its_page_and_a_part_that_fails_hides_no_other(tmp_path: Path) -> None:
+    """The first part is not there, the second is the smallest; each in a process of its own."""
+    pytest.importorskip("torch")
+    parts = "tests.bench.device.not_there,sweep"
+    assert bench_device.main(["--out", str(tmp_path), "--parts", parts, "--commit", "abc"]) == 1
+    page = json.loads((tmp_path / "device.json").read_text(encoding="utf-8"))
+    failing, sweep = page["parts"]
+    assert page["commit"] == "abc" and "ModuleNotFoundError" in failing["failed"] and failing["rows"] == []
+    assert sweep["failed"] == "" and sweep["rows"][0]["device_ms"] > 0.0 and sweep["rows"][0]["psnr_db"] > 40.0
+    text = (tmp_path / "device.md").read_text(encoding="utf-8")
+    assert text.startswith(page["first_line"]) and "not_there" in text and "8 planes, 4 neighbours | 120 x 80" in text
+
+
+def test_a_part_that_takes_too_long_keeps_its_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    torch = pytest.importorskip("torch")
+    from tests.bench.device.rows import Row, Run
+
+    def rows(run: Run) -> Iterator[Row]:
+        yield Row("first", device_ms=1.0, bar_ms=2.0)
+        while True:
+            time.sleep(0.01)
+
+    monkeypatch.setitem(sys.modules, "endless", SimpleNamespace(rows=rows))
+    monkeypatch.setitem(bench_device.PARTS, "endless", bench_device.Part("endless", 1.0, "without an end"))
+    run = Run(torch.device("cpu"), False, time.monotonic() + 0.5, lambda words: None)
+    result = bench_device.run_part("endless", run, lambda result: None)
+    assert [row.met for row in result.rows] == [True] and "stopped" in result.failed

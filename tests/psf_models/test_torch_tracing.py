@@ -7,6 +7,7 @@ kernels are float32.
 import sys
 from collections.abc import Callable
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -28,8 +29,9 @@ from tests.support.command_line import printed_by
 torch = pytest.importorskip("torch")
 
 from mrbokeh.psf_models.torch_tracing._rays import summed  # noqa: E402
+from tests.support.torch_device import NAME  # noqa: E402
 
-DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
+DEVICES = [NAME]
 RAYS = 1 << 15
 Model = Callable[..., PsfModel]
 
@@ -56,12 +58,13 @@ MODELS: dict[str, tuple[Model, list[list[float]]]] = {
     "volume, absorbing": (partial(Volume, albedo=(0.5, 0.9, 0.0), density_per_m=2.0, anisotropy=-0.3), [[1.0, 1.0]]),
     "volume, tentative collisions": (partial(Volume, majorant_per_m=2.7), [[2.0, 2.0]]),
     "simple": (SimpleLens, [[10.0, 40.0]]),
-    "simple, signed colours": (partial(SimpleLens, seidel()), [[-9.0, 4.0]]),
-    "simple, ring": (partial(SimpleLens, Aperture.ring(0.4)), [[30.0, 30.0]]),
     "combined": (Combined, [[10.0, 40.0], [0.0, 30.0]]),
     "combined, in focus at rest": (Combined, [[0.0, 0.0], [0.0, 0.0]]),
     "stylized": (partial(Stylized, picture()), [[10.0, 40.0]]),
 }
+if find_spec("shapely"):
+    MODELS["simple, signed colours"] = (partial(SimpleLens, seidel()), [[-9.0, 4.0]])
+    MODELS["simple, ring"] = (partial(SimpleLens, Aperture.ring(0.4)), [[30.0, 30.0]])
 
 
 @pytest.mark.parametrize("device", DEVICES)

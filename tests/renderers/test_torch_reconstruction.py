@@ -1,8 +1,6 @@
 """Layered reconstruction by torch agrees with the compiled one in its pictures and partitions, whatever the settings."""
 
 import importlib
-import os
-import subprocess
 import sys
 from dataclasses import replace
 from functools import cache
@@ -22,6 +20,7 @@ from tests.support.sampled_planes import LENS, fence_scene, sample_planes
 torch = pytest.importorskip("torch")
 
 from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import TorchReconstruction, _picture  # noqa: E402
+from tests.support.torch_device import DEVICE, KERNELS_ON, NAME, printed_with_kernels  # noqa: E402
 
 SIZE_PX = 45
 SHIPPED = Path(__file__).parents[1] / "data" / "samples"
@@ -34,7 +33,7 @@ def fence_samples(per_pixel: int = 4) -> LightFieldSamples:
 
 
 def by_torch(samples: LightFieldSamples, settings: Settings | None = None, seed: int = 0) -> np.ndarray:
-    return TorchReconstruction(settings or Settings(), seed=seed).reconstruct(samples, LENS).rgb
+    return TorchReconstruction(settings or Settings(), NAME, seed).reconstruct(samples, LENS).rgb
 
 
 # Agreement with the compiled renderer. Both do the same in single precision, but for the order of sums and for the screen-space
@@ -47,7 +46,7 @@ def test_shipped_samples_give_the_picture_of_the_compiled_renderer(name: str, sc
     samples, lens = read_samples(SHIPPED / name / "samples.npz"), read_lens(SHIPPED / name / "lens.json")
     settings = Settings(screen_filter=screen_filter)  # type: ignore[arg-type]
     known, known_counts = LayeredReconstruction(settings).reconstruct_values(samples, samples.rgb, lens)
-    found, counts = TorchReconstruction(settings).reconstruct_values(samples, samples.rgb, samples.coc_px(lens), lens.aperture)
+    found, counts = TorchReconstruction(settings, NAME).reconstruct_values(samples, samples.rgb, samples.coc_px(lens), lens.aperture)
     assert counts == pytest.approx((known_counts.before, known_counts.after), abs=1e-9), "the same partitions"
     assert psnr(found, known) > 90.0
     assert np.abs(found - known).max() < 1e-3
@@ -88,7 +87,7 @@ def test_lamps_and_pixels_without_samples_are_the_same() -> None:
     arrays["rgb"] = arrays["rgb"] + 1e4 * (np.abs(arrays["xy_px"] - 30.5) < 0.5).all(axis=1)[:, None].astype(np.float32)
     samples = LightFieldSamples(SIZE_PX, SIZE_PX, **arrays)
     known = LayeredReconstruction().reconstruct(samples, LENS)
-    found = TorchReconstruction().reconstruct(samples, LENS)
+    found = TorchReconstruction(device=NAME).reconstruct(samples, LENS)
     assert known.rgb.max() > 100.0
     assert np.abs(found.rgb - known.rgb).max() < 1e-6 * 1e4
     np.testing.assert_array_equal(found.depth_m, known.depth_m)
@@ -107,7 +106,7 @@ def test_few_samples_and_bare_background_are_the_same(size_px: tuple[int, int], 
     xy_px, uv = rng.uniform(size=(count, 2)) * size_px, np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
     arrays = xy_px, uv, rng.uniform(size=count), rng.uniform(size=(count, 3)), depth_m, rng.normal(0.0, 20.0, (count, 2))
     samples = LightFieldSamples(*size_px, *(each.astype(np.float32) for each in arrays))
-    known, found = LayeredReconstruction().reconstruct(samples, LENS), TorchReconstruction().reconstruct(samples, LENS)
+    known, found = LayeredReconstruction().reconstruct(samples, LENS), TorchReconstruction(device=NAME).reconstruct(samples, LENS)
     np.testing.assert_allclose(found.rgb, known.rgb, atol=2e-5)
     np.testing.assert_array_equal(found.depth_m, known.depth_m)
 
@@ -117,7 +116,7 @@ def test_samples_that_keep_their_pixels_are_the_same_and_what_is_not_there_refus
     samples = fence_samples()
     task = samples, samples.rgb, samples.coc_px(LENS), LENS.aperture
     known, _ = LayeredReconstruction()._reconstructed(*task, shared_out=False)
-    found, _ = TorchReconstruction().reconstruct_values(*task, shared_out=False)
+    found, _ = TorchReconstruction(device=NAME).reconstruct_values(*task, shared_out=False)
     assert psnr(found, known) > 90.0 > psnr(by_torch(samples), known)
     for device in ("tpu", "cuda:99", "mps"):
         with pytest.raises(InputError, match="device"):
@@ -138,7 +137,7 @@ def test_a_gpu_gives_the_same_picture(screen_filter: str) -> None:
 
 def test_how_much_is_done_at_a_time_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = by_torch(fence_samples())
-    monkeypatch.setitem(_picture.AT_ONCE, "cpu", (3000, 6000, 2000))
+    monkeypatch.setitem(_picture.AT_ONCE, DEVICE.type, (3000, 6000, 2000))
     np.testing.assert_allclose(by_torch(fence_samples()), whole, atol=2e-6)
 
 
@@ -150,39 +149,40 @@ def test_without_torch_it_says_what_to_install(module: str, monkeypatch: pytest.
         importlib.import_module(name)
 
 
-# Kernels for GPUs, interpreted, which has to be said before they are imported, and compiled for one that is not there.
+# Kernels for GPUs: interpreted, on the device where there is one, and compiled for one that is not there.
 
 
-def test_the_kernels_for_gpus_do_what_torch_does() -> None:
+@pytest.mark.parametrize("device", KERNELS_ON)
+def test_the_kernels_for_gpus_do_what_torch_does(device: str) -> None:
     pytest.importorskip("triton")
     code = """
+import sys
 import torch
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import TorchReconstruction, _merging, _reprojection
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import TorchReconstruction, _jobs, _partitions
 from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._triton import splat_by_kernel
 from mrbokeh.renderers.layered_reconstruction.torch_reconstruction._triton import sweep_by_kernel
 from tests.support.sampled_planes import LENS, fence_scene, sample_planes
 
 torch.set_num_threads(1)
-plain_sweep, plain_splat = _merging.sweep_row_by_row, _reprojection.splat_in_chunks
+plain_sweep, plain_splat = _partitions.sweep_row_by_row, _jobs.splat_in_chunks
+_partitions.has_triton = _jobs.has_triton = lambda: False  # what is patched here calls the kernels
 
 def sweep(*task):
     print(all(torch.equal(a, b) for a, b in zip(sweep_by_kernel(*task), plain_sweep(*task))), "merged" if len(task[0].tile) > 20 else "few")
     return plain_sweep(*task)
 
 def splat(planes, light, slope, facts, place, entry, block, side, pairs):
-    some = torch.arange(0, len(entry), 7)
+    some = torch.arange(0, len(entry), 7, device=entry.device)
     found, known = torch.zeros_like(planes), torch.zeros_like(planes)
     splat_by_kernel(found, light, slope, facts, place, entry[some], block[some], side)
     plain_splat(known, light, slope, facts, place, entry[some], block[some], side, pairs)
     print(torch.allclose(found, known, atol=1e-4), "light" if float(known.sum()) > 100 else "dark")
     plain_splat(planes, light, slope, facts, place, entry, block, side, pairs)
 
-_merging.sweep_row_by_row, _reprojection.splat_in_chunks = sweep, splat
-TorchReconstruction().reconstruct(sample_planes(fence_scene(32), 32, 4), LENS)
+_partitions.sweep_row_by_row, _jobs.splat_in_chunks = sweep, splat
+TorchReconstruction(device=sys.argv[1]).reconstruct(sample_planes(fence_scene(32), 32, 4), LENS)
 """
-    environment = {**os.environ, "TRITON_INTERPRET": "1", "OMP_NUM_THREADS": "1"}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment)
-    words = done.stdout.split()
+    words = printed_with_kernels(code, device).split()
     assert words[:2] == ["True", "merged"]
     assert len(words) >= 4 and set(words[2::2]) == {"True"} and "light" in words
 
@@ -207,6 +207,6 @@ singles = dict.fromkeys(("planes", "geometry", "values", "slope"), "*fp32")
 print(ptx(_splat, {**singles, "buckets": "i32", "side": "i32"}, {"CHANNELS": 3, "WIDE": 8, "SAMPLES": 64}))
 print(ptx(_sweep, dict.fromkeys(("sums", "widths", "limits", "window", "chosen"), "*fp64"), {"BACK": 8}, num_warps=1))
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "red.global.gpu.relaxed.add.f32" in done.stdout
-    assert "fma." not in done.stdout
+    printed = printed_with_kernels(code)
+    assert "red.global.gpu.relaxed.add.f32" in printed
+    assert "fma." not in printed

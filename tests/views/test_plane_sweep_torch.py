@@ -15,8 +15,7 @@ from tests.views.test_plane_sweep import turned_view
 torch = pytest.importorskip("torch")
 
 from capture.dense.torch_plane_sweep import plane_sweep_on  # noqa: E402
-
-DEVICES = ["cpu", pytest.param("cuda", marks=pytest.mark.skipif(not torch.cuda.is_available(), reason="no NVIDIA GPU"))]
+from tests.support.torch_device import NAME  # noqa: E402
 
 
 @pytest.fixture(autouse=True)
@@ -28,21 +27,20 @@ def one_thread() -> Iterator[None]:
     torch.set_num_threads(before)
 
 
-def assert_same_costs(device: str, reference: SweepView, neighbours: list[SweepView], planes: np.ndarray, **options: object) -> None:
+def assert_same_costs(reference: SweepView, neighbours: list[SweepView], planes: np.ndarray, **options: object) -> None:
     """Equal to a unit of 255, but for the few points at the very border of a neighbour, seen by one and not by the other."""
     ours = plane_sweep(reference, neighbours, planes, **options)  # type: ignore[arg-type]
-    theirs = plane_sweep_on(device, reference, neighbours, planes, **options)  # type: ignore[arg-type]
+    theirs = plane_sweep_on(NAME, reference, neighbours, planes, **options)  # type: ignore[arg-type]
     assert ours.shape == theirs.shape and ours.dtype == theirs.dtype
     assert np.mean(np.abs(ours.astype(int) - theirs.astype(int)) > 1) < 1e-3
     assert 0 < ours.min() + 1 < ours.max()
 
 
-@pytest.mark.parametrize("device", DEVICES)
-def test_turned_and_distorted_views_and_a_shell_around_a_surface(device: str) -> None:
+def test_turned_and_distorted_views_and_a_shell_around_a_surface() -> None:
     neighbours = [turned_view(1, (0.03, 0.01), 0.1), turned_view(2, (0.0, 0.0), 0.2), turned_view(3, (-0.1, 0.0), 0.1, (24, 30))]
-    assert_same_costs(device, turned_view(0, (0.05, -0.02), 0.1), neighbours, np.linspace(0.4, 2.0, 7), matching=Matching(2, 2, 0.01))
+    assert_same_costs(turned_view(0, (0.05, -0.02), 0.1), neighbours, np.linspace(0.4, 2.0, 7), matching=Matching(2, 2, 0.01))
     scene = traced((wall(1.6, tilt=0.3), card(0.8, -0.1, 0.06)), noise=0.01)
-    assert_same_costs(device, scene.views[0], scene.views[1:], np.array([-0.02, 0.0, 0.02]), base_dioptre=scene.dioptre)
+    assert_same_costs(scene.views[0], scene.views[1:], np.array([-0.02, 0.0, 0.02]), base_dioptre=scene.dioptre)
 
 
 def test_a_device_that_is_not_there_is_refused() -> None:
@@ -57,6 +55,6 @@ def test_the_sweep_of_a_device_may_stand_in() -> None:
     scene = traced((wall(1.6, tilt=0.3), card(0.8, -0.1, 0.06)), noise=0.01)
     by_loops, by_torch = (
         dense_depth(scene.rgb[0], scene.views[0], scene.views[1:], (0.4, 1.5), settings=DenseSettings(most_planes=12, device=device))
-        for device in (None, "cpu")
+        for device in (None, NAME)
     )
     assert np.mean(np.abs(by_torch.depth_m / by_loops.depth_m - 1.0) > 0.001) < 0.01

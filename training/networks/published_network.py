@@ -21,6 +21,8 @@ class PublishedTiles(nn.Module):
     """The published network for all tiles at once: F(x) = tanh(C2(R_N(... R_1(C1(x)) ...) + x_RGB)) of Eq. 2, "+" being concatenation.
 
     Input (B, C tiles, t, t), output (B, 3 tiles, t, t). All convolutions are grouped, so no tile sees another.
+    channels_last: whether the channels of a pixel lie side by side; None is on a CPU only, where depthwise convolutions are then many times
+    faster. Those of a GPU would turn every input round.
     """
 
     linear_in_radiance = False
@@ -29,6 +31,7 @@ class PublishedTiles(nn.Module):
         super().__init__()
         features, inputs = 3 * settings.width, settings.input_channels
         self.tile_count, self.activation = tiles, settings.activation
+        self.channels_last: bool | None = None
         self.c1 = nn.Conv2d(inputs * tiles, features * tiles, 1, groups=tiles)
         radii = [1 if settings.kernels == "3x3" else n for n in range(1, blocks + 1)]
         self.reach_px = 2 * sum(radii)
@@ -39,14 +42,18 @@ class PublishedTiles(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         batch, _, height, width = x.shape
-        # Depthwise convolutions on the CPU are many times faster with the channels of a pixel side by side.
-        state = self.c1(x if torch.compiler.is_exporting() else x.contiguous(memory_format=torch.channels_last))
+        state = self.c1(x.contiguous(memory_format=torch.channels_last) if self._side_by_side(x) else x)
         for block in self.blocks:
             state = block(state)
         per_tile = (batch, self.tile_count, -1, height, width)
         joined = torch.cat([state.reshape(per_tile), x.reshape(per_tile)[:, :, :3]], dim=2)
         y = self.c2(joined.reshape(batch, -1, height, width))
         return torch.tanh(y) if self.activation == "tanh" else y
+
+    def _side_by_side(self, x: Tensor) -> bool:
+        if torch.compiler.is_exporting():
+            return False
+        return x.device.type == "cpu" if self.channels_last is None else self.channels_last
 
     @torch.no_grad()
     def _start_as_identity(self, features: int) -> None:
