@@ -64,7 +64,7 @@ def drawn_table(aperture: Aperture) -> Float32[np.ndarray, " steps"]:
     with suppress(OSError, ValueError, EOFError):
         if path is not None and path.is_file():
             return np.load(path)
-    made = _madedrawn_table(aperture)
+    made = _made_table(aperture)
     with suppress(OSError):
         if path is not None:
             with atomic_path(path, is_result=False) as temporary, temporary.open("wb") as file:

@@ -43,6 +43,47 @@ def _at(plane, y, x, height, width, mask):
 
 @triton.jit
 @no_type_check
+def _beside(plane, y, x, by, height, width, mask, WAY: tl.constexpr):
+    """Load pixels `by` places on: to the right, down, or down to either side."""
+    if WAY == 0:
+        found = _at(plane, y, x + by, height, width, mask)
+    elif WAY == 1:
+        found = _at(plane, y + by, x, height, width, mask)
+    elif WAY == 2:
+        found = _at(plane, y + by, x + by, height, width, mask)
+    else:
+        found = _at(plane, y + by, x - by, height, width, mask)
+    return found
+
+
+@triton.jit
+@no_type_check
+def _between(result, circle, coc_px, y, x, height, width, uneven, even_px, apart_px, WAY: tl.constexpr):
+    """Return the nearer of two even surfaces on opposite sides where the pixel lies between them, else what was found before."""
+    back_1 = _beside(coc_px, y, x, -1, height, width, uneven, WAY)
+    back_2 = _beside(coc_px, y, x, -2, height, width, uneven, WAY)
+    back_3 = _beside(coc_px, y, x, -3, height, width, uneven, WAY)
+    on_1 = _beside(coc_px, y, x, 1, height, width, uneven, WAY)
+    on_2 = _beside(coc_px, y, x, 2, height, width, uneven, WAY)
+    on_3 = _beside(coc_px, y, x, 3, height, width, uneven, WAY)
+    here = uneven & ((tl.abs(circle - on_1) > even_px) | (tl.abs(circle - back_1) > even_px))
+    result = _nearer(result, circle, back_1, back_2, on_1, on_2, here, even_px, apart_px)
+    result = _nearer(result, circle, back_1, back_2, on_2, on_3, here, even_px, apart_px)
+    result = _nearer(result, circle, back_2, back_3, on_1, on_2, here, even_px, apart_px)
+    return _nearer(result, circle, back_2, back_3, on_2, on_3, here, even_px, apart_px)
+
+
+@triton.jit
+@no_type_check
+def _nearer(result, circle, a, beyond_a, b, beyond_b, here, even_px, apart_px):
+    found = here & (tl.abs(a - beyond_a) <= even_px) & (tl.abs(circle - a) > even_px)
+    found = found & ((circle - a) * (b - circle) > 0.0) & (tl.abs(b - circle) > even_px)
+    found = found & (tl.abs(b - beyond_b) <= even_px) & (tl.abs(b - a) > apart_px)
+    return tl.where(found, tl.where(tl.abs(circle - a) < tl.abs(b - circle), a, b), result)
+
+
+@triton.jit
+@no_type_check
 def _look(snapped, lit, brightness, coc_px, height, width, ratio, even_px, apart_px, PIXELS: tl.constexpr):
     pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     inside = pixel < height * width
@@ -65,23 +106,7 @@ def _look(snapped, lit, brightness, coc_px, height, width, ratio, even_px, apart
     result = circle
     if tl.max(uneven.to(tl.int32), axis=0) > 0:
         for way in tl.static_range(4):
-            dy = 0 if way == 0 else 1
-            dx = 1 if way == 0 or way == 2 else (0 if way == 1 else -1)
-            back_1, back_2 = _at(coc_px, y - dy, x - dx, height, width, uneven), _at(coc_px, y - 2 * dy, x - 2 * dx, height, width, uneven)
-            back_3, on_1 = _at(coc_px, y - 3 * dy, x - 3 * dx, height, width, uneven), _at(coc_px, y + dy, x + dx, height, width, uneven)
-            on_2 = _at(coc_px, y + 2 * dy, x + 2 * dx, height, width, uneven)
-            on_3 = _at(coc_px, y + 3 * dy, x + 3 * dx, height, width, uneven)
-            way_uneven = uneven & ((tl.abs(circle - on_1) > even_px) | (tl.abs(circle - back_1) > even_px))
-            for before in tl.static_range(2):
-                a = back_1 if before == 0 else back_2
-                beyond = back_2 if before == 0 else back_3
-                start = way_uneven & (tl.abs(a - beyond) <= even_px) & (tl.abs(circle - a) > even_px)
-                for after in tl.static_range(2):
-                    b = on_1 if after == 0 else on_2
-                    farther = on_2 if after == 0 else on_3
-                    between = ((circle - a) * (b - circle) > 0.0) & (tl.abs(b - circle) > even_px)
-                    found = start & between & (tl.abs(b - farther) <= even_px) & (tl.abs(b - a) > apart_px)
-                    result = tl.where(found, tl.where(tl.abs(circle - a) < tl.abs(b - circle), a, b), result)
+            result = _between(result, circle, coc_px, y, x, height, width, uneven, even_px, apart_px, way)
     tl.store(snapped + pixel, result, mask=inside)
 
 
@@ -112,15 +137,23 @@ def _leaps(farthest_px: int) -> list[int]:
 
 @triton.jit
 @no_type_check
+def _lowest(coc_px, y, x, height, width, mask):
+    """Return the least of the 3x3 pixels around each."""
+    low = _at(coc_px, y, x, height, width, mask)
+    for dy in tl.static_range(-1, 2):
+        for dx in tl.static_range(-1, 2):
+            low = tl.minimum(low, _at(coc_px, y + dy, x + dx, height, width, mask))
+    return low
+
+
+@triton.jit
+@no_type_check
 def _find_pure(pure_px, coc_px, lit, height, width, step_px, PIXELS: tl.constexpr):
     pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
     inside = pixel < height * width
     y, x = pixel // width, pixel % width
     here = tl.load(coc_px + pixel, mask=inside, other=0.0)
-    low = here
-    for dy in tl.static_range(-1, 2):
-        for dx in tl.static_range(-1, 2):
-            low = tl.minimum(low, _at(coc_px, y + dy, x + dx, height, width, inside))
+    low = _lowest(coc_px, y, x, height, width, inside)
     is_pure = (here - low <= step_px) & (tl.load(lit + pixel, mask=inside, other=1) == 0)
     tl.store(pure_px + pixel, tl.where(is_pure, here, float("nan")), mask=inside)
 
@@ -133,10 +166,7 @@ def _pure_beside(of_rims, pure_px, coc_px, height, width, step_px, radius, PIXEL
     inside = pixel < height * width
     y, x = pixel // width, pixel % width
     here = tl.load(coc_px + pixel, mask=inside, other=0.0)
-    low = here
-    for dy in tl.static_range(-1, 2):
-        for dx in tl.static_range(-1, 2):
-            low = tl.minimum(low, _at(coc_px, y + dy, x + dx, height, width, inside))
+    low = _lowest(coc_px, y, x, height, width, inside)
     rim = inside & (here - low > step_px)
     found = tl.zeros((PIXELS,), tl.int32)
     if tl.max(rim.to(tl.int32), axis=0) > 0:

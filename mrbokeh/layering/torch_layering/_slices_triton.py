@@ -1,102 +1,87 @@
-"""Kernels that lay out the light of a slice and let it claim the pupil, on an NVIDIA GPU; `mrbokeh.layering._slices_numba` has their twins."""
+"""Kernels that find the slices of a picture and let their light claim the pupil; `mrbokeh.layering._slices_numba` has the compiled loops."""
 
 from typing import no_type_check
 
 import torch
 import triton
 import triton.language as tl
-from jaxtyping import Float32
+from jaxtyping import Float32, Int32, Int64
 from torch import Tensor
 
-_PIXELS = 128
+from mrbokeh.layering.torch_layering.slicing import Box
 
-Picture = Float32[Tensor, "height width 4"]
-Plane = Float32[Tensor, "height width"]
-Window = tuple[int, int, int, int]
+_TILE = 16, 64
+"""Rows and columns that one program looks at."""
 
 
-def light_of_slice(parts: list[tuple[Picture, Plane, Plane]], number: int, step_px: float, window: Window) -> tuple[Picture, Plane]:
-    """Return the light of one slice in a window, and its circles of confusion: of values, diameters and shares of one layer, or of two.
-
-    Where two layers share a place, the first one's circle holds for both.
-    """
-    top, bottom, left, right = window
-    (values, coc_px, shares), (others, others_px, other_shares) = parts[0], parts[-1]
-    light = torch.empty((bottom - top, right - left, 4), dtype=torch.float32, device=values.device)
-    circles = torch.empty(light.shape[:2], dtype=torch.float32, device=values.device)
-    tensors = light, circles, values, coc_px, shares, others, others_px, other_shares
-    sizes = circles.numel(), right - left, coc_px.shape[1], top, left, number, step_px
-    _light_of_slice[(triton.cdiv(circles.numel(), _PIXELS),)](*tensors, *sizes, len(parts) > 1, _PIXELS)
-    return light, circles
+def extents(
+    coc_px: Float32[Tensor, "2 height width"], shares: Float32[Tensor, "kinds height width"], first: int, numbers: int, step_px: float
+) -> Int32[Tensor, "kinds numbers 4"]:
+    """Return first and end row, first and end column of the pixels of each kind and slice, from number `first` on; end 0 for none."""
+    kinds, height, width = shares.shape
+    nowhere = torch.tensor([height, 0, width, 0], dtype=torch.int32, device=shares.device)
+    boxes = nowhere.expand(kinds, numbers, 4).contiguous()
+    grid = (triton.cdiv(width, _TILE[1]), triton.cdiv(height, _TILE[0]), kinds)
+    _extents[grid](boxes, coc_px, shares, height, width, first, numbers, step_px, *_TILE)
+    return boxes
 
 
 @triton.jit
 @no_type_check
-def _light_of_slice(
-    light,
-    circles,
-    values,
-    coc_px,
-    shares,
-    others,
-    others_px,
-    other_shares,
-    pixels,
-    width,
-    columns,
-    top,
-    left,
-    number,
-    step_px,
-    IS_PAIR: tl.constexpr,
-    PIXELS: tl.constexpr,
-):
-    pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
-    inside = pixel < pixels
-    channel = tl.arange(0, 4)
-    at = (pixel // width + top) * columns + pixel % width + left
-    circle, value = _mine(values, coc_px, shares, at, channel, inside, number, step_px)
-    if IS_PAIR:
-        other, more = _mine(others, others_px, other_shares, at, channel, inside, number, step_px)
-        circle = tl.where(circle == 0.0, other, circle)
-        value += more
-    tl.store(circles + pixel, circle, mask=inside)
-    tl.store(light + pixel[:, None] * 4 + channel[None, :], value, mask=inside[:, None] & (channel < 4)[None, :])
+def _extents(boxes, coc_px, shares, height, width, first, numbers, step_px, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+    kind = tl.program_id(2)
+    y, x = tl.program_id(1) * ROWS + tl.arange(0, ROWS), tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
+    inside = (y < height)[:, None] & (x < width)[None, :]
+    at = y[:, None] * width + x[None, :]
+    circle = tl.load(coc_px + tl.minimum(kind, 1) * height * width + at, mask=inside, other=0.0)
+    used = tl.load(shares + kind * height * width + at, mask=inside, other=0.0) > 0.0
+    number = tl.floor(circle / step_px + 0.5).to(tl.int32) - first
+    lowest = tl.min(tl.min(tl.where(used, number, numbers), axis=1), axis=0)
+    highest = tl.max(tl.max(tl.where(used, number, -1), axis=1), axis=0)
+    rows, columns = y[:, None] + 0 * x[None, :], x[None, :] + 0 * y[:, None]
+    for k in range(lowest, highest + 1):
+        mine = used & (number == k)
+        if tl.max(tl.max(mine.to(tl.int32), axis=1), axis=0) > 0:
+            box = boxes + (kind * numbers + k) * 4
+            tl.atomic_min(box, tl.min(tl.min(tl.where(mine, rows, height), axis=1), axis=0))
+            tl.atomic_max(box + 1, tl.max(tl.max(tl.where(mine, rows, -1), axis=1), axis=0) + 1)
+            tl.atomic_min(box + 2, tl.min(tl.min(tl.where(mine, columns, width), axis=1), axis=0))
+            tl.atomic_max(box + 3, tl.max(tl.max(tl.where(mine, columns, -1), axis=1), axis=0) + 1)
+
+
+def claimed(
+    light: Float32[Tensor, "pixels 4"], places: Int32[Tensor, "slices 11"], starts: Int64[Tensor, "slices 2"], frame: Box
+) -> Float32[Tensor, "height width 4"]:
+    """Return colour and how much of the pupil is taken where slices, one after the other, claim as much of it as is still free."""
+    colour = torch.empty((frame.rows, frame.columns, 4), dtype=torch.float32, device=light.device)
+    grid = (triton.cdiv(frame.columns, _TILE[1]), triton.cdiv(frame.rows, _TILE[0] // 4))
+    _claimed[grid](colour, light, places, starts, len(places), *frame, _TILE[0] // 4, _TILE[1])
+    return colour
 
 
 @triton.jit
 @no_type_check
-def _mine(values, coc_px, shares, at, channel, inside, number, step_px):
-    """Return diameters and light of the pixels of a layer that belong to the slice; 0 elsewhere."""
-    circle = tl.load(coc_px + at, mask=inside, other=0.0)
-    share = tl.load(shares + at, mask=inside, other=0.0)
-    mine = inside & (share > 0.0) & (tl.floor(circle / step_px + 0.5) == number)
-    value = tl.load(values + at[:, None] * 4 + channel[None, :], mask=mine[:, None] & (channel < 4)[None, :], other=0.0)
-    return tl.where(mine, circle, 0.0), value * tl.where(mine, share, 0.0)[:, None]
-
-
-def claim(colour: Picture, light: Picture, top: int, left: int) -> None:
-    """Add light to colour as far as the pupil is still free, its coverage to the last channel. top, left: of the light in the frame."""
-    height, width, _ = light.shape
-    sizes = height * width, width, *colour.shape[:2], top, left
-    _claim[(triton.cdiv(height * width, _PIXELS),)](colour, light, *sizes, _PIXELS)
-
-
-@triton.jit
-@no_type_check
-def _claim(colour, light, pixels, width, frame_height, frame_width, top, left, PIXELS: tl.constexpr):
-    pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
-    y, x = pixel // width + top, pixel % width + left
-    inside = (pixel < pixels) & (y >= 0) & (y < frame_height) & (x >= 0) & (x < frame_width)
-    channel = tl.arange(0, 4)
-    both = inside[:, None] & (channel < 4)[None, :]
-    to = colour + (y * frame_width + x)[:, None] * 4 + channel[None, :]
-    rays = tl.load(light + pixel[:, None] * 4 + channel[None, :], mask=both, other=0.0)
-    there = tl.load(to, mask=both, other=0.0)
-    is_coverage = (channel == 3)[None, :]
-    coverage = tl.sum(tl.where(is_coverage, rays, 0.0), axis=1)
-    taken = tl.sum(tl.where(is_coverage, there, 0.0), axis=1)
-    share = tl.where(coverage > 0.0, tl.minimum(1.0, (1.0 - taken) / coverage), 0.0)
-    claimed = there + rays * share[:, None]
-    full = tl.minimum(1.0, taken + tl.maximum(0.0, coverage))
-    tl.store(to, tl.where(is_coverage, full[:, None], claimed), mask=both)
+def _claimed(colour, light, places, starts, slices, top, left, height, width, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
+    first_y, first_x = top + tl.program_id(1) * ROWS, left + tl.program_id(0) * COLUMNS
+    y, x = first_y + tl.arange(0, ROWS), first_x + tl.arange(0, COLUMNS)
+    red, green = tl.zeros((ROWS, COLUMNS), tl.float32), tl.zeros((ROWS, COLUMNS), tl.float32)
+    blue, taken = tl.zeros((ROWS, COLUMNS), tl.float32), tl.zeros((ROWS, COLUMNS), tl.float32)
+    for piece in range(slices):
+        place = places + 11 * piece
+        box_top, box_left, rows, columns = tl.load(place + 6), tl.load(place + 7), tl.load(place + 8), tl.load(place + 9)
+        meets = (first_y < box_top + rows) & (first_y + ROWS > box_top) & (first_x < box_left + columns) & (first_x + COLUMNS > box_left)
+        if meets:
+            inside = ((y >= box_top) & (y < box_top + rows))[:, None] & ((x >= box_left) & (x < box_left + columns))[None, :]
+            at = light + 4 * tl.load(starts + 2 * piece + 1) + 4 * ((y - box_top)[:, None] * columns + (x - box_left)[None, :])
+            coverage = tl.load(at + 3, mask=inside, other=0.0)
+            share = tl.where(coverage > 0.0, tl.minimum(1.0, (1.0 - taken) / coverage), 0.0)
+            red += share * tl.load(at, mask=inside, other=0.0)
+            green += share * tl.load(at + 1, mask=inside, other=0.0)
+            blue += share * tl.load(at + 2, mask=inside, other=0.0)
+            taken = tl.minimum(1.0, taken + tl.maximum(coverage, 0.0))
+    to = colour + 4 * ((y - top)[:, None] * width + (x - left)[None, :])
+    mask = (y < top + height)[:, None] & (x < left + width)[None, :]
+    tl.store(to, red, mask=mask)
+    tl.store(to + 1, green, mask=mask)
+    tl.store(to + 2, blue, mask=mask)
+    tl.store(to + 3, taken, mask=mask)

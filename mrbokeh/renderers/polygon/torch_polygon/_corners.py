@@ -35,6 +35,7 @@ class DeviceTables:
     edges (E, 4): slope, shift, origin, curvature. corners (K, 7): the edge before, the one after, what one line on of either moves the
     crossing in x and y, the plane. weights (K,): of the impulses. sums, unit: sums along directions, whose profiles count in 1 / unit.
     small (2, levels + 1, size, size): whole kernels behind the focus and in front.
+    taps (T, 4): number of the sum, x, y and weight of every entry of the profiles.
     """
 
     tables: ApertureTables
@@ -44,6 +45,7 @@ class DeviceTables:
     sums: list[Along]
     unit: int
     small: Float32[Tensor, "2 levels size size"]
+    taps: Int32[Tensor, "taps 4"]
 
     @classmethod
     def of(cls, tables: ApertureTables, aperture: Aperture, device: torch.device) -> "DeviceTables":
@@ -52,6 +54,7 @@ class DeviceTables:
         steps = crossed.steps * np.where(crossed.turned, -1, 1)[..., None]
         table = np.column_stack([crossed.before, crossed.after, steps.reshape(-1, 4), crossed.plane])
         sums, unit = _sums(tables)
+        taps = np.array([(which, *tap) for which, along in enumerate(sums) for tap in along.taps], np.int32)
         return cls(
             tables=tables,
             edges=torch.from_numpy(edges.astype(np.float32)).to(device),
@@ -60,6 +63,7 @@ class DeviceTables:
             sums=sums,
             unit=unit,
             small=torch.from_numpy(small_kernels(aperture, tables.exact.to_px)).to(device),
+            taps=torch.from_numpy(taps).to(device),
         )
 
     @property

@@ -9,8 +9,10 @@ from jaxtyping import Float32, Int64
 from torch import Tensor
 from torch.nn.functional import pad
 
+from mrbokeh.layering.torch_layering.slicing import Box
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.polygon._survey_numba import HIGHLIGHT, TILE_PX
+from mrbokeh.renderers.polygon.torch_polygon._batch import Batch
 
 Picture = Float32[Tensor, "height width 4"]
 Plane = Float32[Tensor, "height width"]
@@ -46,12 +48,19 @@ def _suspects(values: Picture, coc_px: Plane, from_px: float) -> Int64[Tensor, "
     return torch.nonzero(high & (coc_px.abs() > from_px))
 
 
-def stamp(out: Picture, values: Picture, coc_px: Plane, shares: Plane, aperture: Aperture) -> None:
-    """Add the share of each pixel's light to the picture, by the exact kernel of the aperture at its diameter."""
-    height, width = coc_px.shape
-    for y, x in torch.nonzero(shares > 0.0).tolist():
-        kernel = torch.from_numpy(aperture.rasterize(float(coc_px[y, x])).kernel).to(out)
-        reach = kernel.shape[0] // 2
-        top, bottom, left, right = max(0, y - reach), min(height, y + reach + 1), max(0, x - reach), min(width, x + reach + 1)
-        part = kernel[top - y + reach : bottom - y + reach, left - x + reach : right - x + reach]
-        out[top:bottom, left:right] += part[..., None] * (shares[y, x] * values[y, x])
+def stamp(light: Float32[Tensor, "pixels 4"], batch: Batch, shares: Plane, aperture: Aperture) -> None:
+    """Add the share of each pixel of the front to the light of its slice, by the exact kernel of the aperture at its diameter."""
+    slices, places, starts = batch.slices, batch.places.tolist(), batch.starts.tolist()
+    at = torch.nonzero(shares > 0.0)
+    y, x = at.T
+    coc_px, values = slices.coc_px[0][y, x], slices.values[0][y, x] * (shares * slices.shares[0])[y, x][:, None]
+    pieces = slices.order[0][torch.floor(coc_px / slices.step_px + 0.5).long() - slices.first]
+    for (row, column), diameter, value, piece in zip(at.tolist(), coc_px.tolist(), values, pieces.tolist(), strict=True):
+        kernel = torch.from_numpy(aperture.rasterize(diameter).kernel).to(light)
+        reach, seen = kernel.shape[0] // 2, Box(*places[piece][6:10])
+        box = Box(row - reach, column - reach, *kernel.shape).within(seen)
+        if box.rows == 0 or box.columns == 0:
+            continue
+        part = kernel[box.top - row + reach :, box.left - column + reach :][: box.rows, : box.columns]
+        window = light[starts[piece][1] :][: seen.rows * seen.columns].view(seen.rows, seen.columns, 4)
+        window[box.top - seen.top :, box.left - seen.left :][: box.rows, : box.columns] += part[..., None] * value

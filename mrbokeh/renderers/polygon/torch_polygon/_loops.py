@@ -7,6 +7,8 @@ import torch
 from jaxtyping import Float32, Int
 from torch import Tensor
 
+from mrbokeh.layering.torch_layering.slicing import Slices
+from mrbokeh.renderers.polygon.torch_polygon._batch import Batch
 from mrbokeh.renderers.polygon.torch_polygon._corners import Along, DeviceTables
 
 Planes = Int[Tensor, "planes rows columns 4"]
@@ -14,12 +16,53 @@ Picture = Float32[Tensor, "height width 4"]
 Plane = Float32[Tensor, "height width"]
 
 
-def splat(planes: Planes, values: Picture, radius: Plane, gain: Plane, tables: DeviceTables, scale: float, margin: int) -> None:
-    """Add every pixel's impulses, `gain` times its light, to the planes. radius: signed, of its kernel. scale: units of one."""
-    rows, columns = planes.shape[1:3]
+def survey(values: Picture, coc_px: Plane) -> Float32[Tensor, "6"]:
+    """Return the strongest value, the largest diameter of a pixel with light, inf for none, and how far below 0 each channel goes."""
+    size = torch.where((values != 0).any(dim=2), torch.nan_to_num(coc_px.abs(), torch.inf), 0.0)
+    return torch.cat([torch.stack([values.abs().amax(), size.amax()]), (-values).amax(dim=(0, 1)).clamp(min=0.0)])
+
+
+def sum_slices(
+    slices: Slices, kept: Plane | None, tables: DeviceTables, most: float, lowest: Float32[Tensor, "4"], whole: torch.dtype
+) -> tuple[Float32[Tensor, "pixels 4"], Batch]:
+    """Return the light of all slices, one after the other, and where each lies.
+
+    kept: the share of each pixel of the front that is no highlight; None for all. most: no light is stronger. lowest: below what no channel
+    of the result falls. whole: numbers of the sums.
+    """
+    batch = Batch.of(slices, tables, most, whole)
+    light = []
+    for place, scales in zip(batch.places.tolist(), batch.scales.tolist(), strict=True):
+        kind, number, _, _, _, _, top, left, rows, columns, rest = place
+        layer = min(kind, 1)
+        mine = slices.shares[kind] * (torch.floor(slices.coc_px[layer] / slices.step_px + 0.5) == number)
+        values, coc_px = slices.values[layer] * mine[..., None], slices.coc_px[layer]
+        out = spread_small(values, coc_px, tables)
+        if rest % 4 >= 2:
+            margin = rest // 4
+            size = len(coc_px) + 2 * margin, coc_px.shape[1] + 2 * margin, 4
+            planes = torch.zeros((tables.planes, *size), dtype=whole, device=values.device)
+            splat(planes, values, coc_px, kept if kind == 0 else None, tables, scales[0], margin)
+            sums = torch.stack([sum_along(planes, along) for along in tables.sums])
+            out = torch.maximum(out + sum_down(sums, tables, scales[1], margin), lowest)
+        light.append(out[top : top + rows, left : left + columns].reshape(-1, 4))
+    return torch.cat(light), batch
+
+
+def summed_shares(coc_px: Plane, tables: DeviceTables) -> Plane:
+    """Return how much of each pixel's light goes through impulses and sums; the rest goes by whole small kernels."""
+    exact = tables.tables.exact
+    return ((coc_px.abs() - exact.from_px) / (exact.to_px - exact.from_px)).clamp(0.0, 1.0)
+
+
+def splat(planes: Planes, values: Picture, coc_px: Plane, kept: Plane | None, tables: DeviceTables, scale: float, margin: int) -> None:
+    """Add the impulses of what goes through sums to the planes. kept: the share of a pixel that is no highlight. scale: units of one."""
+    columns = planes.shape[2]
     real = torch.float32 if planes.dtype == torch.int32 else torch.float64
-    y, x = torch.nonzero(gain > 0.0, as_tuple=True)
-    r, light = radius[y, x], values[y, x]
+    gain = summed_shares(coc_px, tables) * (1.0 if kept is None else kept)
+    y, x = torch.nonzero((gain > 0.0) & (values != 0).any(dim=2), as_tuple=True)
+    r, light = torch.sqrt(0.25 * coc_px[y, x] ** 2 + tables.tables.corners.growth), values[y, x]
+    r = torch.where(coc_px[y, x] > 0, r, -r)
     slope, shift, origin, curvature = tables.edges.T[:, :, None]
     offset = slope * r + (origin + torch.where(r > 0, shift, -shift))
     line = torch.floor(offset)
@@ -37,7 +80,6 @@ def splat(planes: Planes, values: Picture, radius: Plane, gain: Plane, tables: D
                 to = at + on * (steps[1] * columns + steps[0]) + on_after * (steps[3] * columns + steps[2])
                 impulse = light * (weight * of_before * of_after).to(real)[:, None]
                 flat.index_add_(0, to, torch.floor(impulse + 0.5).to(planes.dtype))
-    assert rows > 2 * margin
 
 
 def _place(line: Tensor, step_x: int, step_y: int, columns: int) -> Tensor:
@@ -60,8 +102,8 @@ def sum_along(planes: Planes, along: Along) -> Int[Tensor, "rows columns 4"]:
     return total
 
 
-def sum_down(sums: list[Tensor], tables: DeviceTables, unit: float, margin: int) -> Picture:
-    """Return the light inside the margin: profiles laid over the sums, summed downwards; the picture counts in `unit`."""
+def sum_down(sums: Int[Tensor, "directions rows columns 4"], tables: DeviceTables, unit: float, margin: int) -> Picture:
+    """Return the light inside the margin: profiles laid over the sums, summed downwards. unit: what one of the sums means."""
     total = torch.zeros_like(sums[0])
     rows, columns = total.shape[:2]
     for along, summed in zip(tables.sums, sums, strict=True):
@@ -72,8 +114,8 @@ def sum_down(sums: list[Tensor], tables: DeviceTables, unit: float, margin: int)
     return (inside.to(torch.float64) * unit).float()
 
 
-def spread_small(values: Picture, coc_px: Plane, share: Plane, tables: DeviceTables) -> Picture:
-    """Return the light of pixels with whole small kernels: `share` of it, gathered by the places that it reaches."""
+def spread_small(values: Picture, coc_px: Plane, tables: DeviceTables) -> Picture:
+    """Return the light that goes by whole small kernels, gathered by the places that it reaches."""
     height, width, _ = values.shape
     size, per_px = tables.small.shape[2], tables.tables.exact.per_px
     reach = size // 2
@@ -81,7 +123,7 @@ def spread_small(values: Picture, coc_px: Plane, share: Plane, tables: DeviceTab
     level = at.long().clamp(max=tables.small.shape[1] - 2)
     upper, side = at - level, (coc_px <= 0).long()
     out = torch.zeros((height + 2 * reach, width + 2 * reach, 4), dtype=torch.float32, device=values.device)
-    light = values * share[..., None]
+    light = values * (1.0 - summed_shares(coc_px, tables))[..., None]
     for j in range(size):
         for i in range(size):
             low, high = tables.small[side, level, j, i], tables.small[side, level + 1, j, i]

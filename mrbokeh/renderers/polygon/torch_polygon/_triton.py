@@ -1,4 +1,8 @@
-"""Kernels of polygonal differences for NVIDIA GPUs; imported only if triton is installed. `_loops` says what each computes."""
+"""Kernels of polygonal differences for NVIDIA GPUs; imported only if triton is installed. `_loops` says what each computes.
+
+All slices of a picture go together, each in a window of its own: one launch for all costs little more than one for the largest. Four
+channels of a cell lie side by side; a row is a line of numbers, of which neighbouring threads take neighbouring ones.
+"""
 
 from typing import no_type_check
 
@@ -8,26 +12,76 @@ import triton.language as tl
 from jaxtyping import Float32, Int
 from torch import Tensor
 
+from mrbokeh.layering.torch_layering.slicing import Slices
+from mrbokeh.renderers.polygon.torch_polygon._batch import Batch
 from mrbokeh.renderers.polygon.torch_polygon._corners import Along, DeviceTables
 
-Planes = Int[Tensor, "planes rows columns 4"]
 Picture = Float32[Tensor, "height width 4"]
 Plane = Float32[Tensor, "height width"]
 
-_PIXELS = 128
-"""Pixels that one program splats."""
-_CHAINS, _CELLS, _ROWS = 32, 64, 64
-"""Sums that a program advances together: chains along a direction, cells of a row, and rows of a column."""
+_SEEN, _SPLATTED = 1024, 32
+"""Pixels that one program surveys or splats. Splatting, each number has a thread of its own: then atomic additions lie side by side."""
+_CHAIN_STEPS, _CHAIN_NUMBERS = 16, 64
+_COLUMN_ROWS, _COLUMN_STEPS, _COLUMN_NUMBERS = 64, 8, 128
+"""Rows of a chunk, and what a program of one warp loads at a time."""
+_ROW_CELLS = 64
+_TILE = 16, 16
+"""Rows and columns of the places that one program gathers; small kernels reach no farther than one tile."""
+_SMALL, _SUMMED = tl.constexpr(1), tl.constexpr(2)
 
 
-def splat(planes: Planes, values: Picture, radius: Plane, gain: Plane, tables: DeviceTables, scale: float, margin: int) -> None:
-    height, width = gain.shape
-    area = tables.tables.corners.area
-    grid = (triton.cdiv(gain.numel(), _PIXELS),)
-    tensors = planes, values, radius, gain, tables.edges, tables.corners, tables.weights
-    sizes = gain.numel(), width, planes.shape[1] * planes.shape[2], planes.shape[2], margin
-    counts = len(tables.edges), len(tables.weights)
-    _splat[grid](*tensors, *sizes, area[0], area[1], scale, *counts, planes.dtype == torch.int64, _PIXELS)
+def sum_slices(
+    slices: Slices, kept: Plane | None, tables: DeviceTables, most: float, lowest: Float32[Tensor, "4"], whole: torch.dtype
+) -> tuple[Float32[Tensor, "pixels 4"], Batch]:
+    """Return the light of all slices, one after the other, and where each lies."""
+    batch = Batch.of(slices, tables, most, whole)
+    light = torch.empty((batch.pixels, 4), dtype=torch.float32, device=slices.values.device)
+    spread_small(light, batch, tables)
+    planes = torch.zeros(batch.cells * tables.planes * 4, dtype=whole, device=light.device)
+    splat(planes, batch, kept, tables, tables.planes)
+    sums = torch.empty(batch.cells * len(tables.sums) * 4, dtype=whole, device=light.device)
+    for which, along in enumerate(tables.sums):
+        sum_along(sums, planes, batch, along, which, tables)
+    sum_down(light, lowest, sums, batch, tables)
+    return light, batch
+
+
+def survey(values: Picture, coc_px: Plane) -> Float32[Tensor, "6"]:
+    """Return the strongest value, the largest diameter of a pixel with light, and how far below 0 each channel goes."""
+    found = torch.zeros(6, dtype=torch.float32, device=values.device)
+    _survey[(triton.cdiv(coc_px.numel(), _SEEN),)](found, values, coc_px, coc_px.numel(), _SEEN)
+    return found
+
+
+@triton.jit
+@no_type_check
+def _survey(found, values, coc_px, pixels, PIXELS: tl.constexpr):
+    pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
+    inside = pixel < pixels
+    channel = tl.arange(0, 4)
+    both = inside[:, None] & (channel < 4)[None, :]
+    light = tl.load(values + pixel[:, None] * 4 + channel[None, :], mask=both, other=0.0)
+    size = tl.abs(tl.load(coc_px + pixel, mask=inside, other=0.0))
+    size = tl.where(size == size, size, float("inf"))
+    strongest = tl.max(tl.abs(light), axis=1)
+    tl.atomic_max(found, tl.max(strongest, axis=0))
+    tl.atomic_max(found + 1, tl.max(tl.where(strongest > 0.0, size, 0.0), axis=0))
+    tl.atomic_max(found + 2 + channel, tl.maximum(tl.max(-light, axis=0), 0.0))
+
+
+def splat(planes: Int[Tensor, " numbers"], batch: Batch, kept: Plane | None, tables: DeviceTables, count: int) -> None:
+    """Add the impulses of all pixels to the planes of their slices. kept: the share of a pixel that is no highlight. count: of planes."""
+    exact, corners, slices = tables.tables.exact, tables.tables.corners, batch.slices
+    pixels = slices.coc_px[0].numel()
+    grid = (triton.cdiv(pixels, _SPLATTED), len(slices.shares))
+    tensors = planes, slices.values, slices.coc_px, slices.shares, slices.shares if kept is None else kept
+    where = batch.places, batch.starts, batch.scales, slices.order
+    sizes = pixels, slices.coc_px.shape[2], slices.first, slices.order.shape[1], slices.step_px
+    shape = corners.growth, *corners.area, exact.from_px, 1.0 / (exact.to_px - exact.from_px)
+    counts = len(tables.edges), len(tables.weights), count
+    is_wide = planes.dtype == torch.int64
+    of_tables = tables.edges, tables.corners, tables.weights
+    _splat[grid](*tensors, *of_tables, *where, *sizes, *shape, *counts, is_wide, kept is not None, _SPLATTED, num_warps=4)
 
 
 @triton.jit
@@ -35,59 +89,84 @@ def splat(planes: Planes, values: Picture, radius: Plane, gain: Plane, tables: D
 def _splat(
     planes,
     values,
-    radius,
-    gain,
+    coc_px,
+    shares,
+    kept,
     edges,
     corners,
     weights,
+    places,
+    starts,
+    scales,
+    order,
     pixels,
     width,
-    cells,
-    columns,
-    margin,
+    first,
+    numbers,
+    step_px,
+    growth,
     area,
     area_offset,
-    scale,
+    from_px,
+    per_share,
     EDGES: tl.constexpr,
     CORNERS: tl.constexpr,
+    PLANES: tl.constexpr,
     IS_WIDE: tl.constexpr,
+    HAS_KEPT: tl.constexpr,
     PIXELS: tl.constexpr,
 ):
+    """Splat pixels of one kind, each into the planes of its slice."""
+    kind = tl.program_id(1)
+    layer = tl.minimum(kind, 1) * pixels
     pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
-    share = tl.load(gain + pixel, mask=pixel < pixels, other=0.0)
-    lit = share > 0.0
-    if tl.max(share, axis=0) > 0.0:
-        r = tl.load(radius + pixel, mask=lit, other=1.0)
-        sense = tl.where(r > 0.0, 1.0, -1.0)
+    inside = pixel < pixels
+    diameter = tl.load(coc_px + layer + pixel, mask=inside, other=0.0)
+    gain = tl.minimum(tl.maximum((tl.abs(diameter) - from_px) * per_share, 0.0), 1.0)
+    gain = gain * tl.load(shares + kind * pixels + pixel, mask=inside, other=0.0)
+    if HAS_KEPT:
+        gain = gain * tl.load(kept + pixel, mask=inside & (kind == 0), other=1.0)
+    if tl.max(gain, axis=0) > 0.0:
+        number = tl.floor(diameter / step_px + 0.5).to(tl.int32) - first
+        piece = tl.load(order + kind * numbers + number, mask=(gain > 0.0) & (number >= 0) & (number < numbers), other=-1)
+        used = piece >= 0
+        place = places + tl.maximum(piece, 0) * 11
+        rows, columns = tl.load(place + 4, mask=used, other=1), tl.load(place + 5, mask=used, other=1)
+        y, x = pixel // width - tl.load(place + 2, mask=used, other=0), pixel % width - tl.load(place + 3, mask=used, other=0)
+        sense = tl.where(diameter > 0.0, 1.0, -1.0)
+        r = sense * tl.sqrt(0.25 * diameter * diameter + growth)
+        margin = tl.load(place + 10, mask=used, other=0) // 4
+        used = used & (y >= margin) & (y < rows - margin) & (x >= margin) & (x < columns - margin)
+        channel = tl.arange(0, 4)
+        at = (layer + pixel)[:, None] * 4 + channel[None, :]
+        light = tl.load(values + at, mask=used[:, None] & (channel < 4)[None, :], other=0.0)
+        lit = light != 0.0
         whole = area * r * r + area_offset
         for edge in range(EDGES):
             offset = tl.load(edges + 4 * edge) * r + (tl.load(edges + 4 * edge + 2) + sense * tl.load(edges + 4 * edge + 1))
             part = offset - tl.floor(offset)
             whole += tl.load(edges + 4 * edge + 3) * part * (1.0 - part)
-        channel = tl.arange(0, 4)
-        both = lit[:, None] & (channel < 4)[None, :]
-        light = tl.load(values + pixel[:, None] * 4 + channel[None, :], mask=both, other=0.0) * (share / whole)[:, None]
-        if IS_WIDE:
-            light = light.to(tl.float64) * scale
-        else:
-            light = light * scale
-        here = (pixel // width + margin) * columns + pixel % width + margin
+        scale = tl.load(scales + 2 * tl.maximum(piece, 0), mask=used, other=0.0)
+        light = light * (gain / whole)[:, None]
+        light = light.to(tl.float64) * scale[:, None].to(tl.float64) if IS_WIDE else light * scale[:, None]
+        cells = rows * columns
+        here = tl.load(starts + 2 * tl.maximum(piece, 0), mask=used, other=0) * PLANES + y * columns + x
         for corner in range(CORNERS):
             row = corners + 7 * corner
             before, after = edges + 4 * tl.load(row), edges + 4 * tl.load(row + 1)
-            offset = tl.load(before) * r + (tl.load(before + 2) + sense * tl.load(before + 1))
+            offset_before = tl.load(before) * r + (tl.load(before + 2) + sense * tl.load(before + 1))
             offset_after = tl.load(after) * r + (tl.load(after + 2) + sense * tl.load(after + 1))
-            line, line_after = tl.floor(offset), tl.floor(offset_after)
-            part, part_after = offset - line, offset_after - line_after
+            line, line_after = tl.floor(offset_before), tl.floor(offset_after)
+            share, share_after = offset_before - line, offset_after - line_after
             step = tl.load(row + 3) * columns + tl.load(row + 2)
             step_after = tl.load(row + 5) * columns + tl.load(row + 4)
-            place = here + line.to(tl.int32) * step + line_after.to(tl.int32) * step_after
-            to = planes + (tl.load(row + 6) * cells + place)[:, None] * 4 + channel[None, :]
+            cell = here + (tl.load(row + 6) * cells + line.to(tl.int32) * step + line_after.to(tl.int32) * step_after)
+            to = planes + cell[:, None] * 4 + channel[None, :]
             sign = tl.load(weights + corner)
-            _add(to, light, sign * (1.0 - part) * (1.0 - part_after), both, IS_WIDE)
-            _add(to + 4 * step_after, light, sign * (1.0 - part) * part_after, both, IS_WIDE)
-            _add(to + 4 * step, light, sign * part * (1.0 - part_after), both, IS_WIDE)
-            _add(to + 4 * (step + step_after), light, sign * part * part_after, both, IS_WIDE)
+            _add(to, light, sign * (1.0 - share) * (1.0 - share_after), lit, IS_WIDE)
+            _add(to + 4 * step_after[:, None], light, sign * (1.0 - share) * share_after, lit, IS_WIDE)
+            _add(to + 4 * step[:, None], light, sign * share * (1.0 - share_after), lit, IS_WIDE)
+            _add(to + 4 * (step + step_after)[:, None], light, sign * share * share_after, lit, IS_WIDE)
 
 
 @triton.jit
@@ -100,63 +179,49 @@ def _add(to, light, weight, mask, IS_WIDE: tl.constexpr):
     tl.atomic_add(to, impulse, mask=mask, sem="relaxed")
 
 
-def sum_along(planes: Planes, along: Along) -> Int[Tensor, "rows columns 4"]:
-    _, rows, columns, _ = planes.shape
-    out = torch.empty_like(planes[0])
-    dx, dy = along.step
-    inputs = _inputs(planes, along)
+def sum_along(
+    sums: Int[Tensor, " numbers"], planes: Int[Tensor, " numbers"], batch: Batch, along: Along, which: int, tables: DeviceTables
+) -> None:
+    """Set one sum of every slice; `which`: its number among the sums."""
+    (dx, dy), counts = along.step, (tables.planes, len(tables.sums), which, len(along.inputs))
+    rows, columns = batch.most
+    fed = _inputs(along)
     if dy == 0:
-        _sum_rows[(rows,)](out, planes, *inputs, columns, len(along.inputs), _CELLS)
-        return out
-    steps = triton.cdiv(rows, dy)
-    chains = columns + abs(dx) * (steps - 1)
-    grid = (triton.cdiv(chains, _CHAINS), dy)
-    _sum_chains[grid](out, planes, *inputs, rows, columns, steps, dx, dy, len(along.inputs), _CHAINS)
-    return out
+        _sum_rows[(rows, len(batch))](sums, planes, batch.places, batch.starts, *fed, *counts, _ROW_CELLS)
+        return
+    side = _CHAIN_NUMBERS // 4
+    grid = (triton.cdiv(columns + abs(dx) * (triton.cdiv(rows, dy) - 1), side), dy, len(batch))
+    _sum_chains[grid](sums, planes, batch.places, batch.starts, *fed, dx, dy, *counts, _CHAIN_STEPS, _CHAIN_NUMBERS, num_warps=1)
 
 
-def _inputs(planes: Planes, along: Along) -> list[int]:
-    """Return places of up to four planes and their signs, filled up with the first."""
-    cells = planes.shape[1] * planes.shape[2] * 4
-    places, signs = [plane * cells for plane, _ in along.inputs], [sign for _, sign in along.inputs]
-    missing = 4 - len(places)
-    return [*places, *[0] * missing, *signs, *[0] * missing]
+def _inputs(along: Along) -> list[int]:
+    """Return numbers of up to four planes and their signs, filled up with nothing."""
+    planes, signs = [plane for plane, _ in along.inputs], [sign for _, sign in along.inputs]
+    nothing = [0] * (4 - len(planes))
+    return [*planes, *nothing, *signs, *nothing]
 
 
 @triton.jit
 @no_type_check
-def _fed(planes, at, mask, p0, p1, p2, p3, s0, s1, s2, s3, INPUTS: tl.constexpr):
-    """Return what the planes feed to a sum at some cells."""
-    total = s0 * tl.load(planes + p0 + at, mask=mask, other=0)
+def _fed(planes, cells, at, mask, p0, p1, p2, p3, s0, s1, s2, s3, INPUTS: tl.constexpr):
+    """Return what the planes feed to a sum. cells: numbers of one plane."""
+    total = s0 * tl.load(planes + p0 * cells + at, mask=mask, other=0)
     if INPUTS > 1:
-        total += s1 * tl.load(planes + p1 + at, mask=mask, other=0)
+        total += s1 * tl.load(planes + p1 * cells + at, mask=mask, other=0)
     if INPUTS > 2:
-        total += s2 * tl.load(planes + p2 + at, mask=mask, other=0)
+        total += s2 * tl.load(planes + p2 * cells + at, mask=mask, other=0)
     if INPUTS > 3:
-        total += s3 * tl.load(planes + p3 + at, mask=mask, other=0)
+        total += s3 * tl.load(planes + p3 * cells + at, mask=mask, other=0)
     return total
 
 
 @triton.jit
 @no_type_check
-def _sum_rows(out, planes, p0, p1, p2, p3, s0, s1, s2, s3, columns, INPUTS: tl.constexpr, CELLS: tl.constexpr):
-    row = tl.program_id(0) * columns
-    channel = tl.arange(0, 4)
-    carry = tl.zeros((4,), out.dtype.element_ty)
-    for left in range(0, columns, CELLS):
-        x = left + tl.arange(0, CELLS)
-        at = (row + x)[:, None] * 4 + channel[None, :]
-        mask = (x < columns)[:, None] & (channel < 4)[None, :]
-        fed = _fed(planes, at, mask, p0, p1, p2, p3, s0, s1, s2, s3, INPUTS)
-        tl.store(out + at, tl.cumsum(fed, axis=0) + carry[None, :], mask=mask)
-        carry += tl.sum(fed, axis=0)
-
-
-@triton.jit
-@no_type_check
-def _sum_chains(
-    out,
+def _sum_rows(
+    sums,
     planes,
+    places,
+    starts,
     p0,
     p1,
     p2,
@@ -165,147 +230,273 @@ def _sum_chains(
     s1,
     s2,
     s3,
-    rows,
-    columns,
-    steps,
+    PLANES: tl.constexpr,
+    SUMS: tl.constexpr,
+    WHICH: tl.constexpr,
+    INPUTS: tl.constexpr,
+    CELLS: tl.constexpr,
+):
+    piece = tl.program_id(1)
+    rows, columns = tl.load(places + 11 * piece + 4), tl.load(places + 11 * piece + 5)
+    if (tl.program_id(0) < rows) & (tl.load(places + 11 * piece + 10) % 4 >= _SUMMED):
+        start, cells = 4 * tl.load(starts + 2 * piece), 4 * rows * columns
+        source, out = planes + start * PLANES, sums + start * SUMS + WHICH * cells
+        channel = tl.arange(0, 4)
+        carry = tl.zeros((4,), sums.dtype.element_ty)
+        for left in range(0, columns, CELLS):
+            x = left + tl.arange(0, CELLS)
+            at = (tl.program_id(0) * columns + x)[:, None] * 4 + channel[None, :]
+            mask = (x < columns)[:, None] & (channel < 4)[None, :]
+            fed = _fed(source, cells, at, mask, p0, p1, p2, p3, s0, s1, s2, s3, INPUTS)
+            tl.store(out + at, tl.cumsum(fed, axis=0) + carry[None, :], mask=mask)
+            carry += tl.sum(fed, axis=0)
+
+
+@triton.jit
+@no_type_check
+def _sum_chains(
+    sums,
+    planes,
+    places,
+    starts,
+    p0,
+    p1,
+    p2,
+    p3,
+    s0,
+    s1,
+    s2,
+    s3,
     dx,
     dy,
+    PLANES: tl.constexpr,
+    SUMS: tl.constexpr,
+    WHICH: tl.constexpr,
     INPUTS: tl.constexpr,
-    CHAINS: tl.constexpr,
+    STEPS: tl.constexpr,
+    NUMBERS: tl.constexpr,
 ):
-    """Advance neighbouring chains, each a step (dx, dy) at a time, as long as any of them is in the picture."""
-    first = tl.program_id(0) * CHAINS
-    channel = tl.arange(0, 4)
-    mine = (rows - tl.program_id(1) + dy - 1) // dy
-    if dx > 0:
-        first -= dx * (steps - 1)
-        begin = tl.maximum(-first - CHAINS + dx, 0) // dx
-        end = tl.minimum(mine, (columns - 1 - first) // dx + 1)
-    else:
-        begin = tl.maximum(first - columns - dx, 0) // (-dx)
-        end = tl.minimum(mine, (first + CHAINS - 1) // (-dx) + 1)
-    carry = tl.zeros((CHAINS, 4), out.dtype.element_ty)
-    for j in range(begin, end):
-        x, y = first + tl.arange(0, CHAINS) + j * dx, tl.program_id(1) + j * dy
-        mask = ((x >= 0) & (x < columns))[:, None] & (channel < 4)[None, :]
-        at = (y * columns + x)[:, None] * 4 + channel[None, :]
-        carry += _fed(planes, at, mask, p0, p1, p2, p3, s0, s1, s2, s3, INPUTS)
-        tl.store(out + at, carry, mask=mask)
+    """Advance neighbouring chains by steps of (dx, dy), as long as any of them is in the window; several steps are loaded at a time."""
+    piece = tl.program_id(2)
+    rows, columns = tl.load(places + 11 * piece + 4), tl.load(places + 11 * piece + 5)
+    if tl.load(places + 11 * piece + 10) % 4 >= _SUMMED:
+        start, cells = 4 * tl.load(starts + 2 * piece), 4 * rows * columns
+        source, out = planes + start * PLANES, sums + start * SUMS + WHICH * cells
+        first = tl.program_id(0) * (NUMBERS // 4)
+        mine = (rows - tl.program_id(1) + dy - 1) // dy
+        if dx > 0:
+            first -= dx * ((rows + dy - 1) // dy - 1)
+            begin = tl.maximum(-first - NUMBERS // 4 + dx, 0) // dx
+            end = tl.minimum(mine, tl.maximum(columns - 1 - first + dx, 0) // dx)
+        else:
+            begin = tl.maximum(first - columns - dx, 0) // (-dx)
+            end = tl.minimum(mine, (first + NUMBERS // 4 - 1) // (-dx) + 1)
+        number, step = tl.arange(0, NUMBERS), tl.arange(0, STEPS)
+        carry = tl.zeros((NUMBERS,), sums.dtype.element_ty)
+        for j in range(begin, end, STEPS):
+            x = 4 * (first + (j + step) * dx)[:, None] + number[None, :]
+            y = tl.program_id(1) + (j + step) * dy
+            mask = (x >= 0) & (x < 4 * columns) & (j + step < end)[:, None]
+            at = (y * columns * 4)[:, None] + x
+            fed = _fed(source, cells, at, mask, p0, p1, p2, p3, s0, s1, s2, s3, INPUTS)
+            tl.store(out + at, tl.cumsum(fed, axis=0) + carry[None, :], mask=mask)
+            carry += tl.sum(fed, axis=0)
 
 
-def sum_down(sums: Int[Tensor, "directions rows columns 4"], tables: DeviceTables, unit: float, margin: int) -> Picture:
-    _, rows, columns, _ = sums.shape
-    height, width = rows - 2 * margin, columns - 2 * margin
-    places, weights = _profiles(sums, tables)
-    chunks = triton.cdiv(rows - margin, _ROWS)
-    before = torch.empty((chunks, width, 4), dtype=sums.dtype, device=sums.device)
-    out = torch.empty((height, width, 4), dtype=torch.float32, device=sums.device)
-    grid = (triton.cdiv(width, _CELLS), chunks)
-    sizes = rows - margin, columns, width, margin, unit
-    _sum_columns[grid](out, before, sums, places, weights, *sizes, len(places), False, _CELLS, _ROWS)
+def sum_down(
+    light: Float32[Tensor, "pixels 4"], lowest: Float32[Tensor, "4"], sums: Int[Tensor, " numbers"], batch: Batch, tables: DeviceTables
+) -> None:
+    """Add what comes of the sums to the light of every slice, or set it where it has no small kernels."""
+    rows, columns = batch.most
+    chunks = triton.cdiv(rows, _COLUMN_ROWS)
+    before = torch.zeros((chunks, len(batch), 4 * columns), dtype=sums.dtype, device=sums.device)
+    grid = (triton.cdiv(4 * columns, _COLUMN_NUMBERS), chunks, len(batch))
+    tensors = light, lowest, before, sums, tables.taps, batch.places, batch.starts, batch.scales
+    rest = len(tables.sums), len(tables.taps), _COLUMN_ROWS, _COLUMN_STEPS, _COLUMN_NUMBERS
+    _sum_columns[grid](*tensors, 4 * columns, False, *rest, num_warps=1)
     before = before.cumsum(dim=0, dtype=sums.dtype) - before
-    _sum_columns[grid](out, before, sums, places, weights, *sizes, len(places), True, _CELLS, _ROWS)
-    return out
-
-
-def _profiles(sums: Int[Tensor, "directions rows columns 4"], tables: DeviceTables) -> tuple[Tensor, Tensor]:
-    """Return (taps, 2): how many elements back and how many rows back each tap of the profiles looks, and (taps,) its weight."""
-    _, rows, columns, _ = sums.shape
-    places, weights = [], []
-    for d, along in enumerate(tables.sums):
-        for x, y, weight in along.taps:
-            places.append((4 * (d * rows * columns - y * columns - x), y))
-            weights.append(weight)
-    device = sums.device
-    return torch.tensor(places, dtype=torch.int32, device=device), torch.tensor(weights, dtype=torch.int32, device=device)
+    _sum_columns[grid](light, lowest, before, *tensors[3:], 4 * columns, True, *rest, num_warps=1)
 
 
 @triton.jit
 @no_type_check
 def _sum_columns(
-    out,
+    light,
+    lowest,
     before,
     sums,
+    taps,
     places,
-    weights,
-    rows,
-    columns,
-    width,
-    margin,
-    unit,
-    TAPS: tl.constexpr,
+    starts,
+    scales,
+    stride,
     IS_LAST: tl.constexpr,
-    CELLS: tl.constexpr,
+    SUMS: tl.constexpr,
+    TAPS: tl.constexpr,
     ROWS: tl.constexpr,
+    STEPS: tl.constexpr,
+    NUMBERS: tl.constexpr,
 ):
-    """Sum profiles over the rows of one chunk: into `before`, or on from there into the picture."""
-    x = tl.program_id(0) * CELLS + tl.arange(0, CELLS)
-    channel = tl.arange(0, 4)
-    mask = (x < width)[:, None] & (channel < 4)[None, :]
-    chunk = (tl.program_id(1) * width + x)[:, None] * 4 + channel[None, :]
-    total = tl.zeros((CELLS, 4), sums.dtype.element_ty)
-    if IS_LAST:
-        total = tl.load(before + chunk, mask=mask, other=0)
-    top = tl.program_id(1) * ROWS
-    for y in range(top, tl.minimum(top + ROWS, rows)):
-        at = (y * columns + margin + x)[:, None] * 4 + channel[None, :]
-        for tap in tl.static_range(TAPS):
-            back = tl.load(places + 2 * tap + 1)
-            total += tl.load(weights + tap) * tl.load(
-                sums + at + tl.load(places + 2 * tap), mask=mask & (0 * x + y >= back)[:, None], other=0
-            )
+    """Sum profiles over the visible columns of the rows of one chunk: into `before`, or on from there onto the light."""
+    piece = tl.program_id(2)
+    place = places + 11 * piece
+    rows, columns = tl.load(place + 4), tl.load(place + 5)
+    down, right = tl.load(place + 6) - tl.load(place + 2), tl.load(place + 7) - tl.load(place + 3)
+    height, width, flags = tl.load(place + 8), tl.load(place + 9), tl.load(place + 10) % 4
+    top, end = tl.program_id(1) * ROWS, tl.minimum((tl.program_id(1) + 1) * ROWS, down + height)
+    if (flags >= _SUMMED) & (top < end) & (tl.program_id(0) * NUMBERS < 4 * width):
+        number = tl.program_id(0) * NUMBERS + tl.arange(0, NUMBERS)
+        step, inside = tl.arange(0, STEPS), number < 4 * width
+        chunk = before + (tl.program_id(1) * tl.num_programs(2) + piece) * stride + number
+        source = sums + 4 * tl.load(starts + 2 * piece) * SUMS
+        picture = light + 4 * tl.load(starts + 2 * piece + 1)
+        total = tl.zeros((NUMBERS,), sums.dtype.element_ty)
+        unit = tl.load(scales + 2 * piece + 1)
+        least = tl.load(lowest + number % 4)
         if IS_LAST:
-            if y >= margin:
-                to = ((y - margin) * width + x)[:, None] * 4 + channel[None, :]
-                tl.store(out + to, (total.to(tl.float64) * unit).to(tl.float32), mask=mask)
-    if not IS_LAST:
-        tl.store(before + chunk, total, mask=mask)
+            total = tl.load(chunk, mask=inside, other=0)
+        for first in range(top, end, STEPS):
+            y = first + step
+            mask = (y < end)[:, None] & inside[None, :]
+            laid = tl.zeros((STEPS, NUMBERS), sums.dtype.element_ty)
+            for tap in tl.static_range(TAPS):
+                which, back_x, back_y = tl.load(taps + 4 * tap), tl.load(taps + 4 * tap + 1), tl.load(taps + 4 * tap + 2)
+                row, column = y - back_y, number + 4 * (right - back_x)
+                seen = mask & (row >= 0)[:, None] & ((column >= 0) & (column < 4 * columns))[None, :]
+                at = which * rows * columns * 4 + (row * columns * 4)[:, None] + column[None, :]
+                laid += tl.load(taps + 4 * tap + 3) * tl.load(source + at, mask=seen, other=0)
+            if IS_LAST:
+                here = mask & (y >= down)[:, None]
+                to = picture + ((y - down) * width * 4)[:, None] + number[None, :]
+                summed = tl.cumsum(laid, axis=0) + total[None, :]
+                value = (summed.to(tl.float64) * unit).to(tl.float32)
+                if flags % 2 == _SMALL:
+                    value += tl.load(to, mask=here, other=0.0)
+                tl.store(to, tl.maximum(value, least[None, :]), mask=here)
+            total += tl.sum(laid, axis=0)
+        if not IS_LAST:
+            tl.store(chunk, total, mask=inside)
 
 
-def spread_small(values: Picture, coc_px: Plane, share: Plane, tables: DeviceTables) -> Picture:
-    height, width, _ = values.shape
-    out = torch.empty_like(values)
-    exact, size = tables.tables.exact, tables.small.shape[2]
-    sizes = height, width, tables.small.shape[1], size // 2, exact.per_px, exact.to_px
-    grid = (triton.cdiv(width, _TILE[1]), triton.cdiv(height, _TILE[0]))
-    _spread_small[grid](out, values, coc_px, share, tables.small, *sizes, *_TILE)
-    return out
+def spread_small(light: Float32[Tensor, "pixels 4"], batch: Batch, tables: DeviceTables) -> None:
+    """Set the light of slices with small kernels to what goes by these."""
+    exact, slices, size = tables.tables.exact, batch.slices, tables.small.shape[2]
+    _, height, width = slices.coc_px.shape
+    planar = slices.values.permute(0, 3, 1, 2).contiguous()
+    grid = (triton.cdiv(width, _TILE[1]), triton.cdiv(height, _TILE[0]), len(batch))
+    reaches = torch.empty(grid[::-1], dtype=torch.int32, device=light.device)
+    tensors = slices.coc_px, slices.shares, planar, batch.places
+    _reaches[grid](reaches, *tensors, height, width, slices.step_px, exact.to_px, 0.5 * exact.unit_radius, size // 2, *_TILE)
+    sizes = height, width, tables.small.shape[1], size // 2, exact.per_px, slices.step_px
+    shape = exact.from_px, 1.0 / (exact.to_px - exact.from_px), exact.to_px
+    _spread_small[grid](light, *tensors, batch.starts, reaches, tables.small, *sizes, *shape, *_TILE)
 
 
-_TILE = 8, 16
-"""Rows and columns of the places that one program gathers."""
+@triton.jit
+@no_type_check
+def _reaches(
+    reaches,
+    coc_px,
+    shares,
+    planar,
+    places,
+    height,
+    width,
+    step_px,
+    to_px,
+    per_px,
+    most,
+    ROWS: tl.constexpr,
+    COLUMNS: tl.constexpr,
+):
+    """Set for a tile and a slice how far its small kernels reach; -1 if there is none."""
+    piece = tl.program_id(2)
+    reach = -1
+    if tl.load(places + 11 * piece + 10) % 2 == _SMALL:
+        kind, number = tl.load(places + 11 * piece), tl.load(places + 11 * piece + 1)
+        layer = tl.minimum(kind, 1)
+        y = tl.program_id(1) * ROWS + tl.arange(0, ROWS)
+        x = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
+        inside = (y < height)[:, None] & (x < width)[None, :]
+        at = y[:, None] * width + x[None, :]
+        diameter = tl.load(coc_px + layer * height * width + at, mask=inside, other=0.0)
+        light = tl.load(shares + kind * height * width + at, mask=inside, other=0.0)
+        seen = tl.zeros((ROWS, COLUMNS), tl.float32)
+        for channel in tl.static_range(0, 4):
+            seen += tl.abs(tl.load(planar + (4 * layer + channel) * height * width + at, mask=inside, other=0.0))
+        mine = inside & (light * seen > 0.0) & (tl.floor(diameter / step_px + 0.5) == number) & (tl.abs(diameter) < to_px)
+        extent = tl.minimum(tl.ceil(tl.abs(diameter) * per_px + 0.5).to(tl.int32), most)
+        extent = tl.where(tl.abs(diameter) <= 1.0, 0, extent)
+        reach = tl.max(tl.max(tl.where(mine, extent, -1), axis=1), axis=0)
+    tl.store(reaches + (piece * tl.num_programs(1) + tl.program_id(1)) * tl.num_programs(0) + tl.program_id(0), reach)
 
 
 @triton.jit
 @no_type_check
 def _spread_small(
-    out, values, coc_px, share, small, height, width, levels, reach, per_px, to_px, ROWS: tl.constexpr, COLUMNS: tl.constexpr
+    light,
+    coc_px,
+    shares,
+    planar,
+    places,
+    starts,
+    reaches,
+    small,
+    height,
+    width,
+    levels,
+    radius,
+    per_px,
+    step_px,
+    from_px,
+    per_share,
+    to_px,
+    ROWS: tl.constexpr,
+    COLUMNS: tl.constexpr,
 ):
-    """Gather light for a tile, from as far around as the largest small kernel there reaches."""
-    y = tl.program_id(1) * ROWS + tl.arange(0, ROWS)
-    x = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
-    channel = tl.arange(0, 4)
-    size = 2 * reach + 1
-    light = tl.zeros((ROWS, COLUMNS, 4), tl.float32)
-    for dy in range(-reach, reach + 1):
-        for dx in range(-reach, reach + 1):
-            sy, sx = y - dy, x - dx
-            inside = ((sy >= 0) & (sy < height))[:, None] & ((sx >= 0) & (sx < width))[None, :]
-            at = sy[:, None] * width + sx[None, :]
-            part = tl.load(share + at, mask=inside, other=0.0)
-            used = part > 0.0
-            diameter = tl.load(coc_px + at, mask=used, other=1.0)
-            place = (tl.minimum(tl.maximum(tl.abs(diameter), 1.0), to_px) - 1.0) * per_px
-            level = tl.minimum(place.to(tl.int32), levels - 2)
-            upper = place - level.to(tl.float32)
-            table = small + ((tl.where(diameter > 0.0, 0, levels) + level) * size + dy + reach) * size + dx + reach
-            low = tl.load(table, mask=used, other=0.0)
-            high = tl.load(table + size * size, mask=used, other=0.0)
-            weight = part * (low + upper * (high - low))
-            here = tl.load(
-                values + at[:, :, None] * 4 + channel[None, None, :], mask=used[:, :, None] & (channel < 4)[None, None, :], other=0.0
-            )
-            light += weight[:, :, None] * here
-    to = (y[:, None] * width + x[None, :])[:, :, None] * 4 + channel[None, None, :]
-    mask = ((y < height)[:, None] & (x < width)[None, :])[:, :, None] & (channel < 4)[None, None, :]
-    tl.store(out + to, light, mask=mask)
+    """Gather light of one slice for a tile, from as far around as small kernels there and in the tiles beside it reach."""
+    piece, row, column = tl.program_id(2), tl.program_id(1), tl.program_id(0)
+    place = places + 11 * piece
+    top, left, rows, columns = tl.load(place + 6), tl.load(place + 7), tl.load(place + 8), tl.load(place + 9)
+    y, x = row * ROWS + tl.arange(0, ROWS), column * COLUMNS + tl.arange(0, COLUMNS)
+    mask = ((y >= top) & (y < top + rows))[:, None] & ((x >= left) & (x < left + columns))[None, :]
+    if (tl.load(place + 10) % 2 == _SMALL) & (tl.max(tl.max(mask.to(tl.int32), axis=1), axis=0) > 0):
+        reach = -1
+        for above in tl.static_range(-1, 2):
+            for aside in tl.static_range(-1, 2):
+                ty, tx = row + above, column + aside
+                there = (ty >= 0) & (ty < tl.num_programs(1)) & (tx >= 0) & (tx < tl.num_programs(0))
+                tile = reaches + (piece * tl.num_programs(1) + ty) * tl.num_programs(0) + tx
+                reach = tl.maximum(reach, tl.load(tile, mask=there, other=-1))
+        kind, number = tl.load(place), tl.load(place + 1)
+        cells, size = height * width, 2 * radius + 1
+        layer, of_kind = tl.minimum(kind, 1) * cells, kind * cells
+        red, green = tl.zeros((ROWS, COLUMNS), tl.float32), tl.zeros((ROWS, COLUMNS), tl.float32)
+        blue, alpha = tl.zeros((ROWS, COLUMNS), tl.float32), tl.zeros((ROWS, COLUMNS), tl.float32)
+        for down in range(-reach, reach + 1):
+            for right in range(-reach, reach + 1):
+                sy, sx = y - down, x - right
+                inside = ((sy >= 0) & (sy < height))[:, None] & ((sx >= 0) & (sx < width))[None, :]
+                at = sy[:, None] * width + sx[None, :]
+                diameter = tl.load(coc_px + layer + at, mask=inside, other=float("inf"))
+                extent = tl.abs(diameter)
+                used = inside & (extent < to_px) & (tl.floor(diameter / step_px + 0.5) == number)
+                share = 1.0 - tl.minimum(tl.maximum((extent - from_px) * per_share, 0.0), 1.0)
+                share = share * tl.load(shares + of_kind + at, mask=used, other=0.0)
+                depth = (tl.minimum(tl.maximum(extent, 1.0), to_px) - 1.0) * per_px
+                level = tl.minimum(depth.to(tl.int32), levels - 2)
+                upper = depth - level.to(tl.float32)
+                table = small + ((tl.where(diameter > 0.0, 0, levels) + level) * size + down + radius) * size + right + radius
+                low = tl.load(table, mask=used, other=0.0)
+                high = tl.load(table + size * size, mask=used, other=0.0)
+                weight = share * (low + upper * (high - low))
+                counts = used & (weight != 0.0)
+                red += weight * tl.load(planar + 4 * layer + at, mask=counts, other=0.0)
+                green += weight * tl.load(planar + 4 * layer + cells + at, mask=counts, other=0.0)
+                blue += weight * tl.load(planar + 4 * layer + 2 * cells + at, mask=counts, other=0.0)
+                alpha += weight * tl.load(planar + 4 * layer + 3 * cells + at, mask=counts, other=0.0)
+        to = light + 4 * tl.load(starts + 2 * piece + 1) + ((y - top)[:, None] * columns + (x - left)[None, :]) * 4
+        tl.store(to, red, mask=mask)
+        tl.store(to + 1, green, mask=mask)
+        tl.store(to + 2, blue, mask=mask)
+        tl.store(to + 3, alpha, mask=mask)
