@@ -110,7 +110,7 @@ def tried(
     run.tell(f"  {row.name}")
     network.tiles.channels_last = variant.channels_last  # type: ignore[assignment]
     try:
-        work = graph_of(network, variant, there) if variant.graph else plain(network, variant, there, run)
+        work = graph_of(network, variant, there) if variant.graph else plain(network, variant, there)
         found = work().clone()
         copied = None if host is None or variant.graph else transfers(network, variant, host, run)
         return run.measured(row, work, copied), found
@@ -124,7 +124,7 @@ def cast(network: BlurNetwork, variant: Variant) -> Any:
     return nullcontext() if variant.half is None else torch.autocast(device, variant.half)
 
 
-def plain(network: BlurNetwork, variant: Variant, there: list[Tensor], run: Run) -> Callable[[], Tensor]:
+def plain(network: BlurNetwork, variant: Variant, there: list[Tensor]) -> Callable[[], Tensor]:
     """Return what runs the network on tensors of the device, compiled if the variant is."""
     called: Any = torch.compile(network) if variant.compiled else network
 
