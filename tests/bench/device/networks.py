@@ -148,7 +148,7 @@ def transfers(network: BlurNetwork, variant: Variant, host: tuple[Tensor, Tensor
 
 def graph_of(network: BlurNetwork, variant: Variant, there: list[Tensor]) -> Callable[[], Tensor]:
     """Capture the network as a CUDA graph and return what replays it; autocast's copies of weights may not outlive the capture."""
-    half = variant.half or torch.float32
+    half = variant.half or torch.float16
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
     graph = torch.cuda.CUDAGraph()
