@@ -166,7 +166,7 @@ class Run:
 
     def _once(self, work: Callable[[], object]) -> float:
         if self.device.type != "cuda":
-            return _by_the_clock(work)
+            return once_ms(work)
         begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
         begin.record()
         work()
@@ -176,14 +176,16 @@ class Run:
 
 
 def processor_ms(work: Callable[[], object], most_s: float = 10.0, repeats: int = 10) -> float:
-    """Return the median by the clock, the first time left out unless that alone took all the time there is."""
-    first, ms, until_s = _by_the_clock(work), list[float](), time.monotonic() + most_s
-    while len(ms) < repeats and (not ms or time.monotonic() < until_s) and first < 1e3 * most_s:
-        ms.append(_by_the_clock(work))
-    return statistics.median(ms or [first])
+    """Return the median by the clock; the first time, in which numba may compile, is left out."""
+    work()
+    ms, until_s = [once_ms(work)], time.monotonic() + most_s
+    while len(ms) < repeats and time.monotonic() < until_s:
+        ms.append(once_ms(work))
+    return statistics.median(ms)
 
 
-def _by_the_clock(work: Callable[[], object]) -> float:
+def once_ms(work: Callable[[], object]) -> float:
+    """Return how long this took once, by the clock."""
     begun_s = time.perf_counter()
     work()
     return 1e3 * (time.perf_counter() - begun_s)
