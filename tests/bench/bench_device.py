@@ -49,7 +49,7 @@ class Part(NamedTuple):
 
 PARTS = {
     "spreadlets": Part("tests.bench.device.spreadlets", 70.0, "Laplacian spreadlets"),
-    "lrdm": Part("tests.bench.device.reconstruction", 55.0, "layered reconstruction for defocus and motion"),
+    "lrdm": Part("tests.bench.device.reconstruction", 75.0, "layered reconstruction for defocus and motion"),
     "sweep": Part("tests.bench.device.sweep", 25.0, "plane sweep"),
     "tracing": Part("tests.bench.device.tracing", 35.0, "rays of lens models"),
     "tests": Part("tests.bench.device.device_tests", 100.0, "tests of what runs on a device"),
