@@ -122,7 +122,7 @@ def tried(
         work = graph_of(called, variant, there) if variant.graph else plain(called, variant, there)
         found = work().clone()
         copied = None if host is None or variant.graph else transfers(called, variant, host, run)
-        return run.measured(row, work, copied), found
+        return run.measured(row, work, copied, most_s=1.0), found
     except Exception as error:
         return replace(row, note=in_short(error)), None
 

@@ -149,11 +149,13 @@ class Run:
         """Return the most memory that torch held on the device since it was last asked to count; None on the processor."""
         return torch.cuda.max_memory_allocated(self.device) / MEGABYTE if self.device.type == "cuda" else None
 
-    def measured(self, row: Row, work: Callable[[], object], with_transfers: Callable[[], object] | None = None) -> Row:
+    def measured(
+        self, row: Row, work: Callable[[], object], with_transfers: Callable[[], object] | None = None, most_s: float = 3.0
+    ) -> Row:
         """Return the row with the device's time, memory and, where that work is given, the time with transfers."""
-        timing = self.timed(work)
+        timing = self.timed(work, most_s)
         row = replace(row, device_ms=timing.ms, memory_mb=timing.memory_mb)
-        return row if with_transfers is None else replace(row, transfers_ms=self.host_ms(with_transfers))
+        return row if with_transfers is None else replace(row, transfers_ms=self.host_ms(with_transfers, most_s))
 
     def host_ms(self, work: Callable[[], object], most_s: float = 3.0) -> float:
         """Return the median by the host's clock, the device waited for."""
