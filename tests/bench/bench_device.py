@@ -15,7 +15,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -49,7 +49,7 @@ class Part(NamedTuple):
 
 PARTS = {
     "spreadlets": Part("tests.bench.device.spreadlets", 70.0, "Laplacian spreadlets"),
-    "lrdm": Part("tests.bench.device.reconstruction", 55.0, "layered reconstruction for defocus and motion"),
+    "lrdm": Part("tests.bench.device.reconstruction", 75.0, "layered reconstruction for defocus and motion"),
     "sweep": Part("tests.bench.device.sweep", 25.0, "plane sweep"),
     "tracing": Part("tests.bench.device.tracing", 35.0, "rays of lens models"),
     "tests": Part("tests.bench.device.device_tests", 100.0, "tests of what runs on a device"),
@@ -129,6 +129,9 @@ def run_alone(name: str, seconds: float, page: "Page", out: Path) -> None:
         page.parts[-1].failed = f"its process ended with {running.returncode} after {time.monotonic() - begun_s:.0f} s"
         tell(f"  failed: {page.parts[-1].failed}")
     page.write()
+    kept.unlink(missing_ok=True)
+    with suppress(OSError):
+        kept.parent.rmdir()
 
 
 def alone(name: str, seconds: float, out: Path) -> int:
@@ -154,6 +157,17 @@ def part_named(name: str) -> Part:
 
 def lacking(names: Sequence[str]) -> list[str]:
     return [name for name in names if find_spec(name) is None]
+
+
+def unusable(names: Sequence[str]) -> list[str]:
+    """Return what cannot be imported and why: numba, for one, refuses a numpy that is newer than it knows."""
+    found = []
+    for name in names:
+        try:
+            importlib.import_module(name)
+        except ImportError as error:
+            found.append(f"{name} ({' '.join(str(error).split())})")
+    return found
 
 
 def tell(words: str) -> None:
@@ -192,10 +206,10 @@ def arguments(words: Sequence[str] | None) -> argparse.Namespace:
 def main(words: Sequence[str] | None = None) -> int:
     """Run the chosen parts; returns 1 if any failed."""
     begun_s, asked = time.monotonic(), arguments(words)
-    if missing := lacking(NEEDED):
-        sys.exit(f"nothing can be measured: {', '.join(missing)} is missing, which everything here imports")
     if asked.alone:
         return alone(asked.alone, asked.seconds, asked.out)
+    if missing := unusable(NEEDED):
+        sys.exit(f"nothing can be measured without what everything here imports: {', '.join(missing)}")
     names = chosen(asked.parts)
     from tests.bench.device.page import Page, machine_facts
 

@@ -39,11 +39,24 @@ def test_a_part_that_takes_too_long_keeps_its_rows(monkeypatch: pytest.MonkeyPat
 
     def rows(run: Run) -> Iterator[Row]:
         yield Row("first", device_ms=1.0, bar_ms=2.0)
-        while True:
+        while run.left_s < 60.0:
             time.sleep(0.01)
 
     monkeypatch.setitem(sys.modules, "endless", SimpleNamespace(rows=rows))
     monkeypatch.setitem(bench_device.PARTS, "endless", bench_device.Part("endless", 1.0, "without an end"))
-    run = Run(torch.device("cpu"), False, time.monotonic() + 0.5, lambda words: None)
-    result = bench_device.run_part("endless", run, lambda result: None)
+    said: list[object] = []
+    run = Run(torch.device("cpu"), False, time.monotonic() + 0.5, said.append)
+    result = bench_device.run_part("endless", run, said.append)
     assert [row.met for row in result.rows] == [True] and "stopped" in result.failed
+
+
+def test_outcomes_are_read_of_what_pytest_prints_alone_and_with_several_workers() -> None:
+    pytest.importorskip("torch")
+    from tests.bench.device.device_tests import failures_of, outcomes_of
+
+    alone = "tests/a/test_b.py::test_c[PASSED by] FAILED  [ 50%]\ntests/a/test_b.py::test_d SKIPPED (no GPU)  [100%]\n"
+    summary = "=== short test summary info ===\nFAILED tests/a/test_b.py::test_c[PASSED by] - AssertionError: 1 - 2\n=== 1 failed ==="
+    assert outcomes_of(alone + "[gw0] [ 50%] PASSED tests/a/test_b.py::test_e \n" + summary) == {
+        "tests/a/test_b.py": {"FAILED": 1, "SKIPPED": 1, "PASSED": 1}
+    }
+    assert failures_of(summary) == [("failed: tests/a/test_b.py::test_c[PASSED by]", "AssertionError: 1 - 2")]

@@ -74,8 +74,9 @@ def build_network(settings: TrainSettings, facts: RunFacts) -> BlurNetwork:
     """Build a fresh network for these data, with weights drawn from the seed."""
     tile = settings.network
     grid = TileGrid(facts.height_px, facts.width_px, tile.tile_px, tile.overlap_px) if tile.tile_px else None
-    with torch.random.fork_rng():
-        torch.manual_seed(settings.seed)
+    # Of the processor alone: on a machine with GPUs the state of every one of them would be asked for, which takes memory on each.
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(settings.seed)
         return BlurNetwork(
             settings=tile,
             largest_coc_px=facts.largest_coc_px,

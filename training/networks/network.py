@@ -192,22 +192,23 @@ def split(picture: Tensor, grid: TileGrid) -> Tensor:
 
 def assemble(tiles: Tensor, grid: TileGrid) -> Tensor:
     """Assemble (B, tiles * C, t, t) to (B, C, H, W): every tile at its place, the mean where they overlap."""
-    count = tile_count(grid).to(tiles) if torch.compiler.is_exporting() else _count_on(grid, tiles.device, tiles.dtype)
+    is_traced = torch.compiler.is_exporting() or torch.compiler.is_compiling()
+    count = tile_count(grid, tiles.device).to(tiles) if is_traced else _count_on(grid, tiles.device, tiles.dtype)
     return _sum_placed(tiles.chunk(len(grid), dim=1), grid) / count
 
 
-def tile_count(grid: TileGrid) -> Tensor:
+def tile_count(grid: TileGrid, device: torch.device | None = None) -> Tensor:
     """Return (H, W): how many tiles cover each pixel."""
-    return _sum_placed([torch.ones(1, 1, *grid.tile_size_px)] * len(grid), grid)[0, 0]
+    return _sum_placed([torch.ones(1, 1, *grid.tile_size_px, device=device)] * len(grid), grid)[0, 0]
 
 
 @functools.lru_cache(maxsize=4)
 def _count_on(grid: TileGrid, device: torch.device, precision: torch.dtype) -> Tensor:
-    """Return `tile_count` where it is used: made anew for every picture it would be copied to the device each time, and no graph could be
-    captured. Made in inference mode it could not be used while training.
+    """Return `tile_count` on the device, made once: it takes longer than a small network. Made in inference mode it could not be used
+    while training.
     """
     with torch.inference_mode(False):
-        return tile_count(grid).to(device, precision)
+        return tile_count(grid, device).to(precision)
 
 
 def _sum_placed(tiles: Sequence[Tensor], grid: TileGrid) -> Tensor:

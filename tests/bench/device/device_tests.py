@@ -16,15 +16,15 @@ from tests.support.torch_device import VARIABLE
 
 ROOT = Path(__file__).resolve().parents[3]
 FILES = (
-    "tests/renderers/test_torch_spreadlets.py",
-    "tests/renderers/test_torch_reconstruction.py",
-    "tests/psf_models/test_torch_tracing.py",
     "tests/views/test_plane_sweep_torch.py",
+    "tests/renderers/test_torch_spreadlets.py",
+    "tests/psf_models/test_torch_tracing.py",
+    "tests/renderers/test_torch_reconstruction.py",
 )
 OUTCOME = re.compile(r"(?:(?P<before>PASSED|FAILED|ERROR|SKIPPED|XFAIL|XPASS) )?(?P<file>tests/[\w/]+\.py)::(?P<test>.*)")
 """A line of `pytest -v`: the outcome stands behind the test, or before it where several workers run."""
 MOST_WORKERS = 6
-ALONE = ("-q", "--no-header", "-p", "no:cacheprovider", "-v", "--tb=short", "-rfE", "-m", "not slow")
+ALONE = ("--no-header", "-p", "no:cacheprovider", "-v", "--tb=short", "-rfE", "-m", "not slow")
 OWN_SETTINGS = ("-o", "addopts=--strict-markers", "-o", "filterwarnings=default")
 """Warnings of other versions than those of constraints.txt hide no outcome."""
 
@@ -46,8 +46,10 @@ def rows(run: Run) -> Iterator[Row]:
     last = text.strip().splitlines()[-1:] or ["no output"]
     late = "stopped because the time was up; " if is_late else ""
     yield Row(f"pytest, {VARIABLE}={run.device.type}", f"{took_s:.0f} s", note=f"{late}{last[0].strip('= ')}")
-    for name, why in failures_of(text):
+    failures = failures_of(text)
+    for name, why in failures:
         yield Row(name, note=why)
+    assert not failures, f"{len(failures)} tests failed"
 
 
 def _run_pytest(run: Run, written: Path) -> bool:
@@ -56,7 +58,7 @@ def _run_pytest(run: Run, written: Path) -> bool:
     several = ("-n", str(workers), "--dist", "worksteal") if find_spec("xdist") and workers > 1 else ()
     run.tell(f"  {len(FILES)} files, {workers if several else 1} at a time")
     command = [sys.executable, "-m", "pytest", *ALONE, *OWN_SETTINGS, *several, *FILES]
-    environment = {**os.environ, VARIABLE: run.device.type}
+    environment = {**os.environ, VARIABLE: run.device.type, "OMP_NUM_THREADS": "1"}
     with written.open("w", encoding="utf-8") as file:
         running = subprocess.Popen(command, cwd=ROOT, stdout=file, stderr=subprocess.STDOUT, env=environment)
         try:

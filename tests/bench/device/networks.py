@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from mrbokeh.optics.lens import Lens
+from tests.bench.device.fourier_network import FourierNetwork
 from tests.bench.device.rows import Row, Run, in_short, threads_of_torch
 from training.fitting.run_folder import RunFacts, build_network
 from training.fitting.settings import TrainSettings
@@ -28,18 +29,25 @@ ONE_TILE, TILES = NetworkSettings(tile_px=0, overlap_px=0), NetworkSettings()
 
 @dataclass(frozen=True)
 class Variant:
-    """A way of running the network: the type that autocast takes, and whether the channels of a pixel lie side by side."""
+    """A way of running the network.
+
+    half: the type that autocast takes. channels_last: the channels of a pixel lie side by side. graph: a captured CUDA graph is replayed.
+    fourier: wide kernels by transforms (`fourier_network`).
+    """
 
     half: torch.dtype | None = None
     channels_last: bool = False
     graph: bool = False
     compiled: bool = False
+    fourier: bool = False
 
 
 VARIANTS = {
     "float32": Variant(),
     "float32, channels last": Variant(channels_last=True),
     "float32, graph replayed": Variant(graph=True),
+    "float32, Fourier transforms": Variant(fourier=True),
+    "float32, Fourier transforms, graph replayed": Variant(fourier=True, graph=True),
     "float16 autocast": Variant(half=torch.float16),
     "float16 autocast, channels last": Variant(half=torch.float16, channels_last=True),
     "float16 autocast, graph replayed": Variant(half=torch.float16, graph=True),
@@ -110,45 +118,44 @@ def tried(
     run.tell(f"  {row.name}")
     network.tiles.channels_last = variant.channels_last  # type: ignore[assignment]
     try:
-        work = graph_of(network, variant, there) if variant.graph else plain(network, variant, there, run)
+        called: Callable[..., Tensor] = FourierNetwork(network, *there[0].shape[2:]) if variant.fourier else network
+        work = graph_of(called, variant, there) if variant.graph else plain(called, variant, there)
         found = work().clone()
-        copied = None if host is None or variant.graph else transfers(network, variant, host, run)
-        return run.measured(row, work, copied), found
+        copied = None if host is None or variant.graph else transfers(called, variant, host, run)
+        return run.measured(row, work, copied, most_s=1.0), found
     except Exception as error:
         return replace(row, note=in_short(error)), None
 
 
-def cast(network: BlurNetwork, variant: Variant) -> Any:
+def cast(device: torch.device, variant: Variant) -> Any:
     """Return the context that computes in the variant's type."""
-    device = next(network.parameters()).device.type
-    return nullcontext() if variant.half is None else torch.autocast(device, variant.half)
+    return nullcontext() if variant.half is None else torch.autocast(device.type, variant.half)
 
 
-def plain(network: BlurNetwork, variant: Variant, there: list[Tensor], run: Run) -> Callable[[], Tensor]:
+def plain(network: Callable[..., Tensor], variant: Variant, there: list[Tensor]) -> Callable[[], Tensor]:
     """Return what runs the network on tensors of the device, compiled if the variant is."""
-    called: Any = torch.compile(network) if variant.compiled else network
+    called = torch.compile(network) if variant.compiled else network
 
     def work() -> Tensor:
-        with cast(network, variant):
-            return called(*there)  # type: ignore[no-any-return]
+        with cast(there[0].device, variant):
+            return called(*there)
 
     return work
 
 
-def transfers(network: BlurNetwork, variant: Variant, host: tuple[Tensor, Tensor], run: Run) -> Callable[[], Tensor]:
+def transfers(network: Callable[..., Tensor], variant: Variant, host: tuple[Tensor, Tensor], run: Run) -> Callable[[], Tensor]:
     """Return what copies the inputs there, runs the network and copies the picture back."""
 
     def work() -> Tensor:
-        with cast(network, variant):
-            result: Tensor = network(*(each.to(run.device) for each in host))
-            return result.cpu()
+        with cast(run.device, variant):
+            return network(*(each.to(run.device) for each in host)).cpu()
 
     return work
 
 
-def graph_of(network: BlurNetwork, variant: Variant, there: list[Tensor]) -> Callable[[], Tensor]:
+def graph_of(network: Callable[..., Tensor], variant: Variant, there: list[Tensor]) -> Callable[[], Tensor]:
     """Capture the network as a CUDA graph and return what replays it; autocast's copies of weights may not outlive the capture."""
-    half = variant.half or torch.float32
+    half = variant.half or torch.float16
     stream = torch.cuda.Stream()
     stream.wait_stream(torch.cuda.current_stream())
     graph = torch.cuda.CUDAGraph()
@@ -158,7 +165,7 @@ def graph_of(network: BlurNetwork, variant: Variant, there: list[Tensor]) -> Cal
                 network(*there)
         torch.cuda.current_stream().wait_stream(stream)
         with torch.cuda.graph(graph):
-            picture: Tensor = network(*there)
+            picture = network(*there)
 
     def work() -> Tensor:
         graph.replay()

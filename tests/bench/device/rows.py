@@ -149,11 +149,13 @@ class Run:
         """Return the most memory that torch held on the device since it was last asked to count; None on the processor."""
         return torch.cuda.max_memory_allocated(self.device) / MEGABYTE if self.device.type == "cuda" else None
 
-    def measured(self, row: Row, work: Callable[[], object], with_transfers: Callable[[], object] | None = None) -> Row:
+    def measured(
+        self, row: Row, work: Callable[[], object], with_transfers: Callable[[], object] | None = None, most_s: float = 3.0
+    ) -> Row:
         """Return the row with the device's time, memory and, where that work is given, the time with transfers."""
-        timing = self.timed(work)
+        timing = self.timed(work, most_s)
         row = replace(row, device_ms=timing.ms, memory_mb=timing.memory_mb)
-        return row if with_transfers is None else replace(row, transfers_ms=self.host_ms(with_transfers))
+        return row if with_transfers is None else replace(row, transfers_ms=self.host_ms(with_transfers, most_s))
 
     def host_ms(self, work: Callable[[], object], most_s: float = 3.0) -> float:
         """Return the median by the host's clock, the device waited for."""
@@ -166,7 +168,7 @@ class Run:
 
     def _once(self, work: Callable[[], object]) -> float:
         if self.device.type != "cuda":
-            return _by_the_clock(work)
+            return once_ms(work)
         begin, end = (torch.cuda.Event(enable_timing=True) for _ in range(2))
         begin.record()
         work()
@@ -176,14 +178,16 @@ class Run:
 
 
 def processor_ms(work: Callable[[], object], most_s: float = 10.0, repeats: int = 10) -> float:
-    """Return the median by the clock, the first time left out unless that alone took all the time there is."""
-    first, ms, until_s = _by_the_clock(work), list[float](), time.monotonic() + most_s
-    while len(ms) < repeats and (not ms or time.monotonic() < until_s) and first < 1e3 * most_s:
-        ms.append(_by_the_clock(work))
-    return statistics.median(ms or [first])
+    """Return the median by the clock; the first time, in which numba may compile, is left out."""
+    work()
+    ms, until_s = [once_ms(work)], time.monotonic() + most_s
+    while len(ms) < repeats and time.monotonic() < until_s:
+        ms.append(once_ms(work))
+    return statistics.median(ms)
 
 
-def _by_the_clock(work: Callable[[], object]) -> float:
+def once_ms(work: Callable[[], object]) -> float:
+    """Return how long this took once, by the clock."""
     begun_s = time.perf_counter()
     work()
     return 1e3 * (time.perf_counter() - begun_s)

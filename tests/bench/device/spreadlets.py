@@ -16,7 +16,7 @@ from mrbokeh.renderers.bank.tables import Place
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 from mrbokeh.renderers.spreadlets.torch_spreadlets import DeviceLayer, TorchSpreadlets
 from tests.bench.bench_laplacian_spreadlets import frame, hills_px
-from tests.bench.device.rows import Row, Run, size_of
+from tests.bench.device.rows import Row, Run, once_ms, size_of
 
 PUBLISHED = "66 to 163 ms on a GTX 980 Ti"
 BAR_MS = 20.0
@@ -82,7 +82,7 @@ def layered_row(run: Run, bank: PsfBank, layers: list[HostLayer], is_whole: bool
     there = [layer.there(run) for layer in layers]
     name = f"two layers, defocus and motion, {'whole Laplacians' if is_whole else 'sparse points'}"
     run.tell(f"  {name}: first picture, for which the processor makes the points")
-    first_ms = run.host_ms(partial(renderer.picture, there), most_s=0.0)
+    first_ms = once_ms(partial(renderer.picture, there))
     row = Row(name, size_of(layers[0].coc_px), published=PUBLISHED, bar_ms=None if is_whole else BAR_MS)
     row = run.measured(row, lambda: renderer.picture(there), lambda: renderer.picture([each.there(run) for each in layers]).cpu())
     run.tell("  the compiled renderer")

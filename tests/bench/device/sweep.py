@@ -31,7 +31,7 @@ def wall_views(width_px: int, height_px: int) -> list[SweepView]:
         pose[:3, 3] = -np.asarray(place)
         camera = Camera(width_px, height_px, (focal_px, focal_px), (0.5 * width_px, 0.5 * height_px), pose)
         shift_px = focal_px * np.asarray(place[:2]) / (DEPTH_M - place[2])
-        moved = np.float32([[1, 0, -margin_px - shift_px[0]], [0, 1, -margin_px - shift_px[1]]])
+        moved = np.array([[1, 0, -margin_px - shift_px[0]], [0, 1, -margin_px - shift_px[1]]], np.float32)
         views.append(SweepView(cv2.warpAffine(texture, moved, (width_px, height_px), flags=cv2.INTER_LINEAR), camera))
     return views
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -93,7 +94,7 @@ def checkpoint_row(run: Run) -> Row:
     begun = [Steps(facts, settings, device) for device in (CPU, run.device, CPU)]
     _repeat(begun[0], 3)
     with TemporaryDirectory() as folder:
-        losses = [moved(before, after, Path(folder) / f"{number}.pt") for number, (before, after) in enumerate(zip(begun, begun[1:]))]
+        losses = [moved(before, after, Path(folder) / f"{number}.pt") for number, (before, after) in enumerate(pairwise(begun))]
     row = Row("checkpoints there and back: weights after a step on either", f"{facts.width_px} x {facts.height_px}")
     row = row.compared(weights_of(begun[2]), weights_of(begun[1]))
     return replace(row, note=", ".join(f"loss {here:.6f} and {there:.6f}" for here, there in losses))
