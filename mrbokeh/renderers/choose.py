@@ -58,7 +58,7 @@ def _lrdm(**settings: Any) -> Renderer:
 
 BY_NAME = {"polygon": _polygon, "low-rank": _low_rank, "laplacian": _laplacian, "lrdm": _lrdm, "scatter": _scatter}
 
-ON_DEVICES = ("laplacian", "lrdm")
+ON_DEVICES = ("polygon", "laplacian", "lrdm")
 WITH_BANKS = ("polygon", "low-rank", "laplacian", "scatter")
 
 
@@ -165,7 +165,7 @@ def _on(device: str, name: str) -> dict[str, str]:
 
 def _of_bank(folder: Path, bank: PsfBank, method: str | None, settings: dict[str, Any], device: str) -> Renderer:
     """Return a renderer by a bank of kernels. method: None takes polygons where they can stand for the kernels, else laplacian."""
-    name = method or (DEFAULT if polygons_suit(bank) and not device else "laplacian")
+    name = method or (DEFAULT if polygons_suit(bank) else "laplacian")
     if name not in WITH_BANKS:
         raise InputError(f"the bank {folder} is for --renderer {', '.join(WITH_BANKS)}, got {name}: it takes the opening of a lens file")
     return BY_NAME[name](**settings, **_on(device, name), bank=bank, **_beside(name, folder, bank))

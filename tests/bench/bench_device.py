@@ -48,13 +48,14 @@ class Part(NamedTuple):
 
 
 PARTS = {
-    "spreadlets": Part("tests.bench.device.spreadlets", 70.0, "Laplacian spreadlets"),
-    "lrdm": Part("tests.bench.device.reconstruction", 75.0, "layered reconstruction for defocus and motion"),
+    "polygon": Part("tests.bench.device.polygon", 60.0, "polygonal differences"),
+    "spreadlets": Part("tests.bench.device.spreadlets", 50.0, "Laplacian spreadlets"),
+    "lrdm": Part("tests.bench.device.reconstruction", 60.0, "layered reconstruction for defocus and motion"),
     "sweep": Part("tests.bench.device.sweep", 25.0, "plane sweep"),
     "tracing": Part("tests.bench.device.tracing", 35.0, "rays of lens models"),
-    "tests": Part("tests.bench.device.device_tests", 100.0, "tests of what runs on a device"),
+    "tests": Part("tests.bench.device.device_tests", 90.0, "tests of what runs on a device"),
     "training": Part("tests.bench.device.training_steps", 50.0, "training steps of the published network"),
-    "network": Part("tests.bench.device.networks", 80.0, "the published network"),
+    "network": Part("tests.bench.device.networks", 70.0, "the published network"),
 }
 DEFAULT_S, GRACE_S, LOOK_S = 60.0, 20.0, 0.3
 

@@ -1,1 +1,1 @@
-"""Layering by torch and Triton, for pictures that lie on a device: `cutting` makes slices, renderers blur them, `cutting` puts them together."""
+"""Layering of pictures that lie on a device: `cutting` makes slices and, when a renderer has blurred them, puts them together."""

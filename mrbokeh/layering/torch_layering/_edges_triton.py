@@ -130,9 +130,8 @@ def seeds_behind(coc_px: Plane, lit: Mask, step_px: float, rim_px: int, farthest
 
 
 def _leaps(farthest_px: int) -> list[int]:
-    """Return distances at which pixels look for seeds, one after the other: a step, up to the farthest, and down again."""
-    powers = [1 << k for k in range(max(farthest_px, 1).bit_length())]
-    return [1, *powers, *powers[::-1], 1, 1]
+    """Return distances at which pixels look for seeds, one after the other: from half the farthest down to a step, and that twice more."""
+    return [*(1 << k for k in reversed(range(max(farthest_px, 1).bit_length()))), 1, 1]
 
 
 @triton.jit
@@ -245,7 +244,7 @@ def fill(values: Picture, seeds: Places, pure_px: Plane, surface_px: float, fart
     out, out_px = torch.empty_like(values), torch.empty_like(pure_px)
     grid = (triton.cdiv(pure_px.numel(), _FEW),)
     most = 2 * farthest_px + 3
-    _fill[grid](out, out_px, values, seeds, pure_px, height, width, surface_px, most, _FEW)
+    _fill[grid](out, out_px, values, seeds, pure_px, height, width, surface_px, most, _FEW, num_warps=1)
     return out, out_px
 
 
@@ -275,7 +274,8 @@ def _fill(out, out_px, values, seeds, pure_px, height, width, surface_px, most, 
             angle = way * 0.7853981633974483
             down, right = tl.sin(angle), tl.cos(angle)
             near, is_over = tl.zeros((PIXELS,), tl.int32), has == 0
-            for distance in range(1, last + 1):
+            distance = 1
+            while (distance <= last) & (tl.min(is_over.to(tl.int32), axis=0) == 0):
                 ny, nx = y + _rounded(distance * down), x + _rounded(distance * right)
                 there = (is_over == 0) & (ny >= 0) & (ny < height) & (nx >= 0) & (nx < width)
                 at = ny * width + nx
@@ -291,6 +291,7 @@ def _fill(out, out_px, values, seeds, pure_px, height, width, surface_px, most, 
                 circle += tl.where(counts, weight * coc, 0.0)
                 here = tl.load(values + at[:, None] * 4 + channel[None, :], mask=counts[:, None] & (channel < 4)[None, :], other=0.0)
                 light += weight[:, None] * here
+                distance += 1
         light = light / total[:, None]
         circle = circle / total
     tl.store(out + pixel[:, None] * 4 + channel[None, :], tl.where(has[:, None], light, 0.0), mask=inside[:, None] & (channel < 4)[None, :])

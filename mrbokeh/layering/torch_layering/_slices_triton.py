@@ -1,4 +1,4 @@
-"""Kernels that find the slices of a picture and let their light claim the pupil; `mrbokeh.layering._slices_numba` has the compiled loops."""
+"""Kernels that find the slices of a picture and let their light claim the pupil, as `mrbokeh.layering._slices_numba` does."""
 
 from typing import no_type_check
 
@@ -52,7 +52,10 @@ def _extents(boxes, coc_px, shares, height, width, first, numbers, step_px, ROWS
 def claimed(
     light: Float32[Tensor, "pixels 4"], places: Int32[Tensor, "slices 11"], starts: Int64[Tensor, "slices 2"], frame: Box
 ) -> Float32[Tensor, "height width 4"]:
-    """Return colour and how much of the pupil is taken where slices, one after the other, claim as much of it as is still free."""
+    """Return colour and how much of the pupil is taken where slices, one after the other, claim as much of it as is still free.
+
+    places, starts: see mrbokeh.renderers.polygon.torch_polygon._batch.
+    """
     colour = torch.empty((frame.rows, frame.columns, 4), dtype=torch.float32, device=light.device)
     grid = (triton.cdiv(frame.columns, _TILE[1]), triton.cdiv(frame.rows, _TILE[0] // 4))
     _claimed[grid](colour, light, places, starts, len(places), *frame, _TILE[0] // 4, _TILE[1])
@@ -64,21 +67,25 @@ def claimed(
 def _claimed(colour, light, places, starts, slices, top, left, height, width, ROWS: tl.constexpr, COLUMNS: tl.constexpr):
     first_y, first_x = top + tl.program_id(1) * ROWS, left + tl.program_id(0) * COLUMNS
     y, x = first_y + tl.arange(0, ROWS), first_x + tl.arange(0, COLUMNS)
-    red, green = tl.zeros((ROWS, COLUMNS), tl.float32), tl.zeros((ROWS, COLUMNS), tl.float32)
-    blue, taken = tl.zeros((ROWS, COLUMNS), tl.float32), tl.zeros((ROWS, COLUMNS), tl.float32)
-    for piece in range(slices):
-        place = places + 11 * piece
+    nothing = tl.zeros((ROWS, COLUMNS), tl.float32)
+    red, green, blue, taken = nothing, nothing, nothing, nothing
+    of_red, of_green, of_blue, coverage = nothing, nothing, nothing, nothing
+    for piece in range(slices + 1):
+        place = places + 11 * tl.minimum(piece, slices - 1)
+        if (piece == slices) | (tl.load(place + 10) // 4 % 2 == 0):
+            share = tl.where(coverage > 0.0, tl.minimum(1.0, (1.0 - taken) / coverage), 0.0)
+            red, green, blue = red + share * of_red, green + share * of_green, blue + share * of_blue
+            taken = tl.minimum(1.0, taken + tl.maximum(coverage, 0.0))
+            of_red, of_green, of_blue, coverage = nothing, nothing, nothing, nothing
         box_top, box_left, rows, columns = tl.load(place + 6), tl.load(place + 7), tl.load(place + 8), tl.load(place + 9)
         meets = (first_y < box_top + rows) & (first_y + ROWS > box_top) & (first_x < box_left + columns) & (first_x + COLUMNS > box_left)
-        if meets:
+        if meets & (piece < slices):
             inside = ((y >= box_top) & (y < box_top + rows))[:, None] & ((x >= box_left) & (x < box_left + columns))[None, :]
             at = light + 4 * tl.load(starts + 2 * piece + 1) + 4 * ((y - box_top)[:, None] * columns + (x - box_left)[None, :])
-            coverage = tl.load(at + 3, mask=inside, other=0.0)
-            share = tl.where(coverage > 0.0, tl.minimum(1.0, (1.0 - taken) / coverage), 0.0)
-            red += share * tl.load(at, mask=inside, other=0.0)
-            green += share * tl.load(at + 1, mask=inside, other=0.0)
-            blue += share * tl.load(at + 2, mask=inside, other=0.0)
-            taken = tl.minimum(1.0, taken + tl.maximum(coverage, 0.0))
+            of_red += tl.load(at, mask=inside, other=0.0)
+            of_green += tl.load(at + 1, mask=inside, other=0.0)
+            of_blue += tl.load(at + 2, mask=inside, other=0.0)
+            coverage += tl.load(at + 3, mask=inside, other=0.0)
     to = colour + 4 * ((y - top)[:, None] * width + (x - left)[None, :])
     mask = (y < top + height)[:, None] & (x < left + width)[None, :]
     tl.store(to, red, mask=mask)

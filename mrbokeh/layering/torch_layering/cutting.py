@@ -9,6 +9,7 @@ compiled loops, with their sums on the device.
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import torch
 from jaxtyping import Float32
@@ -58,6 +59,8 @@ def _without_highlights(values: Picture) -> Picture:
     around = torch.stack([wide[:, dy : dy + height, dx : dx + width] for dy in range(5) for dx in range(5)])
     brightness = around.amax(dim=1)
     lit = (LIGHT_OVER_SURROUNDINGS * brightness < brightness[12]).sum(dim=0) > 12
+    if not bool(lit.any()):
+        return values
     colours = torch.where(lit, around.median(dim=0).values, values[..., :3].permute(2, 0, 1))
     return torch.cat([colours.permute(1, 2, 0), values[..., 3:]], dim=2)
 
@@ -117,6 +120,8 @@ def _in_turn(boxes: list[list[list[int]]], first: int) -> list[Slice]:
         for kind, of_kind in enumerate(boxes)
     ]
     together = sorted([*found[CROSSING], *found[0], *found[SHOWN]], key=lambda each: (each.number, (1, 0, 2, 3)[each.kind]))
+    for k, (before, here) in enumerate(pairwise(together), 1):
+        together[k] = here._replace(joins=here.kind == SHOWN and (before.kind, before.number) == (0, here.number))
     return [*together, *found[HIDDEN]]
 
 

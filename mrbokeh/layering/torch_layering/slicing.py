@@ -29,11 +29,15 @@ class Box(NamedTuple):
 
 
 class Slice(NamedTuple):
-    """Pixels of one kind whose circles of confusion are nearest to `number` steps, and the box that holds them."""
+    """Pixels of one kind whose circles of confusion are nearest to `number` steps, and the box that holds them.
+
+    joins: whether they claim the pupil together with the slice before.
+    """
 
     kind: int
     number: int
     box: Box
+    joins: bool = False
 
 
 @dataclass(frozen=True)

@@ -61,6 +61,7 @@ from mrbokeh.system.resources import ZeroedMemory, cores, workers
 if TYPE_CHECKING:
     from mrbokeh.renderers.bank.apertures import BankApertures
     from mrbokeh.renderers.bank.renderers import BankRenderer
+    from mrbokeh.renderers.polygon.torch_polygon import TorchPolygons
 
 
 def ring_of(tables: ApertureTables, margin: int, width: int, planes: np.ndarray) -> Ring:
@@ -256,6 +257,8 @@ class PolygonDifferences:
       blurred.
     precision: of the impulses, "auto" for the choice above; "single" and "double" force it.
     threads: 0 takes all cores. The result does not depend on it, bit for bit.
+    device: "" for compiled loops on the CPU; "cuda", "cuda:1" or "cpu" for torch there (mrbokeh.renderers.polygon.torch_polygon): impulses in
+      double precision unless "single" is asked for, and no halved resolution.
     bank: kernels to use instead of the lens's aperture, as polygons fitted to them (blur of up to 1 px stays sharp); apertures: those, if
       they have been fitted before.
     Memory for the rows is kept between calls.
@@ -269,6 +272,7 @@ class PolygonDifferences:
     precision: Literal["auto", "single", "double"] = "auto"
     layering: Layering = field(default_factory=Layering)
     threads: int = 0
+    device: str = ""
     bank: PsfBank | None = None
     apertures: "BankApertures | None" = field(default=None, repr=False)
     _memory: ZeroedMemory = field(default_factory=ZeroedMemory, repr=False, compare=False)
@@ -283,9 +287,20 @@ class PolygonDifferences:
             raise InputError(f"precision must be auto, single or double, got {self.precision!r}")
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
+        if self._by_torch is not None and self.bank is None and self._by_torch.takes(layers, lens, self.layering):
+            return self._by_torch.render_layer(layers[0], lens, self.layering.slices)
         if self._of_bank is None or not layers:
             return render_layers(layers, lens, self.sum_kernels, self.layering)
         return self._of_bank.render(layers, lens, self.layering)
+
+    @cached_property
+    def _by_torch(self) -> "TorchPolygons | None":
+        if not self.device:
+            return None
+        from mrbokeh.renderers.polygon.torch_polygon import TorchPolygons
+
+        rectified = self.directions, self.max_edges, self.exact_below_px
+        return TorchPolygons(self.device, *rectified, self.exact_highlights, "single" if self.precision == "single" else "double")
 
     @cached_property
     def _of_bank(self) -> "BankRenderer | None":
@@ -301,6 +316,8 @@ class PolygonDifferences:
         self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
     ) -> Float32[np.ndarray, "height width channels"]:
         """Sum kernels as mrbokeh.layering.psf_over_field.KernelSum says."""
+        if self._by_torch is not None:
+            return self._by_torch.sum_arrays(values, coc_px, aperture)
         threads = self.threads or cores()
         with workers(coc_px.size, threads) as pool:
             light = SurveyedLight.of(values, coc_px, pool)

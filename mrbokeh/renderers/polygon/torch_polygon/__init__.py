@@ -14,6 +14,7 @@ torch comes with the extra `train`; without it, importing this package says so.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any, Literal
 from weakref import WeakKeyDictionary
 
@@ -24,13 +25,18 @@ except ModuleNotFoundError as missing:
 
     raise MissingExtraError("torch", "train") from missing
 
+import numpy as np
 from jaxtyping import Float32
 from torch import Tensor
 
+from mrbokeh.images.layer import Layer
+from mrbokeh.layering.layering import Layering
+from mrbokeh.layering.padded_layers import coc_px_of
 from mrbokeh.layering.psf_over_field import reach_px
 from mrbokeh.layering.torch_layering.slicing import Slices
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.drawn_diameters import STEPS_PER_PX, drawn_table
+from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.directional_differences import Direction
 from mrbokeh.renderers.polygon.rectification import PAPER_DIRECTIONS
 from mrbokeh.renderers.polygon.tables import tables_of
@@ -74,12 +80,12 @@ class TorchPolygons:
 
         values (H, W, 4): linear, premultiplied. coc_px (H, W): signed diameters. aperture: plain. Waits once for the device.
         """
-        most, largest_px, *below = self._loops.survey(values, coc_px).tolist()
+        most, largest_px, is_suspect, *below = self._loops.survey(values, coc_px).tolist()
         _require_finite(largest_px)
         if largest_px <= 1.0:
             return values.clone()
         lowest = tuple(-math.inf if each > 0.0 else 0.0 for each in below)
-        light, _ = self._summed(Slices.single(values, coc_px, largest_px), aperture, most, lowest)
+        light, _ = self._summed(Slices.single(values, coc_px, largest_px), aperture, most, lowest, is_suspect > 0.0)
         return light.reshape(values.shape)
 
     def render(self, rgb: Float32[Tensor, "height width 3"], coc_px: Plane, aperture: Aperture, slices: int = 16) -> Picture:
@@ -90,11 +96,37 @@ class TorchPolygons:
         from mrbokeh.layering.torch_layering.cutting import cut, put_together
 
         drawn_px = self._drawn_px(coc_px, aperture)
-        most, largest_px, *_ = self._loops.survey(torch.cat([rgb, torch.ones_like(rgb[..., :1])], dim=2), drawn_px).tolist()
+        most, largest_px, is_suspect, *_ = self._loops.survey(torch.cat([rgb, torch.ones_like(rgb[..., :1])], dim=2), drawn_px).tolist()
         _require_finite(largest_px)
         layers = cut(rgb, drawn_px, reach_px(aperture, largest_px), largest_px, slices)
-        light, batch = self._summed(layers, aperture, most, (-math.inf,) * 4)
+        light, batch = self._summed(layers, aperture, most, (-math.inf,) * 4, is_suspect > 0.0)
         return put_together(light, batch.places, batch.starts, layers.frame)
+
+    def takes(self, layers: Sequence[Layer], lens: Lens, layering: Layering) -> bool:
+        """Return whether `render_layer` can render these layers: one opaque picture, a plain aperture, and kernels for the device."""
+        if len(layers) != 1 or layers[0].extra or not layering.fill or not lens.aperture.is_plain:
+            return False
+        return self._by_kernels and bool((layers[0].alpha == 1.0).all())
+
+    def render_layer(self, layer: Layer, lens: Lens, slices: int) -> Layer:
+        """Render an opaque layer, whose pixels come from the host and go back there."""
+        coc_px = coc_px_of(layer, lens)
+        found = self.render(self._sent_array(layer.rgb), self._sent_array(coc_px), lens.aperture, slices).cpu().numpy()
+        return Layer(np.ascontiguousarray(found[..., :3]), np.ascontiguousarray(found[..., 3]), layer.depth_m)
+
+    def sum_arrays(
+        self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture
+    ) -> Float32[np.ndarray, "height width channels"]:
+        """Sum kernels of light on the host, any number of channels, as mrbokeh.layering.psf_over_field.KernelSum says."""
+        circles, spreads = self._sent_array(coc_px), []
+        for first in range(0, values.shape[2], 4):
+            part = values[..., first : first + 4]
+            light = self._sent_array(np.pad(part, ((0, 0), (0, 0), (0, 4 - part.shape[2]))))
+            spreads.append(self.sum_kernels(light, circles, aperture)[..., : part.shape[2]].cpu().numpy())
+        return np.ascontiguousarray(spreads[0] if len(spreads) == 1 else np.concatenate(spreads, axis=2))
+
+    def _sent_array(self, array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
 
     def _drawn_px(self, coc_px: Plane, aperture: Aperture) -> Plane:
         """Return `drawn_diameters_px` of a plane on the device."""
@@ -108,13 +140,13 @@ class TorchPolygons:
         return torch.where(size * STEPS_PER_PX < last, near, wide).copysign(coc_px)
 
     def _summed(
-        self, slices: Slices, aperture: Aperture, most: float, lowest: tuple[float, ...]
+        self, slices: Slices, aperture: Aperture, most: float, lowest: tuple[float, ...], may_outshine: bool
     ) -> tuple[Float32[Tensor, "pixels 4"], Batch]:
         """Return the light of all slices, one after the other, and where each lies."""
         tables, kept = self.tables_of(aperture), None
         exact, front, circles = tables.tables.exact, slices.values[0], slices.coc_px[0]
         shares = None
-        if self._exact_highlights and slices.largest_px > exact.from_px:
+        if self._exact_highlights and may_outshine and slices.largest_px > exact.from_px:
             shares = shares_of_highlights(front, circles, exact.from_px)
         if shares is not None:
             kept = 1.0 - shares

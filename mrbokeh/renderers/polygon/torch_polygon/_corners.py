@@ -35,7 +35,8 @@ class DeviceTables:
     edges (E, 4): slope, shift, origin, curvature. corners (K, 7): the edge before, the one after, what one line on of either moves the
     crossing in x and y, the plane. weights (K,): of the impulses. sums, unit: sums along directions, whose profiles count in 1 / unit.
     small (2, levels + 1, size, size): whole kernels behind the focus and in front.
-    taps (T, 4): number of the sum, x, y and weight of every entry of the profiles.
+    taps (T, 4): number of the sum, x, y and weight of every entry of the profiles. directions (D, 2 + 2 I): x and y of each step, then
+    every plane that feeds the sum and its sign, filled up with nothing.
     """
 
     tables: ApertureTables
@@ -46,6 +47,7 @@ class DeviceTables:
     unit: int
     small: Float32[Tensor, "2 levels size size"]
     taps: Int32[Tensor, "taps 4"]
+    directions: Int32[Tensor, "directions _"]
 
     @classmethod
     def of(cls, tables: ApertureTables, aperture: Aperture, device: torch.device) -> "DeviceTables":
@@ -64,6 +66,7 @@ class DeviceTables:
             unit=unit,
             small=torch.from_numpy(small_kernels(aperture, tables.exact.to_px)).to(device),
             taps=torch.from_numpy(taps).to(device),
+            directions=torch.tensor(_steps_and_inputs(sums), dtype=torch.int32).to(device),
         )
 
     @property
@@ -91,3 +94,8 @@ def _sums(tables: ApertureTables) -> tuple[list[Along], int]:
         inputs = [(plane, run if pair[1] == direction else -run) for pair, plane in tables.planes.items() if direction in pair]
         found.append(Along(direction, inputs, [(x, y, int(share * unit)) for (x, y), share in taps.items()]))
     return found, unit
+
+
+def _steps_and_inputs(sums: list[Along]) -> list[list[int]]:
+    most = max(len(along.inputs) for along in sums)
+    return [[*along.step, *(n for fed in along.inputs for n in fed), *[0, 0] * (most - len(along.inputs))] for along in sums]

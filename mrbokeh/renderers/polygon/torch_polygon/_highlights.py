@@ -1,11 +1,11 @@
 """Highlights on a device: pixels that give much of the light around them are spread by the kernel of the aperture itself.
 
-The rule is that of `mrbokeh.renderers.polygon._survey_numba`: a pixel that gives more than HIGHLIGHT of the light in the square of four radii
-around it, in any channel.
+The rule is that of `mrbokeh.renderers.polygon._survey_numba`: a pixel that gives more than HIGHLIGHT of the light in the square of four
+radii around it, in any channel.
 """
 
 import torch
-from jaxtyping import Float32, Int64
+from jaxtyping import Bool, Float32
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -20,7 +20,7 @@ Plane = Float32[Tensor, "height width"]
 
 def shares_of_highlights(values: Picture, coc_px: Plane, from_px: float) -> Plane | None:
     """Return how much of each pixel is spread by its exact kernel; None if there is no highlight."""
-    at = _suspects(values, coc_px, from_px)
+    at = torch.nonzero(outshining(values) & (coc_px.abs() > from_px))
     if len(at) == 0:
         return None
     y, x = at.T
@@ -38,26 +38,26 @@ def shares_of_highlights(values: Picture, coc_px: Plane, from_px: float) -> Plan
     return shares if bool((found > 0).any()) else None
 
 
-def _suspects(values: Picture, coc_px: Plane, from_px: float) -> Int64[Tensor, "suspects 2"]:
-    """Return rows and columns of pixels that give much of their own tile's light, which their window holds."""
-    height, width = coc_px.shape
-    light = pad(values.abs().permute(2, 0, 1)[None], (0, -width % TILE_PX, 0, -height % TILE_PX))[0]
-    tiles = light.unflatten(2, (-1, TILE_PX)).unflatten(1, (-1, TILE_PX))
-    least = HIGHLIGHT * tiles.sum(dim=(2, 4), keepdim=True)
-    high = (tiles > least).any(dim=0).flatten(2, 3).flatten(0, 1)[:height, :width]
-    return torch.nonzero(high & (coc_px.abs() > from_px))
+def outshining(values: Picture) -> Bool[Tensor, "height width"]:
+    """Return the mask of pixels that give much of their own tile's light, which their window holds. The picture goes on as in a mirror."""
+    height, width, _ = values.shape
+    beyond = (0, -width % TILE_PX, 0, -height % TILE_PX)
+    mode = "reflect" if min(height, width) >= TILE_PX else "replicate"
+    tiles = pad(values.abs().permute(2, 0, 1), beyond, mode=mode).unflatten(2, (-1, TILE_PX)).unflatten(1, (-1, TILE_PX))
+    high = (tiles > HIGHLIGHT * tiles.sum(dim=(2, 4), keepdim=True)).any(dim=0)
+    return high.flatten(2, 3).flatten(0, 1)[:height, :width]
 
 
 def stamp(light: Float32[Tensor, "pixels 4"], batch: Batch, shares: Plane, aperture: Aperture) -> None:
     """Add the share of each pixel of the front to the light of its slice, by the exact kernel of the aperture at its diameter."""
-    slices, places, starts = batch.slices, batch.places.tolist(), batch.starts.tolist()
+    slices, starts = batch.slices, batch.starts.tolist()
     at = torch.nonzero(shares > 0.0)
     y, x = at.T
     coc_px, values = slices.coc_px[0][y, x], slices.values[0][y, x] * (shares * slices.shares[0])[y, x][:, None]
     pieces = slices.order[0][torch.floor(coc_px / slices.step_px + 0.5).long() - slices.first]
     for (row, column), diameter, value, piece in zip(at.tolist(), coc_px.tolist(), values, pieces.tolist(), strict=True):
         kernel = torch.from_numpy(aperture.rasterize(diameter).kernel).to(light)
-        reach, seen = kernel.shape[0] // 2, Box(*places[piece][6:10])
+        reach, seen = kernel.shape[0] // 2, Box(*batch.host[piece][6:10])
         box = Box(row - reach, column - reach, *kernel.shape).within(seen)
         if box.rows == 0 or box.columns == 0:
             continue

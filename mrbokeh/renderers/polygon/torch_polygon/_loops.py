@@ -10,16 +10,20 @@ from torch import Tensor
 from mrbokeh.layering.torch_layering.slicing import Slices
 from mrbokeh.renderers.polygon.torch_polygon._batch import Batch
 from mrbokeh.renderers.polygon.torch_polygon._corners import Along, DeviceTables
+from mrbokeh.renderers.polygon.torch_polygon._highlights import outshining
 
 Planes = Int[Tensor, "planes rows columns 4"]
 Picture = Float32[Tensor, "height width 4"]
 Plane = Float32[Tensor, "height width"]
 
 
-def survey(values: Picture, coc_px: Plane) -> Float32[Tensor, "6"]:
-    """Return the strongest value, the largest diameter of a pixel with light, inf for none, and how far below 0 each channel goes."""
+def survey(values: Picture, coc_px: Plane) -> Float32[Tensor, "7"]:
+    """Return the strongest value, the largest diameter of a pixel with light, inf if one has none, 1 if a pixel gives much of its tile's
+    light, and how far below 0 each channel goes.
+    """
     size = torch.where((values != 0).any(dim=2), torch.nan_to_num(coc_px.abs(), torch.inf), 0.0)
-    return torch.cat([torch.stack([values.abs().amax(), size.amax()]), (-values).amax(dim=(0, 1)).clamp(min=0.0)])
+    below = (-values).amax(dim=(0, 1)).clamp(min=0.0)
+    return torch.cat([torch.stack([values.abs().amax(), size.amax(), outshining(values).any().float()]), below])
 
 
 def sum_slices(
@@ -32,14 +36,14 @@ def sum_slices(
     """
     batch = Batch.of(slices, tables, most, whole)
     light = []
-    for place, scales in zip(batch.places.tolist(), batch.scales.tolist(), strict=True):
+    for place, scales in zip(batch.host, batch.scales.tolist(), strict=True):
         kind, number, _, _, _, _, top, left, rows, columns, rest = place
         layer = min(kind, 1)
         mine = slices.shares[kind] * (torch.floor(slices.coc_px[layer] / slices.step_px + 0.5) == number)
         values, coc_px = slices.values[layer] * mine[..., None], slices.coc_px[layer]
         out = spread_small(values, coc_px, tables)
-        if rest % 4 >= 2:
-            margin = rest // 4
+        if rest & 2:
+            margin = rest // 8
             size = len(coc_px) + 2 * margin, coc_px.shape[1] + 2 * margin, 4
             planes = torch.zeros((tables.planes, *size), dtype=whole, device=values.device)
             splat(planes, values, coc_px, kept if kind == 0 else None, tables, scales[0], margin)

@@ -13,21 +13,21 @@ from jaxtyping import Float32, Int
 from torch import Tensor
 
 from mrbokeh.layering.torch_layering.slicing import Slices
-from mrbokeh.renderers.polygon.torch_polygon._batch import Batch
-from mrbokeh.renderers.polygon.torch_polygon._corners import Along, DeviceTables
+from mrbokeh.renderers.polygon._survey_numba import HIGHLIGHT
+from mrbokeh.renderers.polygon.torch_polygon._batch import Batch, Group
+from mrbokeh.renderers.polygon.torch_polygon._corners import DeviceTables
 
 Picture = Float32[Tensor, "height width 4"]
 Plane = Float32[Tensor, "height width"]
 
-_SEEN, _SPLATTED = 1024, 32
-"""Pixels that one program surveys or splats. Splatting, each number has a thread of its own: then atomic additions lie side by side."""
+_TILES_SEEN, _SPLATTED = 8, 32
+"""Tiles that one program surveys; pixels that one splats, with a thread for each number, so that atomic additions lie side by side."""
 _CHAIN_STEPS, _CHAIN_NUMBERS = 16, 64
-_COLUMN_ROWS, _COLUMN_STEPS, _COLUMN_NUMBERS = 64, 8, 128
+_COLUMN_ROWS, _COLUMN_STEPS, _COLUMN_NUMBERS = 64, 8, 64
 """Rows of a chunk, and what a program of one warp loads at a time."""
 _ROW_CELLS = 64
 _TILE = 16, 16
 """Rows and columns of the places that one program gathers; small kernels reach no farther than one tile."""
-_SMALL, _SUMMED = tl.constexpr(1), tl.constexpr(2)
 
 
 def sum_slices(
@@ -37,40 +37,52 @@ def sum_slices(
     batch = Batch.of(slices, tables, most, whole)
     light = torch.empty((batch.pixels, 4), dtype=torch.float32, device=slices.values.device)
     spread_small(light, batch, tables)
-    planes = torch.zeros(batch.cells * tables.planes * 4, dtype=whole, device=light.device)
-    splat(planes, batch, kept, tables, tables.planes)
-    sums = torch.empty(batch.cells * len(tables.sums) * 4, dtype=whole, device=light.device)
-    for which, along in enumerate(tables.sums):
-        sum_along(sums, planes, batch, along, which, tables)
-    sum_down(light, lowest, sums, batch, tables)
+    for group in batch.groups:
+        planes = torch.zeros(group.cells * tables.planes * 4, dtype=whole, device=light.device)
+        splat(planes, batch, group, kept, tables)
+        sums = torch.empty(group.cells * len(tables.sums) * 4, dtype=whole, device=light.device)
+        sum_along(sums, planes, batch, group, tables)
+        sum_down(light, lowest, sums, batch, group, tables)
     return light, batch
 
 
-def survey(values: Picture, coc_px: Plane) -> Float32[Tensor, "6"]:
-    """Return the strongest value, the largest diameter of a pixel with light, and how far below 0 each channel goes."""
-    found = torch.zeros(6, dtype=torch.float32, device=values.device)
-    _survey[(triton.cdiv(coc_px.numel(), _SEEN),)](found, values, coc_px, coc_px.numel(), _SEEN)
-    return found
+def survey(values: Picture, coc_px: Plane) -> Float32[Tensor, "7"]:
+    height, width = coc_px.shape
+    grid = (triton.cdiv(width, 8 * _TILES_SEEN), triton.cdiv(height, 8))
+    found = torch.empty((grid[1] * grid[0], 7), dtype=torch.float32, device=values.device)
+    _survey[grid](found, values, coc_px, height, width, HIGHLIGHT, 8 * _TILES_SEEN)
+    return found.amax(dim=0)
 
 
 @triton.jit
 @no_type_check
-def _survey(found, values, coc_px, pixels, PIXELS: tl.constexpr):
-    pixel = tl.program_id(0) * PIXELS + tl.arange(0, PIXELS)
-    inside = pixel < pixels
-    channel = tl.arange(0, 4)
-    both = inside[:, None] & (channel < 4)[None, :]
-    light = tl.load(values + pixel[:, None] * 4 + channel[None, :], mask=both, other=0.0)
-    size = tl.abs(tl.load(coc_px + pixel, mask=inside, other=0.0))
+def _survey(found, values, coc_px, height, width, highlight, COLUMNS: tl.constexpr):
+    """Survey a row of tiles of 8 x 8 pixels, mirrored at the end of the picture."""
+    y, x = tl.program_id(1) * 8 + tl.arange(0, 8), tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
+    inside = (y < height)[:, None] & (x < width)[None, :]
+    y = tl.where(y < height, y, tl.maximum(2 * height - 2 - y, 0))
+    x = tl.where(x < width, x, tl.maximum(2 * width - 2 - x, 0))
+    at = y[:, None] * width + x[None, :]
+    size = tl.abs(tl.load(coc_px + at))
     size = tl.where(size == size, size, float("inf"))
-    strongest = tl.max(tl.abs(light), axis=1)
-    tl.atomic_max(found, tl.max(strongest, axis=0))
-    tl.atomic_max(found + 1, tl.max(tl.where(strongest > 0.0, size, 0.0), axis=0))
-    tl.atomic_max(found + 2 + channel, tl.maximum(tl.max(-light, axis=0), 0.0))
+    strongest, suspects = tl.zeros((8, COLUMNS), tl.float32), tl.zeros((8, COLUMNS // 8, 8), tl.int32)
+    to = found + (tl.program_id(1) * tl.num_programs(0) + tl.program_id(0)) * 7
+    for channel in tl.static_range(4):
+        light = tl.load(values + at * 4 + channel)
+        bright = tl.abs(light)
+        strongest = tl.maximum(strongest, bright)
+        tiles = tl.reshape(bright, (8, COLUMNS // 8, 8))
+        total = tl.sum(tl.sum(tiles, axis=2), axis=0)
+        suspects = tl.maximum(suspects, (tiles > highlight * total[None, :, None]).to(tl.int32))
+        tl.store(to + 3 + channel, tl.maximum(tl.max(tl.max(-light, axis=1), axis=0), 0.0))
+    strongest = tl.where(inside, strongest, 0.0)
+    tl.store(to, tl.max(tl.max(strongest, axis=1), axis=0))
+    tl.store(to + 1, tl.max(tl.max(tl.where(strongest > 0.0, size, 0.0), axis=1), axis=0))
+    tl.store(to + 2, tl.max(tl.max(tl.max(suspects, axis=2), axis=1), axis=0).to(tl.float32))
 
 
-def splat(planes: Int[Tensor, " numbers"], batch: Batch, kept: Plane | None, tables: DeviceTables, count: int) -> None:
-    """Add the impulses of all pixels to the planes of their slices. kept: the share of a pixel that is no highlight. count: of planes."""
+def splat(planes: Int[Tensor, " numbers"], batch: Batch, group: Group, kept: Plane | None, tables: DeviceTables) -> None:
+    """Add the impulses of all pixels to the planes of their slices. kept: the share of a pixel that is no highlight."""
     exact, corners, slices = tables.tables.exact, tables.tables.corners, batch.slices
     pixels = slices.coc_px[0].numel()
     grid = (triton.cdiv(pixels, _SPLATTED), len(slices.shares))
@@ -78,10 +90,11 @@ def splat(planes: Int[Tensor, " numbers"], batch: Batch, kept: Plane | None, tab
     where = batch.places, batch.starts, batch.scales, slices.order
     sizes = pixels, slices.coc_px.shape[2], slices.first, slices.order.shape[1], slices.step_px
     shape = corners.growth, *corners.area, exact.from_px, 1.0 / (exact.to_px - exact.from_px)
-    counts = len(tables.edges), len(tables.weights), count
+    ends = group.first, group.end
+    counts = len(tables.edges), len(tables.weights), tables.planes
     is_wide = planes.dtype == torch.int64
     of_tables = tables.edges, tables.corners, tables.weights
-    _splat[grid](*tensors, *of_tables, *where, *sizes, *shape, *counts, is_wide, kept is not None, _SPLATTED, num_warps=4)
+    _splat[grid](*tensors, *of_tables, *where, *sizes, *ends, *shape, *counts, is_wide, kept is not None, _SPLATTED, num_warps=4)
 
 
 @triton.jit
@@ -104,6 +117,8 @@ def _splat(
     first,
     numbers,
     step_px,
+    first_piece,
+    end_piece,
     growth,
     area,
     area_offset,
@@ -125,17 +140,19 @@ def _splat(
     gain = tl.minimum(tl.maximum((tl.abs(diameter) - from_px) * per_share, 0.0), 1.0)
     gain = gain * tl.load(shares + kind * pixels + pixel, mask=inside, other=0.0)
     if HAS_KEPT:
-        gain = gain * tl.load(kept + pixel, mask=inside & (kind == 0), other=1.0)
+        gain = gain * tl.load(kept + pixel, mask=inside & (0 * pixel + kind == 0), other=1.0)
     if tl.max(gain, axis=0) > 0.0:
         number = tl.floor(diameter / step_px + 0.5).to(tl.int32) - first
         piece = tl.load(order + kind * numbers + number, mask=(gain > 0.0) & (number >= 0) & (number < numbers), other=-1)
-        used = piece >= 0
-        place = places + tl.maximum(piece, 0) * 11
+        used = (piece >= first_piece) & (piece < end_piece)
+        piece = tl.where(used, piece, 0)
+        place = places + piece * 11
         rows, columns = tl.load(place + 4, mask=used, other=1), tl.load(place + 5, mask=used, other=1)
         y, x = pixel // width - tl.load(place + 2, mask=used, other=0), pixel % width - tl.load(place + 3, mask=used, other=0)
         sense = tl.where(diameter > 0.0, 1.0, -1.0)
         r = sense * tl.sqrt(0.25 * diameter * diameter + growth)
-        margin = tl.load(place + 10, mask=used, other=0) // 4
+        flags = tl.load(place + 10, mask=used, other=0)
+        margin, used = flags // 8, used & (flags // 2 % 2 == 1)
         used = used & (y >= margin) & (y < rows - margin) & (x >= margin) & (x < columns - margin)
         channel = tl.arange(0, 4)
         at = (layer + pixel)[:, None] * 4 + channel[None, :]
@@ -146,11 +163,11 @@ def _splat(
             offset = tl.load(edges + 4 * edge) * r + (tl.load(edges + 4 * edge + 2) + sense * tl.load(edges + 4 * edge + 1))
             part = offset - tl.floor(offset)
             whole += tl.load(edges + 4 * edge + 3) * part * (1.0 - part)
-        scale = tl.load(scales + 2 * tl.maximum(piece, 0), mask=used, other=0.0)
+        scale = tl.load(scales + 2 * piece, mask=used, other=0.0)
         light = light * (gain / whole)[:, None]
         light = light.to(tl.float64) * scale[:, None].to(tl.float64) if IS_WIDE else light * scale[:, None]
         cells = rows * columns
-        here = tl.load(starts + 2 * tl.maximum(piece, 0), mask=used, other=0) * PLANES + y * columns + x
+        here = tl.load(starts + 2 * piece, mask=used, other=0) * PLANES + y * columns + x
         for corner in range(CORNERS):
             row = corners + 7 * corner
             before, after = edges + 4 * tl.load(row), edges + 4 * tl.load(row + 1)
@@ -179,39 +196,28 @@ def _add(to, light, weight, mask, IS_WIDE: tl.constexpr):
     tl.atomic_add(to, impulse, mask=mask, sem="relaxed")
 
 
-def sum_along(
-    sums: Int[Tensor, " numbers"], planes: Int[Tensor, " numbers"], batch: Batch, along: Along, which: int, tables: DeviceTables
-) -> None:
-    """Set one sum of every slice; `which`: its number among the sums."""
-    (dx, dy), counts = along.step, (tables.planes, len(tables.sums), which, len(along.inputs))
-    rows, columns = batch.most
-    fed = _inputs(along)
-    if dy == 0:
-        _sum_rows[(rows, len(batch))](sums, planes, batch.places, batch.starts, *fed, *counts, _ROW_CELLS)
-        return
-    side = _CHAIN_NUMBERS // 4
-    grid = (triton.cdiv(columns + abs(dx) * (triton.cdiv(rows, dy) - 1), side), dy, len(batch))
-    _sum_chains[grid](sums, planes, batch.places, batch.starts, *fed, dx, dy, *counts, _CHAIN_STEPS, _CHAIN_NUMBERS, num_warps=1)
-
-
-def _inputs(along: Along) -> list[int]:
-    """Return numbers of up to four planes and their signs, filled up with nothing."""
-    planes, signs = [plane for plane, _ in along.inputs], [sign for _, sign in along.inputs]
-    nothing = [0] * (4 - len(planes))
-    return [*planes, *nothing, *signs, *nothing]
+def sum_along(sums: Int[Tensor, " numbers"], planes: Int[Tensor, " numbers"], batch: Batch, group: Group, tables: DeviceTables) -> None:
+    """Set the sums of every slice along all directions."""
+    (rows, columns), pieces, side = group.most, len(group.numbers), _CHAIN_NUMBERS // 4
+    tensors = sums, planes, batch.places, batch.starts, group.numbers, tables.directions
+    counts = tables.planes, len(tables.sums), max(len(along.inputs) for along in tables.sums)
+    slanted = [along.step for along in tables.sums if along.step[1]]
+    if slanted:
+        chains = max(columns + abs(dx) * (triton.cdiv(rows, dy) - 1) for dx, dy in slanted)
+        grid = (triton.cdiv(chains, side), max(dy for _, dy in slanted), pieces * len(tables.sums))
+        _sum_chains[grid](*tensors, *counts, _CHAIN_STEPS, _CHAIN_NUMBERS, num_warps=1)
+    for which, along in enumerate(tables.sums):
+        if along.step[1] == 0:
+            _sum_rows[(rows, pieces)](*tensors, which, *counts, _ROW_CELLS)
 
 
 @triton.jit
 @no_type_check
-def _fed(planes, cells, at, mask, p0, p1, p2, p3, s0, s1, s2, s3, INPUTS: tl.constexpr):
-    """Return what the planes feed to a sum. cells: numbers of one plane."""
-    total = s0 * tl.load(planes + p0 * cells + at, mask=mask, other=0)
-    if INPUTS > 1:
-        total += s1 * tl.load(planes + p1 * cells + at, mask=mask, other=0)
-    if INPUTS > 2:
-        total += s2 * tl.load(planes + p2 * cells + at, mask=mask, other=0)
-    if INPUTS > 3:
-        total += s3 * tl.load(planes + p3 * cells + at, mask=mask, other=0)
+def _fed(planes, cells, at, mask, direction, INPUTS: tl.constexpr):
+    """Return what the planes feed to a sum. cells: numbers of one plane. direction: dx, dy, then each plane and its sign."""
+    total = tl.load(direction + 3) * tl.load(planes + tl.load(direction + 2) * cells + at, mask=mask, other=0)
+    for k in tl.static_range(1, INPUTS):
+        total += tl.load(direction + 3 + 2 * k) * tl.load(planes + tl.load(direction + 2 + 2 * k) * cells + at, mask=mask, other=0)
     return total
 
 
@@ -222,32 +228,27 @@ def _sum_rows(
     planes,
     places,
     starts,
-    p0,
-    p1,
-    p2,
-    p3,
-    s0,
-    s1,
-    s2,
-    s3,
+    numbers,
+    directions,
+    which,
     PLANES: tl.constexpr,
     SUMS: tl.constexpr,
-    WHICH: tl.constexpr,
     INPUTS: tl.constexpr,
     CELLS: tl.constexpr,
 ):
-    piece = tl.program_id(1)
+    piece = tl.load(numbers + tl.program_id(1))
     rows, columns = tl.load(places + 11 * piece + 4), tl.load(places + 11 * piece + 5)
-    if (tl.program_id(0) < rows) & (tl.load(places + 11 * piece + 10) % 4 >= _SUMMED):
+    if tl.program_id(0) < rows:
         start, cells = 4 * tl.load(starts + 2 * piece), 4 * rows * columns
-        source, out = planes + start * PLANES, sums + start * SUMS + WHICH * cells
+        source, out = planes + start * PLANES, sums + start * SUMS + which * cells
+        direction = directions + (2 + 2 * INPUTS) * which
         channel = tl.arange(0, 4)
         carry = tl.zeros((4,), sums.dtype.element_ty)
         for left in range(0, columns, CELLS):
             x = left + tl.arange(0, CELLS)
             at = (tl.program_id(0) * columns + x)[:, None] * 4 + channel[None, :]
             mask = (x < columns)[:, None] & (channel < 4)[None, :]
-            fed = _fed(source, cells, at, mask, p0, p1, p2, p3, s0, s1, s2, s3, INPUTS)
+            fed = _fed(source, cells, at, mask, direction, INPUTS)
             tl.store(out + at, tl.cumsum(fed, axis=0) + carry[None, :], mask=mask)
             carry += tl.sum(fed, axis=0)
 
@@ -259,29 +260,23 @@ def _sum_chains(
     planes,
     places,
     starts,
-    p0,
-    p1,
-    p2,
-    p3,
-    s0,
-    s1,
-    s2,
-    s3,
-    dx,
-    dy,
+    numbers,
+    directions,
     PLANES: tl.constexpr,
     SUMS: tl.constexpr,
-    WHICH: tl.constexpr,
     INPUTS: tl.constexpr,
     STEPS: tl.constexpr,
     NUMBERS: tl.constexpr,
 ):
     """Advance neighbouring chains by steps of (dx, dy), as long as any of them is in the window; several steps are loaded at a time."""
-    piece = tl.program_id(2)
+    which = tl.program_id(2) % SUMS
+    piece = tl.load(numbers + tl.program_id(2) // SUMS)
+    direction = directions + (2 + 2 * INPUTS) * which
+    dx, dy = tl.load(direction), tl.load(direction + 1)
     rows, columns = tl.load(places + 11 * piece + 4), tl.load(places + 11 * piece + 5)
-    if tl.load(places + 11 * piece + 10) % 4 >= _SUMMED:
+    if tl.program_id(1) < dy:
         start, cells = 4 * tl.load(starts + 2 * piece), 4 * rows * columns
-        source, out = planes + start * PLANES, sums + start * SUMS + WHICH * cells
+        source, out = planes + start * PLANES, sums + start * SUMS + which * cells
         first = tl.program_id(0) * (NUMBERS // 4)
         mine = (rows - tl.program_id(1) + dy - 1) // dy
         if dx > 0:
@@ -298,20 +293,25 @@ def _sum_chains(
             y = tl.program_id(1) + (j + step) * dy
             mask = (x >= 0) & (x < 4 * columns) & (j + step < end)[:, None]
             at = (y * columns * 4)[:, None] + x
-            fed = _fed(source, cells, at, mask, p0, p1, p2, p3, s0, s1, s2, s3, INPUTS)
+            fed = _fed(source, cells, at, mask, direction, INPUTS)
             tl.store(out + at, tl.cumsum(fed, axis=0) + carry[None, :], mask=mask)
             carry += tl.sum(fed, axis=0)
 
 
 def sum_down(
-    light: Float32[Tensor, "pixels 4"], lowest: Float32[Tensor, "4"], sums: Int[Tensor, " numbers"], batch: Batch, tables: DeviceTables
+    light: Float32[Tensor, "pixels 4"],
+    lowest: Float32[Tensor, "4"],
+    sums: Int[Tensor, " numbers"],
+    batch: Batch,
+    group: Group,
+    tables: DeviceTables,
 ) -> None:
     """Add what comes of the sums to the light of every slice, or set it where it has no small kernels."""
-    rows, columns = batch.most
+    (rows, columns), pieces = group.most, len(group.numbers)
     chunks = triton.cdiv(rows, _COLUMN_ROWS)
-    before = torch.zeros((chunks, len(batch), 4 * columns), dtype=sums.dtype, device=sums.device)
-    grid = (triton.cdiv(4 * columns, _COLUMN_NUMBERS), chunks, len(batch))
-    tensors = light, lowest, before, sums, tables.taps, batch.places, batch.starts, batch.scales
+    before = torch.zeros((chunks, pieces, 4 * columns), dtype=sums.dtype, device=sums.device)
+    grid = (triton.cdiv(4 * columns, _COLUMN_NUMBERS), chunks, pieces)
+    tensors = light, lowest, before, sums, tables.taps, batch.places, batch.starts, batch.scales, group.numbers
     rest = len(tables.sums), len(tables.taps), _COLUMN_ROWS, _COLUMN_STEPS, _COLUMN_NUMBERS
     _sum_columns[grid](*tensors, 4 * columns, False, *rest, num_warps=1)
     before = before.cumsum(dim=0, dtype=sums.dtype) - before
@@ -329,6 +329,7 @@ def _sum_columns(
     places,
     starts,
     scales,
+    numbers,
     stride,
     IS_LAST: tl.constexpr,
     SUMS: tl.constexpr,
@@ -338,16 +339,16 @@ def _sum_columns(
     NUMBERS: tl.constexpr,
 ):
     """Sum profiles over the visible columns of the rows of one chunk: into `before`, or on from there onto the light."""
-    piece = tl.program_id(2)
+    piece = tl.load(numbers + tl.program_id(2))
     place = places + 11 * piece
     rows, columns = tl.load(place + 4), tl.load(place + 5)
     down, right = tl.load(place + 6) - tl.load(place + 2), tl.load(place + 7) - tl.load(place + 3)
-    height, width, flags = tl.load(place + 8), tl.load(place + 9), tl.load(place + 10) % 4
+    height, width, is_small = tl.load(place + 8), tl.load(place + 9), tl.load(place + 10) % 2 == 1
     top, end = tl.program_id(1) * ROWS, tl.minimum((tl.program_id(1) + 1) * ROWS, down + height)
-    if (flags >= _SUMMED) & (top < end) & (tl.program_id(0) * NUMBERS < 4 * width):
+    if (top < end) & (tl.program_id(0) * NUMBERS < 4 * width):
         number = tl.program_id(0) * NUMBERS + tl.arange(0, NUMBERS)
         step, inside = tl.arange(0, STEPS), number < 4 * width
-        chunk = before + (tl.program_id(1) * tl.num_programs(2) + piece) * stride + number
+        chunk = before + (tl.program_id(1) * tl.num_programs(2) + tl.program_id(2)) * stride + number
         source = sums + 4 * tl.load(starts + 2 * piece) * SUMS
         picture = light + 4 * tl.load(starts + 2 * piece + 1)
         total = tl.zeros((NUMBERS,), sums.dtype.element_ty)
@@ -370,7 +371,7 @@ def _sum_columns(
                 to = picture + ((y - down) * width * 4)[:, None] + number[None, :]
                 summed = tl.cumsum(laid, axis=0) + total[None, :]
                 value = (summed.to(tl.float64) * unit).to(tl.float32)
-                if flags % 2 == _SMALL:
+                if is_small:
                     value += tl.load(to, mask=here, other=0.0)
                 tl.store(to, tl.maximum(value, least[None, :]), mask=here)
             total += tl.sum(laid, axis=0)
@@ -380,12 +381,14 @@ def _sum_columns(
 
 def spread_small(light: Float32[Tensor, "pixels 4"], batch: Batch, tables: DeviceTables) -> None:
     """Set the light of slices with small kernels to what goes by these."""
+    if len(batch.small) == 0:
+        return
     exact, slices, size = tables.tables.exact, batch.slices, tables.small.shape[2]
     _, height, width = slices.coc_px.shape
     planar = slices.values.permute(0, 3, 1, 2).contiguous()
-    grid = (triton.cdiv(width, _TILE[1]), triton.cdiv(height, _TILE[0]), len(batch))
+    grid = (triton.cdiv(width, _TILE[1]), triton.cdiv(height, _TILE[0]), len(batch.small))
     reaches = torch.empty(grid[::-1], dtype=torch.int32, device=light.device)
-    tensors = slices.coc_px, slices.shares, planar, batch.places
+    tensors = slices.coc_px, slices.shares, planar, batch.places, batch.small
     _reaches[grid](reaches, *tensors, height, width, slices.step_px, exact.to_px, 0.5 * exact.unit_radius, size // 2, *_TILE)
     sizes = height, width, tables.small.shape[1], size // 2, exact.per_px, slices.step_px
     shape = exact.from_px, 1.0 / (exact.to_px - exact.from_px), exact.to_px
@@ -400,6 +403,7 @@ def _reaches(
     shares,
     planar,
     places,
+    pieces,
     height,
     width,
     step_px,
@@ -410,25 +414,23 @@ def _reaches(
     COLUMNS: tl.constexpr,
 ):
     """Set for a tile and a slice how far its small kernels reach; -1 if there is none."""
-    piece = tl.program_id(2)
-    reach = -1
-    if tl.load(places + 11 * piece + 10) % 2 == _SMALL:
-        kind, number = tl.load(places + 11 * piece), tl.load(places + 11 * piece + 1)
-        layer = tl.minimum(kind, 1)
-        y = tl.program_id(1) * ROWS + tl.arange(0, ROWS)
-        x = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
-        inside = (y < height)[:, None] & (x < width)[None, :]
-        at = y[:, None] * width + x[None, :]
-        diameter = tl.load(coc_px + layer * height * width + at, mask=inside, other=0.0)
-        light = tl.load(shares + kind * height * width + at, mask=inside, other=0.0)
-        seen = tl.zeros((ROWS, COLUMNS), tl.float32)
-        for channel in tl.static_range(0, 4):
-            seen += tl.abs(tl.load(planar + (4 * layer + channel) * height * width + at, mask=inside, other=0.0))
-        mine = inside & (light * seen > 0.0) & (tl.floor(diameter / step_px + 0.5) == number) & (tl.abs(diameter) < to_px)
-        extent = tl.minimum(tl.ceil(tl.abs(diameter) * per_px + 0.5).to(tl.int32), most)
-        extent = tl.where(tl.abs(diameter) <= 1.0, 0, extent)
-        reach = tl.max(tl.max(tl.where(mine, extent, -1), axis=1), axis=0)
-    tl.store(reaches + (piece * tl.num_programs(1) + tl.program_id(1)) * tl.num_programs(0) + tl.program_id(0), reach)
+    piece = tl.load(pieces + tl.program_id(2))
+    kind, number = tl.load(places + 11 * piece), tl.load(places + 11 * piece + 1)
+    layer = tl.minimum(kind, 1)
+    y = tl.program_id(1) * ROWS + tl.arange(0, ROWS)
+    x = tl.program_id(0) * COLUMNS + tl.arange(0, COLUMNS)
+    inside = (y < height)[:, None] & (x < width)[None, :]
+    at = y[:, None] * width + x[None, :]
+    diameter = tl.load(coc_px + layer * height * width + at, mask=inside, other=0.0)
+    light = tl.load(shares + kind * height * width + at, mask=inside, other=0.0)
+    seen = tl.zeros((ROWS, COLUMNS), tl.float32)
+    for channel in tl.static_range(0, 4):
+        seen += tl.abs(tl.load(planar + (4 * layer + channel) * height * width + at, mask=inside, other=0.0))
+    mine = inside & (light * seen > 0.0) & (tl.floor(diameter / step_px + 0.5) == number) & (tl.abs(diameter) < to_px)
+    extent = tl.minimum(tl.ceil(tl.abs(diameter) * per_px + 0.5).to(tl.int32), most)
+    extent = tl.where(tl.abs(diameter) <= 1.0, 0, extent)
+    reach = tl.max(tl.max(tl.where(mine, extent, -1), axis=1), axis=0)
+    tl.store(reaches + (tl.program_id(2) * tl.num_programs(1) + tl.program_id(1)) * tl.num_programs(0) + tl.program_id(0), reach)
 
 
 @triton.jit
@@ -439,6 +441,7 @@ def _spread_small(
     shares,
     planar,
     places,
+    pieces,
     starts,
     reaches,
     small,
@@ -455,18 +458,18 @@ def _spread_small(
     COLUMNS: tl.constexpr,
 ):
     """Gather light of one slice for a tile, from as far around as small kernels there and in the tiles beside it reach."""
-    piece, row, column = tl.program_id(2), tl.program_id(1), tl.program_id(0)
+    piece, row, column = tl.load(pieces + tl.program_id(2)), tl.program_id(1), tl.program_id(0)
     place = places + 11 * piece
     top, left, rows, columns = tl.load(place + 6), tl.load(place + 7), tl.load(place + 8), tl.load(place + 9)
     y, x = row * ROWS + tl.arange(0, ROWS), column * COLUMNS + tl.arange(0, COLUMNS)
     mask = ((y >= top) & (y < top + rows))[:, None] & ((x >= left) & (x < left + columns))[None, :]
-    if (tl.load(place + 10) % 2 == _SMALL) & (tl.max(tl.max(mask.to(tl.int32), axis=1), axis=0) > 0):
+    if tl.max(tl.max(mask.to(tl.int32), axis=1), axis=0) > 0:
         reach = -1
         for above in tl.static_range(-1, 2):
             for aside in tl.static_range(-1, 2):
                 ty, tx = row + above, column + aside
                 there = (ty >= 0) & (ty < tl.num_programs(1)) & (tx >= 0) & (tx < tl.num_programs(0))
-                tile = reaches + (piece * tl.num_programs(1) + ty) * tl.num_programs(0) + tx
+                tile = reaches + (tl.program_id(2) * tl.num_programs(1) + ty) * tl.num_programs(0) + tx
                 reach = tl.maximum(reach, tl.load(tile, mask=there, other=-1))
         kind, number = tl.load(place), tl.load(place + 1)
         cells, size = height * width, 2 * radius + 1
