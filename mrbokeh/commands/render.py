@@ -40,7 +40,8 @@ class BlurOptions:
     ] = False
     threads: Annotated[int, typer.Option(help="Threads; 0 takes all cores. The result does not depend on it.", min=0, max=4096)] = 0
     device: Annotated[
-        str, typer.Option(help="cuda, cuda:1 or cpu: --renderer laplacian or lrdm by torch there; without it compiled loops on the CPU.")
+        str,
+        typer.Option(help="cuda, cuda:1 or cpu: polygon, laplacian or lrdm by torch there; without it compiled loops on the CPU."),
     ] = ""
 
     def renderer_of(self, lens: Path | None) -> "tuple[Lens | None, Renderer]":

@@ -114,7 +114,7 @@ def test_no_cycles() -> None:
     + [("pycolmap", {"capture", "viewfinder"}), ("gphoto2", set())],
 )
 def test_heavy_libraries_live_where_they_belong(library: str, homes: set[str]) -> None:
-    """commands/doctor.py may ask torch for a GPU; two renderers have twins on devices; data sets may write metadata.
+    """commands/doctor.py may ask torch for a GPU; three renderers and layering have twins on devices; data sets may write metadata.
 
     COLMAP's maps are made by capture and localised in by the viewfinder; tethered cameras shoot for one and look for the other,
     both through mrbokeh.system.gphoto2_library.
@@ -132,6 +132,8 @@ def test_heavy_libraries_live_where_they_belong(library: str, homes: set[str]) -
         if library in {alias.name.split(".")[0] for alias in node.names} | {(getattr(node, "module", None) or "").split(".")[0]}
     }
     twins = (
+        "mrbokeh.layering.torch_layering",
+        "mrbokeh.renderers.polygon.torch_polygon",
         "mrbokeh.renderers.spreadlets.torch_spreadlets",
         "mrbokeh.renderers.layered_reconstruction.torch_reconstruction",
         "mrbokeh.system.torch_device",

@@ -56,7 +56,7 @@ def test_a_bank_brings_the_lens_it_was_made_for_and_polygons_where_they_suit(fol
 def test_banks_are_refused_where_nothing_takes_them(folder: Path) -> None:
     refused("is for --renderer polygon, low-rank, laplacian, scatter, got lrdm", lens_and_renderer, folder / "disc", "lrdm")
     refused("got network.onnx", lens_and_renderer, folder / "disc", "network.onnx")
-    refused("--device is for", lens_and_renderer, folder / "disc", "polygon", device="cpu")
+    refused("--device is for", lens_and_renderer, folder / "disc", "low-rank", device="cpu")
     refused("holds no bank of PSFs", lens_and_renderer, folder, None)
     refused("holds no bank of PSFs", lens_and_renderer, None, str(folder))
 

@@ -58,7 +58,7 @@ def _without_highlights(values: Picture) -> Picture:
     wide = pad(values[..., :3].permute(2, 0, 1), (2, 2, 2, 2), mode="replicate")
     around = torch.stack([wide[:, dy : dy + height, dx : dx + width] for dy in range(5) for dx in range(5)])
     brightness = around.amax(dim=1)
-    lit = (LIGHT_OVER_SURROUNDINGS * brightness < brightness[12]).sum(dim=0) > 12
+    lit = (float(LIGHT_OVER_SURROUNDINGS) * brightness < brightness[12]).sum(dim=0) > 12
     if not bool(lit.any()):
         return values
     colours = torch.where(lit, around.median(dim=0).values, values[..., :3].permute(2, 0, 1))
@@ -86,7 +86,8 @@ def cut(rgb: Float32[Tensor, "height width 3"], coc_px: Plane, margin_px: int, l
     layer = padded(rgb, coc_px, margin_px)
     front, behind = split_edges(layer, math.ceil(largest_px) + 4)
     shown = 1.0 - front.values[..., 3]
-    across = (behind.coc_px > SHARP_PX) & (front.coc_px < -SHARP_PX) & (front.values[..., 3] > 0.0)
+    sharp_px = float(SHARP_PX)
+    across = (behind.coc_px > sharp_px) & (front.coc_px < -sharp_px) & (front.values[..., 3] > 0.0)
     crossing = torch.where(across, front.values[..., 3], 0.0)
     known = (behind.values[..., 3] > 0.0).float()
     shares = torch.stack([torch.ones_like(shown), crossing, shown * known, (1.0 - shown - crossing).clamp(min=0.0) * known])

@@ -38,7 +38,8 @@ class Batch:
     def of(cls, slices: Slices, tables: DeviceTables, most: float, whole: torch.dtype) -> "Batch":
         """Lay out slices one after the other. most: no light is stronger, without its sign. whole: numbers of sums."""
         exact, device = tables.tables.exact, slices.values.device
-        places, starts, scales, pixels = [], [], [], 0
+        places: list[tuple[int, ...]] = []
+        starts, scales, pixels = [], [], 0
         most_cells = _cells_at_once(device, (tables.planes + len(tables.sums)) * 4 * whole.itemsize)
         waiting: list[list[int]] = []
         cells = 0
