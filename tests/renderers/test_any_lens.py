@@ -61,6 +61,18 @@ def test_banks_are_refused_where_nothing_takes_them(folder: Path) -> None:
     refused("holds no bank of PSFs", lens_and_renderer, None, str(folder))
 
 
+def test_a_bank_by_polygons_goes_to_a_device(folder: Path) -> None:
+    """The same light, to the rounding of impulses."""
+    pytest.importorskip("torch")
+    picture, depth_m = np.random.default_rng(2).uniform(0.0, 1.0, (40, 60, 3)).astype(np.float32), np.full((40, 60), 2.0, np.float32)
+    found = []
+    for device in ("", "cpu"):
+        lens, renderer = lens_and_renderer(folder / "disc", "polygon", device=device)
+        assert lens is not None
+        found.append(renderer.render([opaque(picture, depth_m)], lens.focused_at(9.0)).rgb)
+    np.testing.assert_allclose(found[1], found[0], atol=2e-5)
+
+
 def test_in_python_a_lens_that_was_read_keeps_its_kernels(folder: Path) -> None:
     """The same picture by its path, and as a Lens with what it does not say; another renderer may be named."""
     rng, lens = np.random.default_rng(1), read_lens(folder / "heart")

@@ -257,8 +257,8 @@ class PolygonDifferences:
       blurred.
     precision: of the impulses, "auto" for the choice above; "single" and "double" force it.
     threads: 0 takes all cores. The result does not depend on it, bit for bit.
-    device: "" for compiled loops on the CPU; "cuda", "cuda:1" or "cpu" for torch there (mrbokeh.renderers.polygon.torch_polygon): impulses in
-      double precision unless "single" is asked for, and no halved resolution.
+    device: "" for compiled loops on the CPU; "cuda", "cuda:1" or "cpu" for torch there (mrbokeh.renderers.polygon.torch_polygon), with
+      impulses in double precision unless "single" is asked for, and no halved resolution.
     bank: kernels to use instead of the lens's aperture, as polygons fitted to them (blur of up to 1 px stays sharp); apertures: those, if
       they have been fitted before.
     Memory for the rows is kept between calls.
