@@ -17,6 +17,9 @@ from mrbokeh.depth.soft_edges import LEAST_SOFT_PX, sharpened, softness
 LEAST_JUMP = 0.04
 """Least jump between two surfaces, as a share of the map's range."""
 _RANGE = (0.5, 99.5)
+_NEARER = 1.7
+"""How many times nearer than the map's nearest hundredths a thing may have been before it was blurred."""
+_ROUND = 1e-6
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,9 @@ def mended(depth_m: Plane, photo_rgb: Picture) -> Mended:
     jump = _jump(values)
     soft = softness(values, jump)
     if soft.sigma_px >= LEAST_SOFT_PX:
-        values = sharpened(values, guide, jump, soft.sigma_px)
+        nearest = float(np.percentile(values[::2, ::2], _RANGE[1]))
+        most = nearest * (_NEARER if unit == "dioptres" else 1.0 / _NEARER)
+        values = np.minimum(sharpened(values, guide, jump, soft.sigma_px, most), np.float32(most))
         done.append(f"edges made hard (soft by {soft.sigma_px:.1f} px)")
     else:
         values, told = moved_by_colour(values, guide, jump)
@@ -65,10 +70,11 @@ def _ramps(depth_m: Plane) -> tuple[Plane, str]:
 
 
 def _metres(values: Plane, unit: str) -> Plane:
+    """Return metres of values, infinity where there is none."""
     if unit == "metres":
-        return np.maximum(-values, np.float32(1e-3))
+        return -values
     depth_m = np.full(values.shape, np.inf, np.float32)
-    np.divide(np.float32(1.0), values, out=depth_m, where=values > 1e-6)
+    np.divide(np.float32(1.0), values, out=depth_m, where=values > _ROUND)
     return depth_m
 
 

@@ -62,13 +62,13 @@ def blurred(values: Plane, sigma_px: float) -> Plane:
     return np.asarray(GaussianBlur(values, (0, 0), sigma_px, borderType=BORDER_REPLICATE))
 
 
-def sharpened(values: Plane, guide: Guide, jump: float, sigma_px: float) -> Plane:
-    """Return a map (values grow with nearness) whose edges are as hard as before it was blurred by sigma."""
+def sharpened(values: Plane, guide: Guide, jump: float, sigma_px: float, most: float) -> Plane:
+    """Return a map (values grow with nearness) whose edges are as hard as before it was blurred by sigma. most: no lamp can be nearer."""
     sigma_px = min(sigma_px, _MOST_SOFT_PX)
     lamps = _Lamps.of(values, guide, sigma_px)
     once = _surfaces(lamps.taken_out(values), guide, jump, sigma_px)
     lamps = lamps.looked_at_again(values, once, guide)
-    return lamps.put_in(_surfaces(lamps.taken_out(values), guide, jump, sigma_px))
+    return lamps.put_in(_surfaces(lamps.taken_out(values), guide, jump, sigma_px), most)
 
 
 def _surfaces(soft: Plane, guide: Guide, jump: float, sigma_px: float) -> Plane:
@@ -177,9 +177,10 @@ class _Lamps:
             without[each.where] -= np.float32(each.nearer) * each.spread
         return without
 
-    def put_in(self, values: Plane) -> Plane:
+    def put_in(self, values: Plane, most: float) -> Plane:
         for each in self.each:
-            values[each.where] += np.float32(each.nearer) * each.own
+            there = values[each.where] + np.float32(each.nearer) * each.own
+            values[each.where] = np.where(there <= most, there, values[each.where])
         return values
 
 
