@@ -21,7 +21,7 @@ SURE_PX = 2
 """How far a hard edge may be misplaced."""
 _WINDOW_PX = 5
 _VOTE_WEIGHT, _VOTES = 0.1, 6
-_GREY, _WHITE = 0.25, np.float32(4.0)
+_GREY, _WHITE, _LAMP = 0.25, np.float32(4.0), 0.8
 _ROWS = 16
 """The least rows that are worth a thread."""
 
@@ -41,7 +41,9 @@ class Sides:
 
 @dataclass(frozen=True)
 class Guide:
-    """A photograph as a guide: the root of its light, and pixels in or beside highlights, whose colour tells nothing."""
+    """A photograph as a guide: the root of its light, single pixels of bright light, and all in or beside highlights, whose colour tells
+    nothing.
+    """
 
     root: Picture
     lamps: Mask
@@ -49,10 +51,10 @@ class Guide:
 
     @classmethod
     def of(cls, rgb: Picture) -> "Guide":
-        lamps = find_highlights(np.ascontiguousarray(rgb, np.float32))
-        light = np.clip(rgb, 0.0, None)
-        scale = _GREY / max(float(np.mean(light)), 1e-9)
-        return cls(np.sqrt(np.minimum(light * np.float32(scale), _WHITE)).astype(np.float32), lamps, grown(lamps, 1))
+        lit, light = find_highlights(np.ascontiguousarray(rgb, np.float32)), np.clip(rgb, 0.0, None)
+        scale = np.float32(_GREY / max(float(np.minimum(light, _WHITE).mean()), 1e-9))
+        root = np.sqrt(np.minimum(light * scale, _WHITE)).astype(np.float32)
+        return cls(root, lit & (root.max(axis=2) > _LAMP), grown(lit, 1))
 
 
 def by_rows(pixels: int, rows: int, work: Callable[[int, int], object]) -> None:
@@ -126,7 +128,7 @@ def voted(values: Plane, sides: Sides, guide: Guide, may: Mask, stays: float | P
 _RIM_PX = 1.5
 _SAYS_OTHER = -0.3
 _LEAST_SHARE, _LEAST_RATIO, _LEAST_RIM_PX = 0.15, 2.5, 60
-_PULL = 0.1
+_PULL, _ISLAND_PX = 0.1, 4
 
 
 def moved_by_colour(values: Plane, guide: Guide, jump: float) -> tuple[Plane, str]:
@@ -151,6 +153,20 @@ def moved_by_colour(values: Plane, guide: Guide, jump: float) -> tuple[Plane, st
 
 
 def _without_collars(values: Plane, guide: Guide, jump: float) -> Plane:
-    """Return the values with what is left of a wide near thing around a lamp, which hangs in the air by itself, at what is around it."""
-    collar = guide.lit & ~guide.lamps
-    return np.where(collar, np.minimum(values, lowest(values, 2 * SURE_PX + 3) + np.float32(jump)), values) if collar.any() else values
+    """Return the values with islands of depth around lamps in the air cut down to the lamps themselves."""
+    from scipy.ndimage import distance_transform_edt, find_objects, label
+
+    result, numbers = values.copy(), label(guide.lamps, np.ones((3, 3)))[0]
+    for number, (rows, columns) in enumerate(find_objects(numbers), 1):
+        where = tuple(slice(max(each.start - _ISLAND_PX, 0), each.stop + _ISLAND_PX) for each in (rows, columns))
+        around, own = values[where], numbers[where] == number
+        alike, _ = label(np.abs(around - around[own].max()) <= jump)
+        island = alike == alike[own][np.argmax(around[own])]
+        if not island.all() and not (_rim(island).any()):
+            nearest = distance_transform_edt(island, return_distances=False, return_indices=True)
+            result[where] = np.where(island & ~own, around[tuple(nearest)], result[where])
+    return result
+
+
+def _rim(mask: Mask) -> Bool[np.ndarray, " n"]:
+    return np.concatenate([mask[0], mask[-1], mask[:, 0], mask[:, -1]])

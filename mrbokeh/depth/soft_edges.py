@@ -15,8 +15,9 @@ from jaxtyping import Float32
 from mrbokeh.depth.edge_votes import Guide, Mask, Plane, by_rows, grown, highest, lowest, other_sides, sides_of, voted
 
 LEAST_SOFT_PX, _MOST_SOFT_PX = 0.75, 4.0
-_LEAST_CRESTS = 20
-_AROUND_PX, _LEAST_STEEP, _EVEN, _LEAST_EVEN, _SLANTED = 17, 0.08, 0.6, 0.1, 1.6
+_LEAST_CRESTS = 12
+_AROUND_PX, _BESIDE_PX, _LEAST_STEEP, _EVEN, _SLANTED = 17, 7.0, 0.08, 0.6, 1.6
+Places = Float32[np.ndarray, " n"]
 _ROUNDS, _MOVES = 3, 2
 _STAYS = 0.1
 
@@ -41,19 +42,22 @@ def softness(values: Plane, jump: float) -> Softness:
     step = high - low
     crest = (step > jump) & (steep > _LEAST_STEEP * step) & (steep >= highest(steep, 7))
     crest &= (lowest(steep, _AROUND_PX) < _EVEN * steep) & (highest(high, _AROUND_PX) - lowest(low, _AROUND_PX) < _SLANTED * step)
-    even = crest & (_share_of(values > high - 0.05 * step) > _LEAST_EVEN) & (_share_of(values < low + 0.05 * step) > _LEAST_EVEN)
-    crest = even if np.count_nonzero(even) >= _LEAST_CRESTS else crest
-    if np.count_nonzero(crest) < _LEAST_CRESTS:
+    y, x = np.nonzero(crest)
+    steep, step, low, across, along = (each[y, x] for each in (steep, step, low, right, down))
+    ends = [_at(values, y + way * along / steep, x + way * across / steep) for way in (_BESIDE_PX, -_BESIDE_PX)]
+    even = (ends[0] > low + 0.9 * step) & (ends[1] < low + 0.1 * step)
+    even |= np.count_nonzero(even) < _LEAST_CRESTS
+    if np.count_nonzero(even) < _LEAST_CRESTS:
         return Softness(0.0, 0.0)
-    step, middle = step[crest], (values + 0.5 * (right + down) - low)[crest]
-    sigma_px = float(np.median(step / (steep[crest] * np.sqrt(2.0 * np.pi))))
-    return Softness(sigma_px, abs(float(np.median(middle / step)) - 0.5))
+    sigma_px = float(np.median((step / (steep * np.sqrt(2.0 * np.pi)))[even]))
+    middle = (values[y, x] + 0.5 * (across + along) - low) / step
+    return Softness(sigma_px, abs(float(np.median(middle[even])) - 0.5))
 
 
-def _share_of(mask: Mask) -> Plane:
-    from cv2 import blur
-
-    return np.asarray(blur(mask.astype(np.float32), (_AROUND_PX, _AROUND_PX)))
+def _at(values: Plane, y: Places, x: Places) -> Places:
+    """Return the values at the nearest pixels."""
+    height, width = values.shape
+    return values[np.clip(np.rint(y), 0, height - 1).astype(np.int64), np.clip(np.rint(x), 0, width - 1).astype(np.int64)]
 
 
 def blurred(values: Plane, sigma_px: float) -> Plane:
