@@ -13,6 +13,7 @@ import numpy as np
 
 from mrbokeh.depth.edge_votes import Guide, Mask, Picture, Plane, moved_by_colour
 from mrbokeh.depth.soft_edges import LEAST_SOFT_PX, sharpened, softness
+from mrbokeh.system.channel import say
 
 LEAST_JUMP = 0.04
 """Least jump between two surfaces, as a share of the map's range."""
@@ -28,6 +29,14 @@ class Mended:
 
     depth_m: Plane
     told: str
+
+
+def mended_aloud(depth_m: Plane, photo_rgb: Picture) -> Plane:
+    """Return depth as `mended` does, and say what was done."""
+    result = mended(depth_m, photo_rgb)
+    if result.told:
+        say(f"depth is mended by the picture: {result.told} (--exact-depth leaves it as it is)", err=True)
+    return result.depth_m
 
 
 def mended(depth_m: Plane, photo_rgb: Picture) -> Mended:

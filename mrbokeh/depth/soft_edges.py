@@ -71,7 +71,7 @@ def sharpened(values: Plane, guide: Guide, jump: float, sigma_px: float, most: f
     sigma_px = min(sigma_px, _MOST_SOFT_PX)
     lamps = _Lamps.of(values, guide, sigma_px)
     once = _surfaces(lamps.taken_out(values), guide, jump, sigma_px)
-    lamps = lamps.looked_at_again(values, once, guide)
+    lamps = lamps.looked_at_again(values, once)
     return lamps.put_in(_surfaces(lamps.taken_out(values), guide, jump, sigma_px), most)
 
 
@@ -148,9 +148,8 @@ class _Lamps:
     @classmethod
     def of(cls, values: Plane, guide: Guide, sigma_px: float) -> "_Lamps":
         """Find how much nearer each lamp is than what is around it, 0 where that is not clear."""
-        from scipy.ndimage import find_objects, label
-
         from cv2 import BORDER_CONSTANT, GaussianBlur
+        from scipy.ndimage import find_objects, label
 
         numbers, _ = label(guide.lamps, np.ones((3, 3)))
         around_px, found = int(np.ceil(2.5 * sigma_px)), []
@@ -161,7 +160,7 @@ class _Lamps:
             found.append(_Lamp((where[0], where[1]), own, spread, _nearer(values[where], spread, 1, _CLEAR)))
         return cls(sigma_px, tuple(found))
 
-    def looked_at_again(self, values: Plane, hard: Plane, guide: Guide) -> "_Lamps":
+    def looked_at_again(self, values: Plane, hard: Plane) -> "_Lamps":
         """Look again at those that were not clear, when the surfaces around them are known."""
         from cv2 import MORPH_OPEN, morphologyEx
 
@@ -173,7 +172,9 @@ class _Lamps:
         plain = np.where(grown(unclear, 3), morphologyEx(hard, MORPH_OPEN, np.ones((5, 5), np.uint8)), hard)
         left = self.taken_out(values) - blurred(plain, self.sigma_px)
         again = (each.nearer or _nearer(left[each.where], each.spread, 0, _CLEAR_AGAIN) for each in self.each)
-        return _Lamps(self.sigma_px, tuple(_Lamp(each.where, each.own, each.spread, now) for each, now in zip(self.each, again, strict=True)))
+        return _Lamps(
+            self.sigma_px, tuple(_Lamp(each.where, each.own, each.spread, now) for each, now in zip(self.each, again, strict=True))
+        )
 
     def taken_out(self, values: Plane) -> Plane:
         without = values.copy()
