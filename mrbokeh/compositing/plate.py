@@ -156,9 +156,8 @@ def open_plate(
         return _stack_plate(photo, slice_index, lens, focus_m)
     if slice_index is not None:
         raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}: leave it out")
-    return photograph_plate(
-        photo, read_photograph(photo), phone_photo(photo), LensWishes(lens, focus_m, facts or {}, guessing, exact_depth)
-    )
+    wishes = LensWishes(lens=lens, focus_m=focus_m, facts=facts or {}, guessing=guessing, exact_depth=exact_depth)
+    return photograph_plate(photo, read_photograph(photo), phone_photo(photo), wishes)
 
 
 def photograph_plate(photo: Path, photograph: Photograph, phone: PhonePhoto | None, wishes: "LensWishes") -> Plate:

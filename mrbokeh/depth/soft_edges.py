@@ -10,14 +10,14 @@ pixels, seen in the photograph, and their own blur is known.
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float, Float32
 
 from mrbokeh.depth.edge_votes import Guide, Mask, Plane, by_rows, grown, highest, lowest, other_sides, sides_of, voted
 
 LEAST_SOFT_PX, _MOST_SOFT_PX = 0.75, 4.0
 _LEAST_CRESTS = 12
 _AROUND_PX, _BESIDE_PX, _LEAST_STEEP, _EVEN, _SLANTED = 17, 7.0, 0.08, 0.6, 1.6
-Places = Float32[np.ndarray, " n"]
+Places = Float[np.ndarray, " n"]
 _ROUNDS, _MOVES = 3, 2
 _STAYS = 0.1
 
