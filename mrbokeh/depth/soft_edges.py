@@ -16,9 +16,9 @@ from mrbokeh.depth.edge_votes import Guide, Mask, Plane, by_rows, grown, highest
 
 LEAST_SOFT_PX, _MOST_SOFT_PX = 0.75, 4.0
 _LEAST_CRESTS = 12
-_AROUND_PX, _BESIDE_PX, _LEAST_STEEP, _EVEN, _SLANTED = 17, 7.0, 0.08, 0.6, 1.6
+_AROUND_PX, _BESIDE_PX, _LEAST_STEEP, _EVEN, _LEVEL, _SLANTED = 17, 7.0, 0.08, 0.6, 0.35, 1.6
 Places = Float[np.ndarray, " n"]
-_ROUNDS, _MOVES = 3, 2
+_ROUNDS, _MOVES = (1, 3), 2
 _STAYS = 0.1
 
 
@@ -43,14 +43,18 @@ def softness(values: Plane, jump: float) -> Softness:
     crest = (step > jump) & (steep > _LEAST_STEEP * step) & (steep >= highest(steep, 7))
     crest &= (lowest(steep, _AROUND_PX) < _EVEN * steep) & (highest(high, _AROUND_PX) - lowest(low, _AROUND_PX) < _SLANTED * step)
     y, x = np.nonzero(crest)
-    steep, step, low, across, along = (each[y, x] for each in (steep, step, low, right, down))
-    ends = [_at(values, y + way * along / steep, x + way * across / steep) for way in (_BESIDE_PX, -_BESIDE_PX)]
-    even = (ends[0] > low + 0.9 * step) & (ends[1] < low + 0.1 * step)
+    height, low, across, along = (each[y, x] for each in (step, low, right, down))
+    steepest = steep[y, x]
+    ends = [(y + way * along / steepest, x + way * across / steepest) for way in (_BESIDE_PX, -_BESIDE_PX)]
+    even = (_at(values, *ends[0]) > low + 0.9 * height) & (_at(values, *ends[1]) < low + 0.1 * height)
+    even &= np.maximum(_at(steep, *ends[0]), _at(steep, *ends[1])) < _LEVEL * steepest
     even |= np.count_nonzero(even) < _LEAST_CRESTS
     if np.count_nonzero(even) < _LEAST_CRESTS:
         return Softness(0.0, 0.0)
-    sigma_px = float(np.median((step / (steep * np.sqrt(2.0 * np.pi)))[even]))
-    middle = (values[y, x] + 0.5 * (across + along) - low) / step
+    blurred_px = float(np.median((height / (steepest * np.sqrt(2.0 * np.pi)))[even]))
+    # A difference of neighbours is a mean over a pixel, whose own variance is 1/12.
+    sigma_px = float(np.sqrt(max(blurred_px * blurred_px - 1.0 / 12.0, 0.0)))
+    middle = (values[y, x] + 0.5 * (across + along) - low) / height
     return Softness(sigma_px, abs(float(np.median(middle[even])) - 0.5))
 
 
@@ -70,15 +74,15 @@ def sharpened(values: Plane, guide: Guide, jump: float, sigma_px: float, most: f
     """Return a map (values grow with nearness) whose edges are as hard as before it was blurred by sigma. most: no lamp can be nearer."""
     sigma_px = min(sigma_px, _MOST_SOFT_PX)
     lamps = _Lamps.of(values, guide, sigma_px)
-    once = _surfaces(lamps.taken_out(values), guide, jump, sigma_px)
+    once = _surfaces(lamps.taken_out(values), guide, jump, sigma_px, _ROUNDS[0])
     lamps = lamps.looked_at_again(values, once)
-    return lamps.put_in(_surfaces(lamps.taken_out(values), guide, jump, sigma_px), most)
+    return lamps.put_in(_surfaces(lamps.taken_out(values), guide, jump, sigma_px, _ROUNDS[1]), most)
 
 
-def _surfaces(soft: Plane, guide: Guide, jump: float, sigma_px: float) -> Plane:
+def _surfaces(soft: Plane, guide: Guide, jump: float, sigma_px: float, rounds: int) -> Plane:
     """Return the map without its blur, lamps apart."""
     reach_px, hard = round(1.5 * sigma_px), _steepened(soft, jump, sigma_px)
-    for _ in range(_ROUNDS):
+    for _ in range(rounds):
         sides = sides_of(hard, guide, jump, reach_px)
         hard = voted(hard, sides, guide, sides.away_px <= reach_px, _STAYS)
         hard = _given_back(hard, soft, jump, sigma_px)
