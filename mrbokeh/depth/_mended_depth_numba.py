@@ -13,7 +13,9 @@ from mrbokeh.system.compiled import njit
 _FAR_AWAY = 99.0
 _PER_STEP = np.float32(2.5e-5)
 """What a pixel of distance adds to the square of a difference of colours."""
-_ROUND = 0.03
+_ROUND = np.float32(0.03)
+_UNLIKE, _BESIDE, _DIAGONAL, _HALF = np.float32(44.0), np.float32(1.0), np.float32(0.7), np.float32(0.5)
+"""Neighbours count about exp(-44 d), d the square of the difference of their colours; those at a corner less."""
 
 
 @njit(cache=True, nogil=True)
@@ -140,7 +142,8 @@ def vote(
                     if u == x and v == y:
                         continue
                     r, g, b = rgb[v, u, 0] - rgb[y, x, 0], rgb[v, u, 1] - rgb[y, x, 1], rgb[v, u, 2] - rgb[y, x, 2]
-                    says = weight * math.exp(-(r * r + g * g + b * b) * 44.0) * (0.7 if u != x and v != y else 1.0)
+                    unlike = _UNLIKE * (r * r + g * g + b * b)
+                    says = weight * (_DIAGONAL if u != x and v != y else _BESIDE) / (_BESIDE + unlike + _HALF * unlike * unlike)
                     total += says if abs(values[v, u] - own[y, x]) < abs(values[v, u] - other[y, x]) else -says
             out[y, x] = own[y, x] if total >= 0.0 else other[y, x]
 
@@ -199,6 +202,28 @@ def give_back(
             out[y, x] = values[y, x] + missing / max(counts, 0.1)
 
 
+@njit(cache=True, nogil=True)
+def settle(
+    out: np.ndarray, values: np.ndarray, share: np.ndarray, band: np.ndarray, reach_px: int, jump: float, top: int, bottom: int
+) -> None:
+    """Set rows of out: in the band the mean of the surface around each pixel; what the blur left more of counts more."""
+    height, width = values.shape
+    for y in range(top, bottom):
+        for x in range(width):
+            out[y, x] = values[y, x]
+            if not band[y, x] or share[y, x] > _WHOLE:
+                continue
+            total, counts = 0.0, 0.0
+            for v in range(max(y - reach_px, 0), min(y + reach_px + 1, height)):
+                for u in range(max(x - reach_px, 0), min(x + reach_px + 1, width)):
+                    if abs(values[v, u] - values[y, x]) <= jump:
+                        weight = share[v, u] * share[v, u] * share[v, u]
+                        total += weight * values[v, u]
+                        counts += weight
+            out[y, x] = total / counts
+
+
+_WHOLE = np.float32(0.95)
 _STEP, _COLOUR_STEP, _LEVELS = 1, 60.0, 512
 _SIDES = ((0, 1), (1, 0), (0, -1), (-1, 0))
 

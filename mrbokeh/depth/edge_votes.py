@@ -20,7 +20,7 @@ Picture = Float32[np.ndarray, "height width 3"]
 SURE_PX = 2
 """How far a hard edge may be misplaced."""
 _WINDOW_PX = 5
-_VOTE_WEIGHT, _VOTES = 0.1, 6
+_VOTE_WEIGHT, _VOTES = np.float32(0.1), 4
 _GREY, _WHITE, _LAMP = 0.25, np.float32(4.0), 0.8
 _ROWS = 16
 """The least rows that are worth a thread."""

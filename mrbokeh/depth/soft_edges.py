@@ -12,14 +12,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Float32
 
-from mrbokeh.depth.edge_votes import Guide, Mask, Plane, by_rows, grown, highest, lowest, other_sides, sides_of, voted
+from mrbokeh.depth.edge_votes import Guide, Mask, Plane, by_rows, grown, highest, lowest, sides_of, voted
 
 LEAST_SOFT_PX, _MOST_SOFT_PX = 0.75, 4.0
 _LEAST_CRESTS = 12
 _AROUND_PX, _BESIDE_PX, _LEAST_STEEP, _EVEN, _LEVEL, _SLANTED = 17, 7.0, 0.08, 0.6, 0.35, 1.6
 Places = Float[np.ndarray, " n"]
-_ROUNDS, _MOVES = (1, 3), 2
-_STAYS = 0.1
+_ROUNDS, _MOVES = (1, 2), 2
+_STAYS, _TAPS = 0.1, 1.5
+_SETTLE_PX, _SETTLE_JUMPS = 7, 3.0
 
 
 @dataclass(frozen=True)
@@ -74,8 +75,8 @@ def sharpened(values: Plane, guide: Guide, jump: float, sigma_px: float, most: f
     """Return a map (values grow with nearness) whose edges are as hard as before it was blurred by sigma. most: no lamp can be nearer."""
     sigma_px = min(sigma_px, _MOST_SOFT_PX)
     lamps = _Lamps.of(values, guide, sigma_px)
-    once = _surfaces(lamps.taken_out(values), guide, jump, sigma_px, _ROUNDS[0])
-    lamps = lamps.looked_at_again(values, once)
+    if any(each.nearer == 0.0 for each in lamps.each):
+        lamps = lamps.looked_at_again(values, _surfaces(lamps.taken_out(values), guide, jump, sigma_px, _ROUNDS[0]))
     return lamps.put_in(_surfaces(lamps.taken_out(values), guide, jump, sigma_px, _ROUNDS[1]), most)
 
 
@@ -85,7 +86,7 @@ def _surfaces(soft: Plane, guide: Guide, jump: float, sigma_px: float, rounds: i
     for _ in range(rounds):
         sides = sides_of(hard, guide, jump, reach_px)
         hard = voted(hard, sides, guide, sides.away_px <= reach_px, _STAYS)
-        hard = _given_back(hard, soft, jump, sigma_px)
+        hard = _given_back(hard, soft, jump, sigma_px, settled=rounds > 1)
     return hard
 
 
@@ -109,13 +110,14 @@ def _steepened(soft: Plane, jump: float, sigma_px: float) -> Plane:
     return now
 
 
-def _given_back(hard: Plane, soft: Plane, jump: float, sigma_px: float) -> Plane:
-    from mrbokeh.depth._mended_depth_numba import give_back, shares
+def _given_back(hard: Plane, soft: Plane, jump: float, sigma_px: float, *, settled: bool) -> Plane:
+    from mrbokeh.depth._mended_depth_numba import give_back, settle, shares
 
-    reach_px = round(2.0 * sigma_px)
+    reach_px = round(_TAPS * sigma_px)
     along = np.exp(-(np.arange(-reach_px, reach_px + 1) ** 2) / (2.0 * sigma_px * sigma_px))
     taps = np.outer(along, along) / along.sum() ** 2
-    band = other_sides(hard, jump, 3 * round(sigma_px))[1] < 99.0
+    around_px = 2 * reach_px + 1
+    band = highest(hard, around_px) - lowest(hard, around_px) > jump
     for _ in range(_MOVES):
         left, share, now = soft - blurred(hard, sigma_px), np.empty_like(hard), np.empty_like(hard)
 
@@ -128,6 +130,14 @@ def _given_back(hard: Plane, soft: Plane, jump: float, sigma_px: float) -> Plane
         by_rows(hard.size, len(hard), weigh)
         by_rows(hard.size, len(hard), move)
         hard = now
+        if settled:
+            now = np.empty_like(hard)
+
+            def calm(top: int, bottom: int, hard: Plane = hard, share: Plane = share, now: Plane = now) -> None:
+                settle(now, hard, share, band, _SETTLE_PX, np.float32(_SETTLE_JUMPS * jump), top, bottom)
+
+            by_rows(hard.size, len(hard), calm)
+            hard = now
     return hard
 
 

@@ -152,7 +152,7 @@ def read_depth(path: Path | str, *, with_holes: bool = False) -> Float32[np.ndar
     if name is None:
         raise InputError(f"{path}: expected depth in a channel {', '.join(_LONE_DEPTH_NAMES)}, but it has {', '.join(sorted(channels))}")
     depth_m = channels[name].astype(np.float32)
-    if np.isnan(depth_m).any() and not with_holes:
+    if np.isnan(depth_m).any() and not (with_holes and (depth_m > 0).any()):
         raise InputError(f"{path}: {int(np.isnan(depth_m).sum())} pixels of {name} are NaN: write inf (or 0) where there is background")
     if not (depth_m > 0).any():
         raise InputError(f"{path}: expected metres above 0 in {name}, but the largest is {depth_m.max():g}: is it depth along the axis?")
