@@ -250,10 +250,11 @@ def open_depth(source: Path, photo_rgb: Rgb, settings: DepthSettings | None = No
         raise InputError(f"--stereo-cameras is for a file of disparity ({', '.join(_ARRAYS)}), got {source}: leave it out")
     depth, is_soft = _read(source, photo_rgb, settings)
     _require_same_aspect(source, depth, photo_rgb)
-    refine = is_soft if settings.refined is None else settings.refined
+    smaller = depth.depth_m.shape[1] < _SMALLER * photo_rgb.shape[1]
+    refine = is_soft and smaller if settings.refined is None else settings.refined
     if settings.exact:
         return at_size_of(with_holes_filled(depth), photo_rgb, refine)
-    if refine and depth.depth_m.shape[1] < _SMALLER * photo_rgb.shape[1]:
+    if refine and smaller:
         return at_size_of(_mended(depth, photo_rgb), photo_rgb, refine)
     return _mended(at_size_of(depth, photo_rgb, False), photo_rgb)
 

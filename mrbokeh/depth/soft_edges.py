@@ -7,19 +7,20 @@ and then surfaces are moved as wholes until the map, blurred as it was, is the o
 pixels, seen in the photograph, and their own blur is known.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Float32
 
 from mrbokeh.depth.edge_votes import Guide, Mask, Plane, by_rows, grown, highest, lowest, sides_of, voted
 
-LEAST_SOFT_PX, _MOST_SOFT_PX = 0.75, 4.0
+LEAST_SOFT_PX, _MOST_SOFT_PX = 0.9, 4.0
 _LEAST_CRESTS = 12
 _AROUND_PX, _BESIDE_PX, _LEAST_STEEP, _EVEN, _LEVEL, _SLANTED = 17, 7.0, 0.08, 0.6, 0.35, 1.6
 Places = Float[np.ndarray, " n"]
 _ROUNDS, _MOVES = (1, 2), 2
 _STAYS, _TAPS = 0.1, 1.5
+_SPARE, _LEAST_SHARE = np.float32(1.1), np.float32(0.15)
 _SETTLE_PX, _SETTLE_JUMPS = 7, 3.0
 
 
@@ -74,7 +75,7 @@ def blurred(values: Plane, sigma_px: float) -> Plane:
 def sharpened(values: Plane, guide: Guide, jump: float, sigma_px: float, most: float) -> Plane:
     """Return a map (values grow with nearness) whose edges are as hard as before it was blurred by sigma. most: no lamp can be nearer."""
     sigma_px = min(sigma_px, _MOST_SOFT_PX)
-    lamps = _Lamps.of(values, guide, sigma_px)
+    lamps = _Lamps.of(values, guide, jump, sigma_px)
     if any(each.nearer == 0.0 for each in lamps.each):
         lamps = lamps.looked_at_again(values, _surfaces(lamps.taken_out(values), guide, jump, sigma_px, _ROUNDS[0]))
     return lamps.put_in(_surfaces(lamps.taken_out(values), guide, jump, sigma_px, _ROUNDS[1]), most)
@@ -130,6 +131,7 @@ def _given_back(hard: Plane, soft: Plane, jump: float, sigma_px: float, *, settl
         by_rows(hard.size, len(hard), weigh)
         by_rows(hard.size, len(hard), move)
         hard = now
+        hard = np.where(band, _within_reason(hard, soft, share, reach_px), hard)
         if settled:
             now = np.empty_like(hard)
 
@@ -141,7 +143,14 @@ def _given_back(hard: Plane, soft: Plane, jump: float, sigma_px: float, *, settl
     return hard
 
 
-_CLEAR, _CLEAR_AGAIN = 4.0, 2.0
+def _within_reason(hard: Plane, soft: Plane, share: Plane, reach_px: int) -> Plane:
+    """Return values that go beyond those of the soft map around them no farther than what was blurred away allows."""
+    high, low = highest(soft, 2 * reach_px + 1), lowest(soft, 2 * reach_px + 1)
+    most = (high - low) * (_SPARE / np.maximum(share, _LEAST_SHARE))
+    return np.clip(hard, high - most, low + most)
+
+
+_CLEAR, _CLEAR_AGAIN, _LEAST_BUMP = 4.0, 2.0, 0.1
 
 
 @dataclass(frozen=True)
@@ -157,10 +166,11 @@ class _Lamp:
 @dataclass(frozen=True)
 class _Lamps:
     sigma_px: float
+    least: float
     each: tuple[_Lamp, ...]
 
     @classmethod
-    def of(cls, values: Plane, guide: Guide, sigma_px: float) -> "_Lamps":
+    def of(cls, values: Plane, guide: Guide, jump: float, sigma_px: float) -> "_Lamps":
         """Find how much nearer each lamp is than what is around it, 0 where that is not clear."""
         from cv2 import BORDER_CONSTANT, GaussianBlur
         from scipy.ndimage import find_objects, label
@@ -171,8 +181,8 @@ class _Lamps:
             where = tuple(slice(max(each.start - around_px, 0), each.stop + around_px) for each in (rows, columns))
             own = numbers[where] == number
             spread = np.asarray(GaussianBlur(own.astype(np.float32), (0, 0), sigma_px, borderType=BORDER_CONSTANT))
-            found.append(_Lamp((where[0], where[1]), own, spread, _nearer(values[where], spread, 1, _CLEAR)))
-        return cls(sigma_px, tuple(found))
+            found.append(_Lamp((where[0], where[1]), own, spread, _nearer(values[where], spread, 1, _CLEAR, _LEAST_BUMP * jump)))
+        return cls(sigma_px, _LEAST_BUMP * jump, tuple(found))
 
     def looked_at_again(self, values: Plane, hard: Plane) -> "_Lamps":
         """Look again at those that were not clear, when the surfaces around them are known."""
@@ -185,10 +195,8 @@ class _Lamps:
             return self
         plain = np.where(grown(unclear, 3), morphologyEx(hard, MORPH_OPEN, np.ones((5, 5), np.uint8)), hard)
         left = self.taken_out(values) - blurred(plain, self.sigma_px)
-        again = (each.nearer or _nearer(left[each.where], each.spread, 0, _CLEAR_AGAIN) for each in self.each)
-        return _Lamps(
-            self.sigma_px, tuple(_Lamp(each.where, each.own, each.spread, now) for each, now in zip(self.each, again, strict=True))
-        )
+        again = (each.nearer or _nearer(left[each.where], each.spread, 0, _CLEAR_AGAIN, self.least) for each in self.each)
+        return replace(self, each=tuple(replace(each, nearer=now) for each, now in zip(self.each, again, strict=True)))
 
     def taken_out(self, values: Plane) -> Plane:
         without = values.copy()
@@ -203,8 +211,12 @@ class _Lamps:
         return values
 
 
-def _nearer(around: Float32[np.ndarray, "rows columns"], spread: Float32[np.ndarray, "rows columns"], degree: int, clear: float) -> float:
-    """Return the height of a bump of that shape on an even surface, or on a plane (degree 1); 0 where it does not stand out clearly."""
+def _nearer(
+    around: Float32[np.ndarray, "rows columns"], spread: Float32[np.ndarray, "rows columns"], degree: int, clear: float, least: float
+) -> float:
+    """Return the height of a bump of that shape on an even surface, or on a plane (degree 1); 0 where it does not stand out clearly, or by
+    less than the least.
+    """
     y, x = np.mgrid[: spread.shape[0], : spread.shape[1]] / 8.0 - 0.5
     basis = np.stack([spread.ravel(), np.ones(spread.size), *((y.ravel(), x.ravel()) if degree else ())], axis=1)
     start = np.sqrt(spread.ravel() / spread.max()) + 0.05
@@ -214,4 +226,4 @@ def _nearer(around: Float32[np.ndarray, "rows columns"], spread: Float32[np.ndar
         off = np.abs(seen - basis @ fitted)
         usual = 1.5 * float(np.median(off)) + 1e-7
         weight = start / (1.0 + (off / (3.0 * usual)) ** 2)
-    return float(fitted[0]) if fitted[0] * spread.max() > clear * usual else 0.0
+    return float(fitted[0]) if fitted[0] * spread.max() > max(clear * usual, least) else 0.0
