@@ -20,7 +20,7 @@ _AROUND_PX, _BESIDE_PX, _LEAST_STEEP, _EVEN, _LEVEL, _SLANTED = 17, 7.0, 0.08, 0
 Places = Float[np.ndarray, " n"]
 _ROUNDS, _MOVES = (1, 2), 2
 _STAYS, _TAPS = 0.1, 1.5
-_SPARE, _LEAST_SHARE = np.float32(1.1), np.float32(0.15)
+_SPARE, _LEAST_SHARE = np.float32(1.4), np.float32(0.15)
 _SETTLE_PX, _SETTLE_JUMPS = 7, 3.0
 
 
