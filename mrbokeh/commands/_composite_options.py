@@ -57,14 +57,7 @@ class PlateOptions(shared.NearOptions):
     ] = None
     disparity: shared.DisparityOption = None
     depth_scale: Annotated[float | None, typer.Option(help="--depth holds distance: metres for each step; 0 is unknown.")] = None
-    exact_depth: Annotated[
-        bool,
-        typer.Option(
-            "--exact-depth",
-            help="Depth is exact at rims, as of a render. By default between and rerender move the rims of near things, where a stack "
-            "has an all-in-focus picture, to where the photograph shows them.",
-        ),
-    ] = False
+    exact_depth: shared.ExactDepthOption = False
 
     def require_meant(self, photo: Path) -> None:
         """Raise InputError where options of depth contradict one another, or go without a second photograph that they are of."""

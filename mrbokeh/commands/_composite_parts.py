@@ -48,7 +48,7 @@ def plate_by(whole: CompositeOptions, bundle: CaptureBundle | None, *, lens: Len
         raise InputError(f"{told} would change the lens that {photo} states itself: leave that out, or give --lens")
     if bundle is None:
         slice_index = 0 if options.all_slices else options.slice_
-        plate = open_plate(photo, slice_index, lens, focus_m, facts, guessing=whole.guesses_ground)
+        plate = open_plate(photo, slice_index, lens, focus_m, facts, guessing=whole.guesses_ground, exact_depth=options.exact_depth)
     else:
         plate = bundle_plate(bundle, lens, focus_m)
     if colour.of_plate is not None:
@@ -58,10 +58,13 @@ def plate_by(whole: CompositeOptions, bundle: CaptureBundle | None, *, lens: Len
     if options.rgb is not None:
         plate = replace(plate, sharp_rgb=_rgb_of(options.rgb, colour))
     if options.stereo is not None:
-        plate = with_stereo(plate, _rgb_of(options.stereo, colour), options.baseline, (photo, options.stereo))
+        plate = with_stereo(plate, _rgb_of(options.stereo, colour), options.baseline, (photo, options.stereo), exact=options.exact_depth)
     source = options.depth or (photo if near_far_m or options.depth_scale else None)
     if source is not None:
-        before_m, plate = plate.depth_m, with_depth(plate, source, DepthSettings(near_far_m, options.depth_scale))
+        before_m, plate = (
+            plate.depth_m,
+            with_depth(plate, source, DepthSettings(near_far_m, options.depth_scale, exact=options.exact_depth)),
+        )
         plate = replace(plate, depth_note="", metres_guessed=plate.metres_guessed and photo.is_dir())
         if own is not None and plate.blur_from and before_m is not None:
             plate = with_blur_in_metres(plate, before_m, focus_m)

@@ -122,6 +122,13 @@ class RenderingOptions:
 DisparityOption = Annotated[
     str | None, typer.Option(metavar="NEAR:FAR", help="--depth is even in 1/distance, largest number at NEAR, 0 at FAR metres.")
 ]
+ExactDepthOption = Annotated[
+    bool,
+    typer.Option(
+        "--exact-depth",
+        help="Depth is exact, as of a render. By default holes, soft and misplaced edges of depth are mended by the picture's colours.",
+    ),
+]
 FocusAtOption = Annotated[str | None, typer.Option(help="Focus on pixel X,Y, or on what lies within R pixels of it: X,Y,R.")]
 
 

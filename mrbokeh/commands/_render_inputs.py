@@ -7,7 +7,15 @@ from typing import Annotated
 import numpy as np
 import typer
 
-from mrbokeh.commands._insertion_options import DisparityOption, FocusAtOption, focused_at_pixel, in_degrees, near_far_of, require_one_focus
+from mrbokeh.commands._insertion_options import (
+    DisparityOption,
+    ExactDepthOption,
+    FocusAtOption,
+    focused_at_pixel,
+    in_degrees,
+    near_far_of,
+    require_one_focus,
+)
 from mrbokeh.images.layer import Layer, flatten
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
@@ -24,6 +32,7 @@ class SharpOptions:
         typer.Option(help="Its depth in metres: EXR channel Z, depth.Z or Y (inf or <= 0: background), or one number."),
     ] = None
     disparity: DisparityOption = None
+    exact_depth: ExactDepthOption = False
     layer: Annotated[list[Path] | None, typer.Option(help="EXR layer with premultiplied RGBA and Z; repeat it, front first.")] = None
     behind: Annotated[
         list[Path] | None, typer.Option(help="EXR layer behind --rgb: what is known of what it hides (clean plate, other view).")
@@ -95,7 +104,7 @@ def _read(sources: SharpOptions) -> dict[str, Layer]:
     if (rgb is None) != (depth is None):
         raise InputError("--rgb and --depth belong together: give both, or only --layer")
     if rgb is not None and depth is not None:
-        sharp[str(rgb)] = _picture(rgb, depth, near_far_m, sources.srgb)
+        sharp[str(rgb)] = _picture(rgb, depth, near_far_m, sources)
     if sources.behind and rgb is None:
         raise InputError("--behind is for what lies behind --rgb: without a picture list all layers with --layer, front first")
     sharp |= {str(path): _whole_layer(path) for path in sources.behind or ()}
@@ -114,19 +123,21 @@ def _whole_layer(path: Path) -> Layer:
     return layer
 
 
-def _picture(rgb: Path, depth: Path, near_far_m: tuple[float, float] | None, is_srgb: bool) -> Layer:
+def _picture(rgb: Path, depth: Path, near_far_m: tuple[float, float] | None, sources: SharpOptions) -> Layer:
+    from mrbokeh.depth.mended_depth import mended_aloud
     from mrbokeh.depth.open_depth import depth_of_file
     from mrbokeh.images.image_io import read_image, read_linear
     from mrbokeh.images.layer import opaque
 
     linear_or = "develop the RAW file to EXR first, or say with --srgb that it is sRGB if that is all there is"
-    colour = read_image(rgb) if is_srgb else read_linear(rgb, linear_or)
-    distant = _is_distance(depth)
-    depth_m = np.full(colour.shape[:2], float(str(depth)), np.float32) if distant else depth_of_file(depth, near_far_m)
+    colour = read_image(rgb) if sources.srgb else read_linear(rgb, linear_or)
+    if _is_distance(depth):
+        return opaque(colour, np.full(colour.shape[:2], float(str(depth)), np.float32))
+    depth_m = depth_of_file(depth, near_far_m, with_holes=not sources.exact_depth)
     if colour.shape[:2] != depth_m.shape:
         sizes = f"{rgb} is {colour.shape[1]}x{colour.shape[0]} px, {depth} {depth_m.shape[1]}x{depth_m.shape[0]} px"
         raise InputError(f"picture and depth must be of one size, but {sizes}: resize the depth with its nearest pixels, not between them")
-    return opaque(colour, depth_m)
+    return opaque(colour, depth_m if sources.exact_depth else mended_aloud(depth_m, colour))
 
 
 def _is_distance(depth: Path) -> bool:

@@ -34,6 +34,7 @@ def render(
     *,
     focus: float | tuple[float, float] | None = None,
     renderer: str | Renderer | None = None,
+    exact_depth: bool = False,
 ) -> Rgb:
     """Blur an all-in-focus picture with depth as a lens does; return linear Rec.709 (H, W, 3) of float32.
 
@@ -42,13 +43,17 @@ def render(
     keeps the lens's own.
     renderer: polygon, low-rank, laplacian, lrdm, scatter (exact, slow), the path of a network (.onnx) or bank, or a Renderer; None takes
     the lens's own.
+    exact_depth: depth is taken as it is; else NaN is unknown, and holes, soft and misplaced edges are mended by the picture.
     Raises InputError if sizes differ or a value is no number.
 
     >>> blurred = mrbokeh.render(picture, depth_m, mrbokeh.Lens(focal_length_mm=50, f_number=1.8), focus=1.2)
     """
-    rgb, surface_m = _rgb(picture, "picture"), _depth_of(depth_m)
+    from mrbokeh.depth.mended_depth import mended_aloud
+
+    rgb, surface_m = _rgb(picture, "picture"), _depth_of(depth_m, with_holes=not exact_depth)
     if rgb.shape[:2] != surface_m.shape:
         raise InputError(f"picture and depth must be of one size, got {rgb.shape[:2]} and {surface_m.shape} (height, width)")
+    surface_m = surface_m if exact_depth else mended_aloud(surface_m, rgb)
     held, spreads = _optics(lens, renderer)
     return spreads.render([opaque(rgb, surface_m)], _focused(held or Lens.default(), focus, surface_m)).rgb
 
@@ -66,12 +71,13 @@ def composite(
     height: float | str | Sequence[float | str] | None = None,
     mode: str | None = None,
     renderer: str | Renderer | None = None,
+    exact_depth: bool = False,
 ) -> Rgb:
     """Put virtual objects into a photograph, blurred by its lens, before and behind what it shows; return linear Rec.709 (H, W, 3).
 
     photo: (H, W, 3) linear, a photograph's file, or the folder of a merged focal stack with the slice_index to put it into.
     inserted: GLB files, or sharp layers (Layer or EXR with R, G, B, A and Z in metres) of the photograph's size, front first.
-    lens, renderer: as in `render`; None takes what the file or the stack tells. focus: metres, or a pixel (x, y); needs depth.
+    lens, renderer, exact_depth: as in `render`; None takes what the file or the stack tells. focus: metres, or a pixel (x, y); needs depth.
     depth_m: (H, W) metres, or any file that `mrbokeh composite --depth` takes. all_in_focus: the photograph without its blur, if known.
     at_pixel: (x, y) on which a GLB stands, one for each, or to which the depth of layers is scaled. height: of a GLB in metres, or such as
     "120px"; one for each, or one for all.
@@ -86,22 +92,25 @@ def composite(
     from mrbokeh.compositing.ground import with_ground_behind
     from mrbokeh.compositing.plate import open_plate, plate_of, with_depth
     from mrbokeh.depth.depth_map import DepthSettings
+    from mrbokeh.depth.mended_depth import mended_aloud
     from mrbokeh.images.image_io import read_layer
 
     known_lens, spreads = _optics(lens, renderer)
     focus_m = None if focus is None or isinstance(focus, tuple) else float(focus)
     if isinstance(photo, (str, Path)):
-        plate = open_plate(Path(photo), slice_index, known_lens, focus_m)
+        plate = open_plate(Path(photo), slice_index, known_lens, focus_m, exact_depth=exact_depth)
     elif known_lens is None:
         raise InputError("a photograph as an array does not tell its lens: give lens, such as mrbokeh.Lens(focal_length_mm=50, f_number=2)")
     else:
         plate = plate_of(_rgb(photo, "photo"), known_lens if focus_m is None else known_lens.focused_at(focus_m))
-    if isinstance(depth_m, (str, Path)):
-        plate = with_depth(plate, Path(depth_m), DepthSettings())
-    elif depth_m is not None:
-        plate = replace(plate, depth_m=_depth_of(depth_m))
     if all_in_focus is not None:
         plate = replace(plate, sharp_rgb=_rgb(all_in_focus, "all_in_focus"))
+    if isinstance(depth_m, (str, Path)):
+        plate = with_depth(plate, Path(depth_m), DepthSettings(exact=exact_depth))
+    elif depth_m is not None:
+        surface_m, seen_rgb = _depth_of(depth_m, with_holes=not exact_depth), plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb
+        mends = not exact_depth and surface_m.shape == seen_rgb.shape[:2]
+        plate = replace(plate, depth_m=mended_aloud(surface_m, seen_rgb) if mends else surface_m)
     if isinstance(focus, tuple):
         if plate.depth_m is None:
             raise InputError("to focus on a pixel the photograph needs depth: give depth_m, or focus in metres")
@@ -124,7 +133,7 @@ def composite(
         layers = standing_on_pixel(layers, plate, *standing.first_px) if at_pixels else layers
     if at_pixels:
         plate = with_ground_behind(plate, standing.pixels, layers)
-    return insertion_of(mode or best_mode(plate)).insert(plate, layers, spreads).rgb
+    return insertion_of(mode or best_mode(plate), exact_depth=exact_depth).insert(plate, layers, spreads).rgb
 
 
 def _rgb(given: np.ndarray | File, name: str) -> Rgb:
@@ -139,15 +148,15 @@ def _rgb(given: np.ndarray | File, name: str) -> Rgb:
     return np.ascontiguousarray(rgb, np.float32)
 
 
-def _depth_of(given: np.ndarray | File) -> Plane:
+def _depth_of(given: np.ndarray | File, *, with_holes: bool) -> Plane:
     from mrbokeh.images.image_io import read_depth
 
     if isinstance(given, (str, Path)):
-        return read_depth(given)
+        return read_depth(given, with_holes=with_holes)
     depth_m = np.asarray(given, np.float32)
-    if depth_m.ndim != 2 or np.isnan(depth_m).any():
+    if depth_m.ndim != 2 or (np.isnan(depth_m).any() and not with_holes):
         raise InputError(f"depth_m: expected metres of shape (height, width), inf where nothing is, got shape {depth_m.shape} or NaN in it")
-    return np.where(depth_m > 0, depth_m, np.float32(np.inf))
+    return np.where((depth_m > 0) | np.isnan(depth_m), depth_m, np.float32(np.inf))
 
 
 def _optics(lens: Lens | File | None, renderer: str | Renderer | None) -> tuple[Lens | None, Renderer]:

@@ -18,6 +18,7 @@ from mrbokeh.commands._insertion_options import (
     ANY_LENS,
     ANY_RENDERER,
     DisparityOption,
+    ExactDepthOption,
     FocusAtOption,
     LensFacts,
     focused_at_pixel,
@@ -68,6 +69,8 @@ class DepthOptions:
         typer.Option("--refine/--no-refine", help="Sharpen soft depth edges along the photograph. Default: where depth is soft."),
     ] = None
 
+    exact_depth: ExactDepthOption = False
+
     @property
     def settings(self) -> DepthSettings:
         """Statements of these options about the depth, parsed."""
@@ -78,6 +81,7 @@ class DepthOptions:
             model_gives=self.depth_model_gives,
             known=tuple(parse_known(each) for each in self.known or ()),
             refined=self.refine,
+            exact=self.exact_depth,
         )
 
 

@@ -70,6 +70,7 @@ class ClipOptions(shared.NearOptions):
         Path | None, typer.Option(metavar="DEPTH.exr", help="Depth of the filmed scene in metres, one file or depth.%04d.exr.")
     ] = None
     disparity: shared.DisparityOption = None
+    exact_depth: shared.ExactDepthOption = False
     steady_depth: Annotated[bool, typer.Option("--steady-depth", help="Filter numbered depth in time, against flicker.")] = False
 
 
@@ -162,6 +163,7 @@ def recipe_of(
         camera=_camera(source, virtual),
         focus=None if blur.focus_pull is None else FocusPulled.of(blur.focus_pull),
         depth=_depth(taken),
+        exact_depth=taken.exact_depth,
         matte=None if taken.matte is None else MatteFiles(taken.matte.resolve()),
         near_m=taken.near_distance,
         look=_look(look, source, taken),
@@ -179,7 +181,9 @@ def recipe_of(
 
 def _depth(taken: ClipOptions) -> DepthFiles | None:
     near_far_m = near_far_of(taken.disparity, taken.depth)
-    return None if taken.depth is None else DepthFiles(taken.depth.resolve(), taken.steady_depth, near_far_m)
+    return (
+        None if taken.depth is None else DepthFiles(taken.depth.resolve(), taken.steady_depth, near_far_m, with_holes=not taken.exact_depth)
+    )
 
 
 def _first_depth_m(recipe: CompositeRecipe, source: PictureSource, taken: ClipOptions) -> "np.ndarray | None":

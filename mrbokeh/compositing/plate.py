@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 
 from mrbokeh.depth.depth_map import DepthSettings
+from mrbokeh.depth.mended_depth import mended_aloud
 from mrbokeh.depth.open_depth import open_depth
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.depth.phone_photo import PhoneFocus, PhonePhoto
@@ -134,13 +135,14 @@ def open_plate(
     facts: Mapping[str, float] | None = None,
     *,
     guessing: bool = False,
+    exact_depth: bool = False,
 ) -> Plate:
     """Open a photograph with a lens, or a slice of a merged focal stack, which brings its own lens and depth.
 
     lens: replaces that of the photograph's metadata or of the stack, but keeps the focus of a slice. focus_m replaces all.
     A phone's photograph with depth inside brings that, its sharp original, and a lens with the blur that the phone put on.
     facts: of a photograph's lens, in place of what its metadata state or lack (`Photograph.stating`). guessing: what is lacking then is
-    guessed, and said, but the focus.
+    guessed, and said, but the focus. exact_depth: that of a phone is taken as it is.
     """
     if not photo.exists():
         require_file(photo, "a photograph or the folder of a focal stack")
@@ -154,7 +156,8 @@ def open_plate(
         return _stack_plate(photo, slice_index, lens, focus_m)
     if slice_index is not None:
         raise InputError(f"--slice chooses a slice of a focal stack, but {photo} is not a folder with {FILE_NAME}: leave it out")
-    return photograph_plate(photo, read_photograph(photo), phone_photo(photo), LensWishes(lens, focus_m, facts or {}, guessing))
+    wishes = LensWishes(lens=lens, focus_m=focus_m, facts=facts or {}, guessing=guessing, exact_depth=exact_depth)
+    return photograph_plate(photo, read_photograph(photo), phone_photo(photo), wishes)
 
 
 def photograph_plate(photo: Path, photograph: Photograph, phone: PhonePhoto | None, wishes: "LensWishes") -> Plate:
@@ -173,18 +176,19 @@ def photograph_plate(photo: Path, photograph: Photograph, phone: PhonePhoto | No
     stated = wishes.lens is not None or wishes.focus_m is not None or photograph.focus_distance_m is not None
     guessed = [] if phone.focus is None else [phone.focus.note * (not stated), phone.focus.blur_note * bool(held.blur_from)]
     note = "; ".join(each for each in (f"{photo}: {phone.depth.note}", *guessed) if each)
-    deep = with_depth(plate, photo, DepthSettings())
+    deep = with_depth(plate, photo, DepthSettings(exact=wishes.exact_depth))
     return replace(deep, sharp_rgb=original, blur_from=held.blur_from, depth_note=note, metres_guessed=not phone.has_unit)
 
 
 @dataclass(frozen=True)
 class LensWishes:
-    """Lens that a photograph is to have, as `open_plate` takes it."""
+    """Lens that a photograph is to have, and whether its own depth is exact, as `open_plate` takes them."""
 
     lens: Lens | None = None
     focus_m: float | None = None
     facts: Mapping[str, float] = field(default_factory=dict)
     guessing: bool = False
+    exact_depth: bool = False
 
 
 @dataclass(frozen=True)
@@ -327,9 +331,12 @@ def with_depth(plate: Plate, source: Path, settings: DepthSettings) -> Plate:
 
 
 def with_stereo(
-    plate: Plate, second_rgb: Float32[np.ndarray, "height width 3"], baseline_m: float | None, photos: tuple[Path, Path]
+    plate: Plate, second_rgb: Float32[np.ndarray, "height width 3"], baseline_m: float | None, photos: tuple[Path, Path], *, exact: bool
 ) -> Plate:
-    """Return the plate with depth from a second photograph beside it. baseline_m: how far the camera moved; None is guessed, and said."""
+    """Return the plate with depth from a second photograph beside it. baseline_m: how far the camera moved; None is guessed, and said.
+
+    exact: the depth is not mended.
+    """
     seen_rgb = plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb
     depth = stereo_depth(seen_rgb, second_rgb, plate.camera, baseline_m or _HANDS_BREADTH_M, photos)
     guess(
@@ -338,7 +345,8 @@ def with_stereo(
         if baseline_m is None
         else ""
     )
-    return replace(plate, depth_m=depth.depth_m, depth_note="", metres_guessed=baseline_m is None)
+    depth_m = depth.depth_m if exact else mended_aloud(depth.depth_m, seen_rgb)
+    return replace(plate, depth_m=depth_m, depth_note="", metres_guessed=baseline_m is None)
 
 
 _HANDS_BREADTH_M = 0.1

@@ -38,7 +38,8 @@ class DepthSettings:
 
     near_far_m: what the largest and the smallest number of a map linear in dioptres mean; inf is allowed for the far one.
     metres_per_unit: an integer file holds depth, 0 is unknown. stereo: of a disparity file. model_gives, known: of a network.
-    refined: soft edges are sharpened along the photograph; None: if the source is known to be soft.
+    refined: a map smaller than the photograph is enlarged along its edges; None: if the source is known to be soft. exact: nothing is
+    mended (`mrbokeh.depth.mended_depth`).
     """
 
     near_far_m: tuple[float, float] | None = None
@@ -47,6 +48,7 @@ class DepthSettings:
     model_gives: str = "inverse"
     known: tuple[KnownDistance, ...] = ()
     refined: bool | None = None
+    exact: bool = False
 
     def __post_init__(self) -> None:
         if self.near_far_m is not None and not 0 < self.near_far_m[0] < self.near_far_m[1]:

@@ -4,7 +4,7 @@ The user brings the network (.onnx), such as MiDaS (Ranftl et al. 2020) or Depth
 file cannot say stands in a JSON of its name beside it (model.onnx: model.json).
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from jaxtyping import Float32
 
 from mrbokeh.depth.depth_filters import refined_dioptres
 from mrbokeh.depth.depth_map import DepthMap, DepthSettings, with_holes_filled, without_steps
+from mrbokeh.depth.mended_depth import mended_aloud
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.images.image_io import read_depth
@@ -200,11 +201,19 @@ def _levels(numbers: np.ndarray) -> Plane:
     return np.clip((np.nan_to_num(numbers, posinf=high, neginf=low, nan=low) - low) / max(high - low, 1e-30), 0, 1).astype(np.float32)
 
 
-def depth_of_file(path: Path, near_far_m: tuple[float, float] | None = None) -> Plane:
-    """Read depth in metres as a file stores it: EXR with Z, or with near_far_m a picture that is even in 1/distance."""
+def depth_of_file(path: Path, near_far_m: tuple[float, float] | None = None, *, with_holes: bool = False) -> Plane:
+    """Read depth in metres as a file stores it: EXR with Z, or with near_far_m a picture that is even in 1/distance.
+
+    with_holes: what is unknown is NaN; else an EXR with NaN is refused, and a picture's holes take the nearest depth.
+    """
     if near_far_m is None:
-        return read_depth(path)
-    return with_holes_filled(read_number_map(path, DepthSettings(near_far_m))).depth_m
+        return read_depth(path, with_holes=with_holes)
+    depth = read_number_map(path, DepthSettings(near_far_m))
+    return _holed(depth) if with_holes else with_holes_filled(depth).depth_m
+
+
+def _holed(depth: DepthMap) -> Plane:
+    return np.where(depth.valid, depth.depth_m, np.float32(np.nan))
 
 
 def read_stereo(path: Path, settings: DepthSettings) -> DepthMap:
@@ -225,7 +234,7 @@ def read_stereo(path: Path, settings: DepthSettings) -> DepthMap:
 
 
 _ARRAYS = (".npz", ".npy")
-_SAME_ASPECT = 0.02
+_SAME_ASPECT, _SMALLER = 0.02, 0.75
 
 
 def open_depth(source: Path, photo_rgb: Rgb, settings: DepthSettings | None = None) -> DepthMap:
@@ -241,9 +250,22 @@ def open_depth(source: Path, photo_rgb: Rgb, settings: DepthSettings | None = No
         raise InputError(f"--stereo-cameras is for a file of disparity ({', '.join(_ARRAYS)}), got {source}: leave it out")
     depth, is_soft = _read(source, photo_rgb, settings)
     _require_same_aspect(source, depth, photo_rgb)
-    filled = with_holes_filled(depth)
-    refine = is_soft if settings.refined is None else settings.refined
-    return at_size_of(filled, photo_rgb, refine)
+    smaller = depth.depth_m.shape[1] < _SMALLER * photo_rgb.shape[1]
+    refine = is_soft and smaller if settings.refined is None else settings.refined
+    if settings.exact:
+        return at_size_of(with_holes_filled(depth), photo_rgb, refine)
+    if refine and smaller:
+        return at_size_of(_mended(depth, photo_rgb), photo_rgb, refine)
+    return _mended(at_size_of(depth, photo_rgb, False), photo_rgb)
+
+
+def _mended(depth: DepthMap, photo_rgb: Rgb) -> DepthMap:
+    """Return the map mended by the photograph, which is made as small for it."""
+    import cv2
+
+    size = depth.depth_m.shape[::-1]
+    seen_rgb = photo_rgb if photo_rgb.shape[1::-1] == size else cv2.resize(photo_rgb, size, interpolation=cv2.INTER_AREA)
+    return replace(depth, depth_m=mended_aloud(_holed(depth), seen_rgb))
 
 
 def _read(source: Path, photo_rgb: Rgb, settings: DepthSettings) -> tuple[DepthMap, bool]:
@@ -252,8 +274,9 @@ def _read(source: Path, photo_rgb: Rgb, settings: DepthSettings) -> tuple[DepthM
     if suffix == ".onnx":
         return network_depth(source, photo_rgb, settings), True
     if suffix == ".exr":
-        depth_m = read_depth(source)
-        return DepthMap(depth_m, np.ones(depth_m.shape, bool), source.name), False
+        depth_m = read_depth(source, with_holes=not settings.exact)
+        known = ~np.isnan(depth_m)
+        return DepthMap(np.where(known, depth_m, np.float32(np.inf)), known, source.name), False
     if suffix in _ARRAYS:
         return read_stereo(source, settings), False
     phone = read_phone_photo(source, settings.near_far_m)

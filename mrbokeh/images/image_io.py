@@ -142,18 +142,21 @@ def read_linear(path: Path | str, instead: str = "develop the RAW file to EXR fi
     return rgb
 
 
-def read_depth(path: Path | str) -> Float32[np.ndarray, "height width"]:
-    """Read depth in metres along the optical axis from an EXR with Z, depth.Z or Y; inf and values not above 0 are background (inf)."""
+def read_depth(path: Path | str, *, with_holes: bool = False) -> Float32[np.ndarray, "height width"]:
+    """Read depth in metres along the optical axis from an EXR with Z, depth.Z or Y; inf and values not above 0 are background (inf).
+
+    with_holes: NaN stays, as a hole; else it is refused.
+    """
     channels = {name: pixels for part in reversed(read_exr(path)) for name, pixels in part.channels.items()}
     name = next((name for name in _LONE_DEPTH_NAMES if name in channels), None)
     if name is None:
         raise InputError(f"{path}: expected depth in a channel {', '.join(_LONE_DEPTH_NAMES)}, but it has {', '.join(sorted(channels))}")
     depth_m = channels[name].astype(np.float32)
-    if np.isnan(depth_m).any():
+    if np.isnan(depth_m).any() and not (with_holes and (depth_m > 0).any()):
         raise InputError(f"{path}: {int(np.isnan(depth_m).sum())} pixels of {name} are NaN: write inf (or 0) where there is background")
     if not (depth_m > 0).any():
         raise InputError(f"{path}: expected metres above 0 in {name}, but the largest is {depth_m.max():g}: is it depth along the axis?")
-    return np.where(depth_m > 0, depth_m, np.float32(np.inf))
+    return np.where((depth_m > 0) | np.isnan(depth_m), depth_m, np.float32(np.inf))
 
 
 LARGEST_ALPHA_ERROR = 0.1

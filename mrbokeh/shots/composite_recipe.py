@@ -15,6 +15,7 @@ from jaxtyping import Float32
 from mrbokeh.compositing.choose import DEFAULT_MODE, InDirtyRectangle, dirty_rectangle, insertion_of
 from mrbokeh.compositing.over import OverPhotograph, behind, covered_by, occlusion_matte
 from mrbokeh.compositing.plate import Inserted, Insertion, Plate, plate_of, same_size
+from mrbokeh.depth.mended_depth import mended
 from mrbokeh.images.alpha_io import coverage_with
 from mrbokeh.images.layer import Layer, clear, flatten
 from mrbokeh.layering.pixel_box import NOWHERE, Box, is_same_everywhere
@@ -25,6 +26,7 @@ from mrbokeh.renderers.choose import BY_NAME, DEFAULT, files_of, lens_and_render
 from mrbokeh.shots.inputs import CameraSource, DepthSource, Description, Finisher, FocusSource, Kept, LayerSource, MatteSource, Moment
 from mrbokeh.shots.shot import Picture, Rgba
 from mrbokeh.stacks.photograph import SensorOrientation, lens_for_orientation
+from mrbokeh.system.channel import say
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -131,6 +133,7 @@ class CompositeRecipe:
     camera: Description[CameraSource] | None = None
     focus: Description[FocusSource] | None = None
     depth: Description[DepthSource] | None = None
+    exact_depth: bool = False
     matte: Description[MatteSource] | None = None
     near_m: float | None = None
     look: Description[Finisher] | None = None
@@ -159,7 +162,7 @@ class CompositeMaker:
     """A FrameMaker. What did not change since the last frame is not made again: reading, rendering, cutting, blur."""
 
     def __init__(self, recipe: CompositeRecipe, threads: int) -> None:
-        lens = recipe.stated_lens
+        lens, self._told = recipe.stated_lens, False
         self._recipe, self._lens = recipe, lens if recipe.holding is None else lens_for_orientation(lens, recipe.holding)
         self._sources = [each.opened(threads) for each in recipe.layers]
         self._camera = None if recipe.camera is None else recipe.camera.opened(threads)
@@ -169,7 +172,7 @@ class CompositeMaker:
         self._finisher = None if recipe.look is None else recipe.look.opened(threads)
         _, renderer = lens_and_renderer(recipe.lens, recipe.renderer, threads=threads)
         is_local = (recipe.renderer or DEFAULT) in _LOCAL and not spreads_light(recipe.lens)
-        self._boxed = BoxedInsertion(insertion_of(recipe.mode, recipe.near_m), renderer, local=is_local)
+        self._boxed = BoxedInsertion(insertion_of(recipe.mode, recipe.near_m, exact_depth=recipe.exact_depth), renderer, local=is_local)
 
     def make(self, index: int, rgb: Rgb, time_s: float, alpha: Plane | None = None) -> Picture:
         height, width = rgb.shape[:2]
@@ -190,10 +193,19 @@ class CompositeMaker:
         return [layer for source in self._sources for layer in source.layers_at(moment, self._camera)]
 
     def _plate(self, moment: Moment, rgb: Rgb, camera: Camera | None) -> Plate:
-        depth_m = None if self._depth is None else self._depth.depth_m_at(moment)
+        depth_m = None if self._depth is None else self._mended(self._depth.depth_m_at(moment), rgb)
         lens = self._lens_at(moment.number)
         plate = plate_of(rgb, lens, depth_m) if camera is None else Plate(rgb, depth_m, lens, camera)
         return plate if self._matte is None else replace(plate, near_alpha=self._matte.near_alpha_at(moment))
+
+    def _mended(self, depth_m: Plane, rgb: Rgb) -> Plane:
+        if self._recipe.exact_depth:
+            return depth_m
+        found = mended(depth_m, rgb)
+        if found.told and not self._told:
+            say(f"depth is mended by the picture, as in the first frame: {found.told} (--exact-depth leaves it as it is)", err=True)
+        self._told = self._told or bool(found.told)
+        return found.depth_m
 
     def _lens_at(self, number: int) -> Lens:
         """The very same lens as long as the focus stays."""

@@ -94,16 +94,17 @@ class DepthFiles:
 
     steady: numbered depth goes through a temporal filter. It looks at 48 frames before the first one asked for, so that
     a segment begins as if the one before had gone through it too; the clip itself begins with a filter that has settled.
-    near_far_m: metres of the largest and the smallest number of pictures that are even in 1/distance.
+    near_far_m: metres of the largest and the smallest number of pictures that are even in 1/distance. with_holes: NaN is unknown depth.
     """
 
     path: Path
     steady: bool = False
     near_far_m: tuple[float, float] | None = None
+    with_holes: bool = False
 
     def read(self, name: str | Path) -> Plane:
         """Read one file of depth."""
-        return depth_of_file(Path(name), self.near_far_m)
+        return depth_of_file(Path(name), self.near_far_m, with_holes=self.with_holes)
 
     @property
     def files(self) -> tuple[Path, ...]:
