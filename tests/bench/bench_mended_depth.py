@@ -10,6 +10,7 @@ import argparse
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -78,11 +79,12 @@ def main() -> None:
             for group, planes in ((case.group, ways), (f"{case.group}, without lamps", [np.where(lamps, exact_m, each) for each in ways])):
                 blurred = [RENDERER.render([opaque(rgb, each)], case.lens).rgb for each in planes]
                 found[f"render, {group}", kind].append((psnr(blurred[0], case.truth), psnr(blurred[1], case.truth)))
-    for case in traced_cases(folders.mixed):
+    for mixed in traced_cases(folders.mixed):
+        assert mixed.plate.depth_m is not None and mixed.plate.sharp_rgb is not None
         for kind, damage in DAMAGE.items():
-            plates = [replace(case.plate, depth_m=each) for each in both_ways(damage(case.plate.depth_m), case.plate.sharp_rgb)]
-            put_in = [insertion_of("between").insert(plate, [case.virtual], RENDERER).rgb for plate in plates]
-            found["between", kind].append((psnr(put_in[0], case.truth), psnr(put_in[1], case.truth)))
+            plates = [replace(mixed.plate, depth_m=each) for each in both_ways(damage(mixed.plate.depth_m), mixed.plate.sharp_rgb)]
+            put_in = [insertion_of("between").insert(plate, [mixed.virtual], RENDERER).rgb for plate in plates]
+            found["between", kind].append((psnr(put_in[0], mixed.truth), psnr(put_in[1], mixed.truth)))
     print_table({key: np.mean(values, axis=0) for key, values in found.items()})
     print_times(folders.truth)
     tell()
@@ -104,7 +106,7 @@ def print_times(truth: Path) -> None:
     rgb = np.tile(case.picture.rgb, (down, across, 1))[:800, :1250].copy()
     for kind, damage in DAMAGE.items():
         depth_m = damage(np.tile(case.picture.depth_m, (down, across))[:800, :1250])
-        print(f"a megapixel, {kind}: {in_turns(lambda depth_m=depth_m: mended(depth_m, rgb), repeats=3)[0].wall_ms / 1e3:.2f} s")
+        print(f"a megapixel, {kind}: {in_turns(partial(mended, depth_m, rgb), repeats=3)[0].wall_ms / 1e3:.2f} s")
 
 
 if __name__ == "__main__":

@@ -1,5 +1,7 @@
 """Depth mended by the picture: what is exact stays, what is not goes where the picture has it."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, grey_dilation, grey_erosion
@@ -86,7 +88,7 @@ def test_a_thin_wire_is_kept_and_as_near_as_it_was() -> None:
 
 
 @pytest.mark.parametrize("damage", [grey_erosion, grey_dilation])
-def test_edges_a_pixel_off_are_moved_to_those_of_the_picture(damage) -> None:
+def test_edges_a_pixel_off_are_moved_to_those_of_the_picture(damage: Callable[..., np.ndarray]) -> None:
     near = block()
     depth_m, rgb = board(near)
     off_m = damage(depth_m, (3, 3))
