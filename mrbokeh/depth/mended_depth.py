@@ -18,8 +18,9 @@ from mrbokeh.system.channel import say
 LEAST_JUMP = 0.04
 """Least jump between two surfaces, as a share of the map's range."""
 _RANGE = (0.5, 99.5)
-_NEARER = 1.7
-"""How many times nearer than the map's nearest hundredths a thing may have been before it was blurred."""
+_NEARER, _NEARER_LAMP = 1.2, 1.7
+"""How many times nearer than the map's nearest hundredths a surface, or a lamp in the air, may have been before it was blurred. In metres a
+thin thing before what is far loses more: there surfaces may be as near as lamps."""
 _ROUND = 1e-6
 
 
@@ -53,8 +54,8 @@ def mended(depth_m: Plane, photo_rgb: Picture) -> Mended:
     soft = softness(values, jump)
     if soft.sigma_px >= LEAST_SOFT_PX:
         nearest = float(np.percentile(values[::2, ::2], _RANGE[1]))
-        most = nearest * (_NEARER if unit == "dioptres" else 1.0 / _NEARER)
-        values = np.minimum(sharpened(values, guide, jump, soft.sigma_px, most), np.float32(most))
+        most = (nearest * _NEARER, nearest * _NEARER_LAMP) if unit == "dioptres" else (nearest / _NEARER_LAMP,) * 2
+        values = sharpened(values, guide, jump, soft.sigma_px, most)
         done.append(f"edges made hard (soft by {soft.sigma_px:.1f} px)")
     else:
         values, told = moved_by_colour(values, guide, jump)

@@ -72,13 +72,17 @@ def blurred(values: Plane, sigma_px: float) -> Plane:
     return np.asarray(GaussianBlur(values, (0, 0), sigma_px, borderType=BORDER_REPLICATE))
 
 
-def sharpened(values: Plane, guide: Guide, jump: float, sigma_px: float, most: float) -> Plane:
-    """Return a map (values grow with nearness) whose edges are as hard as before it was blurred by sigma. most: no lamp can be nearer."""
+def sharpened(values: Plane, guide: Guide, jump: float, sigma_px: float, most: tuple[float, float]) -> Plane:
+    """Return a map (values grow with nearness) whose edges are as hard as before it was blurred by sigma.
+
+    most: no surface can be nearer than the first, no lamp than the second.
+    """
     sigma_px = min(sigma_px, _MOST_SOFT_PX)
     lamps = _Lamps.of(values, guide, jump, sigma_px)
     if any(each.nearer == 0.0 for each in lamps.each):
         lamps = lamps.looked_at_again(values, _surfaces(lamps.taken_out(values), guide, jump, sigma_px, _ROUNDS[0]))
-    return lamps.put_in(_surfaces(lamps.taken_out(values), guide, jump, sigma_px, _ROUNDS[1]), most)
+    surfaces = np.minimum(_surfaces(lamps.taken_out(values), guide, jump, sigma_px, _ROUNDS[1]), np.float32(most[0]))
+    return lamps.put_in(surfaces, most[1])
 
 
 def _surfaces(soft: Plane, guide: Guide, jump: float, sigma_px: float, rounds: int) -> Plane:
