@@ -66,7 +66,10 @@ class DepthOptions:
     ] = None
     refine: Annotated[
         bool | None,
-        typer.Option("--refine/--no-refine", help="Sharpen soft depth edges along the photograph. Default: where depth is soft."),
+        typer.Option(
+            "--refine/--no-refine",
+            help="Enlarge depth smaller than the photograph along its edges. Default: where that is soft.",
+        ),
     ] = None
 
     exact_depth: ExactDepthOption = False

@@ -181,9 +181,11 @@ def recipe_of(
 
 def _depth(taken: ClipOptions) -> DepthFiles | None:
     near_far_m = near_far_of(taken.disparity, taken.depth)
-    return (
-        None if taken.depth is None else DepthFiles(taken.depth.resolve(), taken.steady_depth, near_far_m, with_holes=not taken.exact_depth)
-    )
+    if taken.depth is None:
+        return None
+    # A filter over time takes numbers only.
+    with_holes = not (taken.exact_depth or taken.steady_depth)
+    return DepthFiles(taken.depth.resolve(), taken.steady_depth, near_far_m, with_holes=with_holes)
 
 
 def _first_depth_m(recipe: CompositeRecipe, source: PictureSource, taken: ClipOptions) -> "np.ndarray | None":

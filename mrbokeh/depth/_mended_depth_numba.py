@@ -1,7 +1,7 @@
 """Compiled loops of mrbokeh.depth.mended_depth: edges of depth made hard, sides told by colour, and what a blur took given back.
 
-All work on rows top to bottom, so that bands of a picture may run side by side; none depends on where a band ends. Values grow with
-nearness, and two that differ by no more than `jump` belong to one surface.
+All but `flow` work on rows top to bottom, so that bands of a picture may run side by side; none depends on where a band ends. Values grow
+with nearness, and two that differ by no more than `jump` belong to one surface.
 """
 
 import math

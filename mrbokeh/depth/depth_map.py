@@ -86,8 +86,8 @@ Mask = Bool[np.ndarray, "height width"]
 class DepthMap:
     """Depth of a photograph, pixel by pixel.
 
-    depth_m: (H, W) along the optical axis, above 0, inf is background. valid: (H, W) where it was measured; elsewhere it is the
-    depth of the nearest place where it was. note: where it comes from, for people.
+    depth_m: (H, W) along the optical axis, above 0, inf is background. valid: (H, W) where it was measured; elsewhere it was
+    filled in, or is the depth of the nearest place where it was. note: where it comes from, for people.
     """
 
     depth_m: Plane

@@ -75,8 +75,8 @@ def _ramps(depth_m: Plane) -> tuple[Plane, str]:
     if not np.isfinite(depth_m).all():
         return dioptres, "dioptres"
     metres = -depth_m
-    skewed = [softness(each, _jump(each)) for each in (dioptres, metres)]
-    return (metres, "metres") if skewed[1].skewed < skewed[0].skewed else (dioptres, "dioptres")
+    skewed = [softness(each, _jump(each)).skewed for each in (dioptres, metres)]
+    return (metres, "metres") if skewed[1] < skewed[0] < np.inf else (dioptres, "dioptres")
 
 
 def _metres(values: Plane, unit: str) -> Plane:

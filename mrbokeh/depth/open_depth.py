@@ -251,7 +251,7 @@ def open_depth(source: Path, photo_rgb: Rgb, settings: DepthSettings | None = No
     depth, is_soft = _read(source, photo_rgb, settings)
     _require_same_aspect(source, depth, photo_rgb)
     smaller = depth.depth_m.shape[1] < _SMALLER * photo_rgb.shape[1]
-    refine = is_soft and smaller if settings.refined is None else settings.refined
+    refine = is_soft and smaller and not settings.exact if settings.refined is None else settings.refined
     if settings.exact:
         return at_size_of(with_holes_filled(depth), photo_rgb, refine)
     if refine and smaller:

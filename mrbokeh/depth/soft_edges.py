@@ -26,7 +26,10 @@ _SETTLE_PX, _SETTLE_JUMPS = 7, 3.0
 
 @dataclass(frozen=True)
 class Softness:
-    """How soft edges are: the standard deviation of the blur in pixels, and how far the middle of ramps lies from half of the jump."""
+    """How soft edges are: the standard deviation of the blur in pixels, and how far the middle of ramps lies from half of the jump.
+
+    0 and inf where there are too few to tell.
+    """
 
     sigma_px: float
     skewed: float
@@ -52,7 +55,7 @@ def softness(values: Plane, jump: float) -> Softness:
     even &= np.maximum(_at(steep, *ends[0]), _at(steep, *ends[1])) < _LEVEL * steepest
     even |= np.count_nonzero(even) < _LEAST_CRESTS
     if np.count_nonzero(even) < _LEAST_CRESTS:
-        return Softness(0.0, 0.0)
+        return Softness(0.0, np.inf)
     blurred_px = float(np.median((height / (steepest * np.sqrt(2.0 * np.pi)))[even]))
     # A difference of neighbours is a mean over a pixel, whose own variance is 1/12.
     sigma_px = float(np.sqrt(max(blurred_px * blurred_px - 1.0 / 12.0, 0.0)))
@@ -75,13 +78,14 @@ def blurred(values: Plane, sigma_px: float) -> Plane:
 def sharpened(values: Plane, guide: Guide, jump: float, sigma_px: float, most: tuple[float, float]) -> Plane:
     """Return a map (values grow with nearness) whose edges are as hard as before it was blurred by sigma.
 
-    most: no surface can be nearer than the first, no lamp than the second.
+    most: no surface can be nearer than the first, unless the map itself is there, and no lamp nearer than the second.
     """
     sigma_px = min(sigma_px, _MOST_SOFT_PX)
     lamps = _Lamps.of(values, guide, jump, sigma_px)
     if any(each.nearer == 0.0 for each in lamps.each):
         lamps = lamps.looked_at_again(values, _surfaces(lamps.taken_out(values), guide, jump, sigma_px, _ROUNDS[0]))
-    surfaces = np.minimum(_surfaces(lamps.taken_out(values), guide, jump, sigma_px, _ROUNDS[1]), np.float32(most[0]))
+    held = highest(values, 2 * round(_TAPS * sigma_px) + 1)
+    surfaces = np.minimum(_surfaces(lamps.taken_out(values), guide, jump, sigma_px, _ROUNDS[1]), np.maximum(np.float32(most[0]), held))
     return lamps.put_in(surfaces, most[1])
 
 

@@ -67,9 +67,12 @@ def both_ways(depth_m: Plane, rgb: np.ndarray) -> tuple[Plane, Plane]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("truth", type=Path)
-    parser.add_argument("mixed", type=Path)
+    parser.add_argument("truth", type=Path, nargs="?")
+    parser.add_argument("mixed", type=Path, nargs="?")
     folders = parser.parse_args()
+    if folders.mixed is None:
+        print("not measured: it needs two folders of traced pictures, TRUTH and MIXED")
+        return
     found: dict[tuple[str, str], list[tuple[float, float]]] = defaultdict(list)
     for case in truth_cases(folders.truth):
         rgb, exact_m = case.picture.rgb, case.picture.depth_m

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter, grey_dilation, grey_erosion
 
+import mrbokeh
 from mrbokeh.depth.edge_votes import Guide
 from mrbokeh.depth.mended_depth import filled, mended
 from mrbokeh.depth.soft_edges import softness
+from mrbokeh.system.errors import InputError
 
 NEAR_M, FAR_M = np.float32(1.0), np.float32(4.0)
 GREEN, RED = (0.1, 0.5, 0.2), (0.5, 0.15, 0.1)
@@ -45,6 +47,20 @@ def test_exact_depth_stays_to_the_bit() -> None:
     found = mended(depth_m, rgb)
     assert found.told == ""
     assert np.array_equal(found.depth_m, depth_m)
+
+
+@pytest.mark.parametrize("far_m", [FAR_M, np.float32(np.inf)])
+def test_a_small_thing_alone_in_front_stays_near(far_m: np.float32) -> None:
+    """It is less than a hundredth of the picture: what is usual there says nothing of it. Open sky lies behind, or a wall."""
+    near = np.zeros(SIZE, bool)
+    near[40:47, 50:57] = True
+    depth_m, rgb = board(near)
+    dioptres = np.where(near, 1.0 / NEAR_M, 1.0 / far_m)
+    soft = gaussian_filter(dioptres, 1.5).astype(np.float32)
+    depth_m = np.full(SIZE, np.inf, np.float32)
+    np.divide(np.float32(1.0), soft, out=depth_m, where=soft > 1e-4)
+    found = mended(depth_m, rgb)
+    assert found.depth_m[43, 53] <= depth_m[43, 53] * 1.01
 
 
 def test_a_slanted_surface_stays_to_the_bit() -> None:
@@ -144,3 +160,18 @@ def test_a_lamp_in_the_air_that_a_blur_has_swallowed_hangs_there_again() -> None
 def test_depth_that_holds_nothing_is_background() -> None:
     _, rgb = board(block())
     assert np.isinf(mended(np.full(SIZE, np.nan, np.float32), rgb).depth_m).all()
+
+
+def test_exact_depth_is_left_as_it_is_when_asked() -> None:
+    """In Python; NaN is a hole by default and a mistake in depth that is exact."""
+    depth_m, rgb = board(block())
+    soft_m, lens = blurred(depth_m, 2.0), {"lens": mrbokeh.Lens(focal_length_mm=50.0, f_number=1.4), "focus": 4.0}
+    by_default, as_it_is, exact = (
+        mrbokeh.render(rgb, each, exact_depth=is_exact, **lens) for each, is_exact in ((soft_m, False), (soft_m, True), (depth_m, True))
+    )
+    off = [float(np.square(each - exact).mean()) for each in (by_default, as_it_is)]
+    assert off[0] < 0.5 * off[1]
+    soft_m[10:14, 10:14] = np.nan
+    assert np.isfinite(mrbokeh.render(rgb, soft_m, **lens)).all()
+    with pytest.raises(InputError, match="NaN"):
+        mrbokeh.render(rgb, soft_m, exact_depth=True, **lens)

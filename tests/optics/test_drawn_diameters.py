@@ -124,13 +124,13 @@ def test_every_renderer_blurs_a_picture_of_pixels_as_the_lens_does(name: str, mo
 def test_a_kept_table_is_the_one_that_was_made_and_a_damaged_one_is_made_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(compiled, "folder_of", lambda _file, _module: tmp_path)
     apertures = (Aperture.disc(), Aperture.blades(6), Aperture.blades(7))
-    made = [drawn_diameters._table.__wrapped__(each) for each in apertures]
+    made = [drawn_diameters.drawn_table.__wrapped__(each) for each in apertures]
     assert len(list(tmp_path.iterdir())) == len(apertures), "one for each opening"
     monkeypatch.setattr(drawn_diameters, "_made_table", None)
     for each, table in zip(apertures, made, strict=True):
-        np.testing.assert_array_equal(drawn_diameters._table.__wrapped__(each), table)
+        np.testing.assert_array_equal(drawn_diameters.drawn_table.__wrapped__(each), table)
     monkeypatch.undo()
     monkeypatch.setattr(compiled, "folder_of", lambda _file, _module: tmp_path)
     for path in tmp_path.iterdir():
         path.write_bytes(b"x")
-    np.testing.assert_array_equal(drawn_diameters._table.__wrapped__(apertures[0]), made[0])
+    np.testing.assert_array_equal(drawn_diameters.drawn_table.__wrapped__(apertures[0]), made[0])

@@ -124,7 +124,8 @@ def without_kernels(monkeypatch: pytest.MonkeyPatch) -> Any:
     return found
 
 
-def test_slices_on_a_device_are_put_together_as_the_compiled_ones(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("is_behind", [False, True], ids=["both sides of the focus", "all behind it"])
+def test_slices_on_a_device_are_put_together_as_the_compiled_ones(monkeypatch: pytest.MonkeyPatch, is_behind: bool) -> None:
     """Order of slices, what hides across the focus, windows and claims; plain twins stand for all kernels, so that no GPU is needed."""
     cutting = without_kernels(monkeypatch)
 
@@ -134,10 +135,25 @@ def test_slices_on_a_device_are_put_together_as_the_compiled_ones(monkeypatch: p
 
     monkeypatch.setattr(cutting, "split_edges", split)
     rgb, depth_m, lens = post()
+    lens = lens.focused_at(float(depth_m.min()) * 0.9) if is_behind else lens
     known = PolygonDifferences(layering=Layering(slices=6), precision="double").render([opaque(rgb, depth_m)], lens).rgb
     coc_px = np.asarray(lens.coc_px(depth_m, rgb.shape[1]), np.float32)
     found = TorchPolygons("cpu", precision="double").render(torch.from_numpy(rgb), torch.from_numpy(coc_px), OCTAGON, 6)
     np.testing.assert_allclose(found[..., :3].numpy(), known, atol=DOUBLE)
+
+
+def test_a_picture_without_depth_somewhere_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    without_kernels(monkeypatch)
+    rgb, depth_m, lens = post()
+    coc_px = np.asarray(lens.coc_px(depth_m, rgb.shape[1]), np.float32)
+    coc_px[4, 4] = np.nan
+    with pytest.raises(InputError, match="finite circle of confusion"):
+        TorchPolygons("cpu").render(torch.from_numpy(rgb), torch.from_numpy(coc_px), OCTAGON, 6)
+
+
+def test_small_kernels_that_reach_too_far_are_refused() -> None:
+    with pytest.raises(InputError, match="exact_below_px"):
+        TorchPolygons(NAME, exact_below_px=40.0).sum_kernels(here(texture()), here(slope_px(5.0, 20.0)), OCTAGON)
 
 
 def test_a_slice_by_itself_is_what_it_is_among_others() -> None:

@@ -130,7 +130,7 @@ def seeds_behind(coc_px: Plane, lit: Mask, step_px: float, rim_px: int, farthest
 
 
 def _leaps(farthest_px: int) -> list[int]:
-    """Return distances at which pixels look for seeds, one after the other: from half the farthest down to a step, and that twice more."""
+    """Return distances at which pixels look for seeds, one after the other: powers of two down to a step, and that twice more."""
     return [*(1 << k for k in reversed(range(max(farthest_px, 1).bit_length()))), 1, 1]
 
 

@@ -92,7 +92,7 @@ def cut(rgb: Float32[Tensor, "height width 3"], coc_px: Plane, margin_px: int, l
     known = (behind.values[..., 3] > 0.0).float()
     shares = torch.stack([torch.ones_like(shown), crossing, shown * known, (1.0 - shown - crossing).clamp(min=0.0) * known])
     circles = torch.stack([front.coc_px, behind.coc_px])
-    nearest, farthest = torch.stack(layer.coc_px.aminmax()).tolist()
+    nearest, farthest = (end(each, 0.0) for end, each in zip((min, max), torch.stack(layer.coc_px.aminmax()).tolist(), strict=True))
     step_px = max((farthest - nearest) / slices, LEAST_STEP_PX)
     first = math.floor(nearest / step_px + 0.5) - 1
     boxes = extents(circles, shares, first, math.floor(farthest / step_px + 0.5) + 2 - first, step_px).tolist()

@@ -310,7 +310,8 @@ class PolygonDifferences:
         from mrbokeh.renderers.bank.lattice import BankLattice
         from mrbokeh.renderers.bank.renderers import by_polygons
 
-        return by_polygons(self.bank, self.apertures or fit_apertures(BankLattice(self.bank)), self.sum_kernels, self.tables_of)
+        prepare = self.tables_of if self._by_torch is None else self._by_torch.tables_of
+        return by_polygons(self.bank, self.apertures or fit_apertures(BankLattice(self.bank)), self.sum_kernels, prepare)
 
     def sum_kernels(
         self, values: Float32[np.ndarray, "height width channels"], coc_px: Float32[np.ndarray, "height width"], aperture: Aperture

@@ -84,8 +84,7 @@ class TorchPolygons:
         _require_finite(largest_px)
         if largest_px <= 1.0:
             return values.clone()
-        lowest = tuple(-math.inf if each > 0.0 else 0.0 for each in below)
-        light, _ = self._summed(Slices.single(values, coc_px, largest_px), aperture, most, lowest, is_suspect > 0.0)
+        light, _ = self._summed(Slices.single(values, coc_px, largest_px), aperture, most, _lowest(below), is_suspect > 0.0)
         return light.reshape(values.shape)
 
     def render(self, rgb: Float32[Tensor, "height width 3"], coc_px: Plane, aperture: Aperture, slices: int = 16) -> Picture:
@@ -96,10 +95,10 @@ class TorchPolygons:
         from mrbokeh.layering.torch_layering.cutting import cut, put_together
 
         drawn_px = self._drawn_px(coc_px, aperture)
-        most, largest_px, is_suspect, *_ = self._loops.survey(torch.cat([rgb, torch.ones_like(rgb[..., :1])], dim=2), drawn_px).tolist()
+        most, largest_px, is_suspect, *below = self._loops.survey(torch.cat([rgb, torch.ones_like(rgb[..., :1])], dim=2), drawn_px).tolist()
         _require_finite(largest_px)
         layers = cut(rgb, drawn_px, reach_px(aperture, largest_px), largest_px, slices)
-        light, batch = self._summed(layers, aperture, most, (-math.inf,) * 4, is_suspect > 0.0)
+        light, batch = self._summed(layers, aperture, most, _lowest(below), is_suspect > 0.0)
         return put_together(light, batch.places, batch.starts, layers.frame)
 
     def takes(self, layers: Sequence[Layer], lens: Lens, layering: Layering) -> bool:
@@ -134,7 +133,7 @@ class TorchPolygons:
         last = len(table) - 1
         size = coc_px.abs()
         at = (size * STEPS_PER_PX).clamp(max=last)
-        lower = at.long().clamp(max=last - 1)
+        lower = torch.nan_to_num(at).long().clamp(0, last - 1)
         near = table[lower] + (at - lower) * (table[lower + 1] - table[lower])
         wide = torch.sqrt((size * size - (last / STEPS_PER_PX) ** 2 + table[last] ** 2).clamp(min=0.0))
         return torch.where(size * STEPS_PER_PX < last, near, wide).copysign(coc_px)
@@ -150,7 +149,8 @@ class TorchPolygons:
             shares = shares_of_highlights(front, circles, exact.from_px)
         if shares is not None:
             kept = 1.0 - shares
-            most = float((front.abs().amax(dim=2) * summed_shares(circles, tables) * kept).amax())
+            rest = front.abs().amax(dim=2) * summed_shares(circles, tables) * kept
+            most = max(float(each.abs().amax()) for each in (rest, *slices.values[1:]))
         light, batch = self._loops.sum_slices(slices, kept, tables, most, self._sent_numbers(lowest), self._whole)
         if shares is not None:
             stamp(light, batch, summed_shares(circles, tables) * shares, aperture)
@@ -180,6 +180,11 @@ class TorchPolygons:
         from mrbokeh.renderers.polygon.torch_polygon import _triton
 
         return _triton
+
+
+def _lowest(below: list[float]) -> tuple[float, ...]:
+    """Return below what no channel of the result falls: 0 where no light is negative."""
+    return tuple(-math.inf if each > 0.0 else 0.0 for each in below)
 
 
 def _require_finite(largest_px: float) -> None:

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mrbokeh.layering.torch_layering.slicing import Slices
 from mrbokeh.renderers.polygon.torch_polygon._corners import DeviceTables
+from mrbokeh.system.errors import InputError
 
 _BITS = {torch.int32: 31, torch.int64: 62}
 
@@ -47,6 +48,11 @@ class Batch:
             least_px, largest_px = slices.range_px(each.number)
             margin, is_summed = tables.tables.margin_px(largest_px), largest_px > exact.from_px
             window = each.box.within(slices.frame.grown(margin)).grown(margin)
+            if 4 * window.rows * window.columns * max(tables.planes, len(tables.sums)) >= 1 << 31:
+                raise InputError(
+                    f"a picture of {slices.frame.columns}x{slices.frame.rows} px with circles of confusion of up to {largest_px:.0f} px is "
+                    f"too large for the device: leave the device out, or render it smaller"
+                )
             seen = window.within(slices.frame)
             unit = max(most, 1e-30) * tables.bound(least_px, largest_px) * tables.unit
             scale = 2.0 ** math.floor(_BITS[whole] - math.log2(unit))

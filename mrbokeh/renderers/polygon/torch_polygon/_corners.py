@@ -13,7 +13,10 @@ from torch import Tensor
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.polygon.directional_differences import edge_profile
 from mrbokeh.renderers.polygon.tables import ApertureTables, small_kernels
+from mrbokeh.system.errors import InputError
 
+REACH_PX = 16
+"""How far small kernels reach at most."""
 _FINEST_PROFILE = 64
 """Largest denominator that a profile of few steps has."""
 _LATTICE = 1.25
@@ -51,6 +54,11 @@ class DeviceTables:
 
     @classmethod
     def of(cls, tables: ApertureTables, aperture: Aperture, device: torch.device) -> "DeviceTables":
+        if tables.exact.radius > REACH_PX:
+            raise InputError(
+                f"on a device kernels are splatted whole up to {REACH_PX} px around, but exact_below_px {tables.exact.from_px:g} asks for "
+                f"{tables.exact.radius}: lower it, or leave the device out"
+            )
         corners, crossed = tables.corners, tables.crossed
         edges = np.stack([corners.slope, corners.shift, corners.origin, corners.curvature], axis=1)
         steps = crossed.steps * np.where(crossed.turned, -1, 1)[..., None]

@@ -56,6 +56,8 @@ def stamp(light: Float32[Tensor, "pixels 4"], batch: Batch, shares: Plane, apert
     coc_px, values = slices.coc_px[0][y, x], slices.values[0][y, x] * (shares * slices.shares[0])[y, x][:, None]
     pieces = slices.order[0][torch.floor(coc_px / slices.step_px + 0.5).long() - slices.first]
     for (row, column), diameter, value, piece in zip(at.tolist(), coc_px.tolist(), values, pieces.tolist(), strict=True):
+        if piece < 0:
+            continue  # on the border of two slices, by rounding
         kernel = torch.from_numpy(aperture.rasterize(diameter).kernel).to(light)
         reach, seen = kernel.shape[0] // 2, Box(*batch.host[piece][6:10])
         box = Box(row - reach, column - reach, *kernel.shape).within(seen)

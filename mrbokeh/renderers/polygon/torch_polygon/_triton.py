@@ -15,7 +15,7 @@ from torch import Tensor
 from mrbokeh.layering.torch_layering.slicing import Slices
 from mrbokeh.renderers.polygon._survey_numba import HIGHLIGHT
 from mrbokeh.renderers.polygon.torch_polygon._batch import Batch, Group
-from mrbokeh.renderers.polygon.torch_polygon._corners import DeviceTables
+from mrbokeh.renderers.polygon.torch_polygon._corners import REACH_PX, DeviceTables
 
 Picture = Float32[Tensor, "height width 4"]
 Plane = Float32[Tensor, "height width"]
@@ -26,7 +26,7 @@ _CHAIN_STEPS, _CHAIN_NUMBERS = 16, 64
 _COLUMN_ROWS, _COLUMN_STEPS, _COLUMN_NUMBERS = 64, 8, 64
 """Rows of a chunk, and what a program of one warp loads at a time."""
 _ROW_CELLS = 64
-_TILE = 16, 16
+_TILE = REACH_PX, REACH_PX
 """Rows and columns of the places that one program gathers; small kernels reach no farther than one tile."""
 
 
