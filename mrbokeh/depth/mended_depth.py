@@ -70,13 +70,16 @@ def _jump(values: Plane) -> float:
 
 
 def _ramps(depth_m: Plane) -> tuple[Plane, str]:
-    """Return values that grow with nearness in the unit in which edges are even ramps: dioptres, or metres below 0."""
+    """Return values that grow with nearness in the unit in which edges are even ramps: dioptres, or metres below 0.
+
+    A surface that has no edges in one of them, slanted evenly, is taken in that, so that it stays.
+    """
     dioptres = np.where(np.isfinite(depth_m), 1.0 / depth_m, 0.0).astype(np.float32)
     if not np.isfinite(depth_m).all():
         return dioptres, "dioptres"
     metres = -depth_m
     skewed = [softness(each, _jump(each)).skewed for each in (dioptres, metres)]
-    return (metres, "metres") if skewed[1] < skewed[0] < np.inf else (dioptres, "dioptres")
+    return (metres, "metres") if skewed[1] < skewed[0] else (dioptres, "dioptres")
 
 
 def _metres(values: Plane, unit: str) -> Plane:

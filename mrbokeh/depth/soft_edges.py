@@ -28,7 +28,7 @@ _SETTLE_PX, _SETTLE_JUMPS = 7, 3.0
 class Softness:
     """How soft edges are: the standard deviation of the blur in pixels, and how far the middle of ramps lies from half of the jump.
 
-    0 and inf where there are too few to tell.
+    Both 0 where there are too few to tell.
     """
 
     sigma_px: float
@@ -55,7 +55,7 @@ def softness(values: Plane, jump: float) -> Softness:
     even &= np.maximum(_at(steep, *ends[0]), _at(steep, *ends[1])) < _LEVEL * steepest
     even |= np.count_nonzero(even) < _LEAST_CRESTS
     if np.count_nonzero(even) < _LEAST_CRESTS:
-        return Softness(0.0, np.inf)
+        return Softness(0.0, 0.0)
     blurred_px = float(np.median((height / (steepest * np.sqrt(2.0 * np.pi)))[even]))
     # A difference of neighbours is a mean over a pixel, whose own variance is 1/12.
     sigma_px = float(np.sqrt(max(blurred_px * blurred_px - 1.0 / 12.0, 0.0)))

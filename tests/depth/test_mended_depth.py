@@ -63,9 +63,10 @@ def test_a_small_thing_alone_in_front_stays_near(far_m: np.float32) -> None:
     assert found.depth_m[43, 53] <= depth_m[43, 53] * 1.01
 
 
-def test_a_slanted_surface_stays_to_the_bit() -> None:
+@pytest.mark.parametrize("is_even_in_metres", [False, True])
+def test_a_slanted_surface_stays_to_the_bit(is_even_in_metres: bool) -> None:
     rows, _ = np.mgrid[: SIZE[0], : SIZE[1]]
-    depth_m = (1.0 / (0.2 + 0.01 * rows)).astype(np.float32)
+    depth_m = (1.0 + 0.03 * rows if is_even_in_metres else 1.0 / (0.2 + 0.01 * rows)).astype(np.float32)
     _, rgb = board(block())
     assert np.array_equal(mended(depth_m, rgb).depth_m, depth_m)
 
