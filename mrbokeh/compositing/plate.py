@@ -331,7 +331,7 @@ def with_depth(plate: Plate, source: Path, settings: DepthSettings) -> Plate:
 
 
 def with_stereo(
-    plate: Plate, second_rgb: Float32[np.ndarray, "height width 3"], baseline_m: float | None, photos: tuple[Path, Path], *, exact: bool
+    plate: Plate, second_rgb: Float32[np.ndarray, "rows columns 3"], baseline_m: float | None, photos: tuple[Path, Path], *, exact: bool
 ) -> Plate:
     """Return the plate with depth from a second photograph beside it. baseline_m: how far the camera moved; None is guessed, and said.
 

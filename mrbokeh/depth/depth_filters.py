@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from mrbokeh.depth.edge_votes import highest, lowest
 from mrbokeh.system.errors import InputError
 
 Plane = Float32[np.ndarray, "height width"]
@@ -155,13 +156,13 @@ def edge_sides(dioptres: Plane, edge_px: int, least_jump: float) -> EdgeSides:
     pixel wide is one too, and a pixel of the soft rim is not.
     """
     window = 2 * edge_px + 1
-    low, high = _lowest(dioptres, window), _highest(dioptres, window)
+    low, high = lowest(dioptres, window), highest(dioptres, window)
     jump = high - low
-    wide = _highest(dioptres, 3 * window) - _lowest(dioptres, 3 * window)
+    wide = highest(dioptres, 3 * window) - lowest(dioptres, 3 * window)
     at_edge = (jump > least_jump) & (wide < _SLANTED * jump)
     slack = _SETTLED * jump
-    settled_high = (dioptres >= _highest(dioptres, 3) - slack) & (dioptres > high - 0.5 * jump)
-    settled_low = (dioptres <= _lowest(dioptres, 3) + slack) & (dioptres < low + 0.5 * jump)
+    settled_high = (dioptres >= highest(dioptres, 3) - slack) & (dioptres > high - 0.5 * jump)
+    settled_low = (dioptres <= lowest(dioptres, 3) + slack) & (dioptres < low + 0.5 * jump)
     near, has_near = _nearest(dioptres, settled_high & at_edge, 2 * edge_px)
     far, has_far = _nearest(dioptres, settled_low & at_edge, 2 * edge_px)
     return EdgeSides(at_edge & has_near & has_far, near, far)
@@ -175,18 +176,6 @@ def _nearest(values: Plane, known: Mask, reach_px: int) -> tuple[Plane, Mask]:
         return values, known
     distance, (rows, columns) = distance_transform_edt(~known, return_indices=True)
     return values[rows, columns], distance <= reach_px
-
-
-def _lowest(values: Plane, window: int) -> Plane:
-    import cv2
-
-    return cv2.erode(values, np.ones((window, window), np.uint8))
-
-
-def _highest(values: Plane, window: int) -> Plane:
-    import cv2
-
-    return cv2.dilate(values, np.ones((window, window), np.uint8))
 
 
 _MAD_PER_SIGMA = 0.6745

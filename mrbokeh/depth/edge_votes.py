@@ -64,18 +64,21 @@ def by_rows(pixels: int, rows: int, work: Callable[[int, int], object]) -> None:
 
 
 def grown(mask: Mask, by_px: int) -> Mask:
+    """Return a mask that holds all pixels up to so many beside those of the given one, corners included."""
     from cv2 import dilate
 
     return np.asarray(dilate(mask.astype(np.uint8), np.ones((2 * by_px + 1,) * 2, np.uint8)) > 0)
 
 
 def highest(values: Plane, window_px: int) -> Plane:
+    """Return the greatest value of the square window around each pixel."""
     from cv2 import dilate
 
     return np.asarray(dilate(values, np.ones((window_px, window_px), np.uint8)))
 
 
 def lowest(values: Plane, window_px: int) -> Plane:
+    """Return the least value of the square window around each pixel."""
     from cv2 import erode
 
     return np.asarray(erode(values, np.ones((window_px, window_px), np.uint8)))

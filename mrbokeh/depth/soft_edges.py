@@ -70,6 +70,7 @@ def _at(values: Plane, y: Places, x: Places) -> Places:
 
 
 def blurred(values: Plane, sigma_px: float) -> Plane:
+    """Return a map blurred by a Gaussian; it goes on beyond its border."""
     from cv2 import BORDER_REPLICATE, GaussianBlur
 
     return np.asarray(GaussianBlur(values, (0, 0), sigma_px, borderType=BORDER_REPLICATE))

@@ -34,7 +34,9 @@ _SPILL_PX, _MEDIAN_PX, _FILL_PX, _CONTRAST = 6, 5, 40.0, 0.03
 _LEAST_MEASURED, _MOST_WIDER = 0.3, 2.0
 
 
-def stereo_depth(first_rgb: Rgb, second_rgb: Rgb, camera: Camera, baseline_m: float, photos: tuple[Path, Path]) -> DepthMap:
+def stereo_depth(
+    first_rgb: Rgb, second_rgb: Float32[np.ndarray, "rows columns 3"], camera: Camera, baseline_m: float, photos: tuple[Path, Path]
+) -> DepthMap:
     """Return the depth of the first photograph at its size. camera: of both, without pose. baseline_m: how far it moved.
 
     Raises InputError for pictures of differing sizes or scenes, and where the camera did not move sideways.

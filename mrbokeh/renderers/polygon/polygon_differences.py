@@ -285,6 +285,7 @@ class PolygonDifferences:
             raise InputError(f"halve_from_px must be at least 32 px, so that kernels keep their shape, got {self.halve_from_px}")
         if self.precision not in ("auto", "single", "double"):
             raise InputError(f"precision must be auto, single or double, got {self.precision!r}")
+        _ = self._by_torch  # a device that is not there is refused at once
 
     def render(self, layers: Sequence[Layer], lens: Lens) -> Layer:
         if self._by_torch is not None and self.bank is None and self._by_torch.takes(layers, lens, self.layering):
