@@ -82,6 +82,13 @@ async def newest_until(watch: Watcher, true_of: Callable[[Seen], Any]) -> Seen:
     return found[0]
 
 
+async def standing_still_at(watch: Watcher) -> int:
+    """The number of the capture that a source which gives no more leaves on the viewer's screen."""
+    watch.forget()
+    seen = await watch.until(lambda seen: len(seen) > 3 and len({each.sequence for each in seen[-3:]}) == 1)
+    return seen[-1].sequence
+
+
 async def test_the_object_stands_where_it_must_and_the_plate_stays(clip: LiveClip, tmp_path: Path) -> None:
     async with shown(clip, tmp_path) as (_, watch):
         seen = await watch.more(30)
@@ -141,14 +148,16 @@ def _all_saw_the_same(viewers: list[list[Seen]]) -> bool:
 async def test_a_tap_on_the_object_focuses_at_its_depth_and_messages_that_make_no_sense_change_nothing(
     clip: LiveClip, tmp_path: Path
 ) -> None:
-    async with shown(clip, tmp_path) as (one, watch):
-        before = one.moment.frame.sequence
-        x, y = true_centroid_px(clip.camera(before))
+    camera = ClipCamera(clip)
+    async with shown(clip, tmp_path, camera) as (one, watch):
+        # A hand held still: a machine that is kept waiting would take the tap for a later picture, where the card is elsewhere.
+        camera.gives = "nothing"
+        capture = await standing_still_at(watch)
+        x, y = true_centroid_px(clip.camera(capture))
         answer = await one.done({"focus": {"at": [x / WIDTH, y / HEIGHT]}})
-        captures = range(before, one.moment.frame.sequence + 1)
-        # The middle of the card, in one of the captures meanwhile, along the optical axis.
-        depths_m = [float(clip.camera(n).project(card_corners_m())[1].mean()) for n in captures]
-        assert min(depths_m) * 0.98 < answer["focus_distance_m"] < max(depths_m) * 1.02
+        # The middle of the card along the optical axis.
+        assert answer["focus_distance_m"] == pytest.approx(float(clip.camera(capture).project(card_corners_m())[1].mean()), rel=0.02)
+        camera.gives = "board"
         await newest_until(watch, lambda each: each.status["focus_distance_m"] == pytest.approx(answer["focus_distance_m"]))
         # Malformed messages have tests of their own (test_server_stream); these name what is not there, or what the lens cannot do.
         before = await one.state()
@@ -207,7 +216,8 @@ async def test_a_capture_composites_to_what_the_stream_showed(clip: LiveClip, tm
         bundle = read_bundle(tmp_path / name)
         sequence = bundle.facts["sequence"]
         streamed = await watch.until(lambda seen: any(each.sequence == sequence for each in seen))
-    streamed_bgr = next(each for each in streamed if each.sequence == sequence).bgr
+    shown_first = next(each for each in streamed if each.sequence == sequence)
+    streamed_bgr = shown_first.bgr
     plate = bundle_plate(bundle)
     picture = OverPhotograph().insert(plate, bundle.layers, make_renderer(bundle.renderer)).rgb
     codes = 255.0 * code_from_linear(np.clip(picture, 0.0, 1.0), "bt709")[..., ::-1]
@@ -217,7 +227,7 @@ async def test_a_capture_composites_to_what_the_stream_showed(clip: LiveClip, tm
     camera = clip.camera(sequence)
     assert psnr_db(codes, streamed_bgr, ~away_from_card(camera)) > 29.0
     # In its middle it is the same light: the curve of sRGB in place of the clip's would be six codes off.
-    np.testing.assert_allclose(middle_of_card(codes, camera), middle_of_card(streamed_bgr, camera), atol=3.0)
+    np.testing.assert_allclose(middle_of_card(codes, camera), middle_of_card(streamed_bgr, camera), atol=3.0, err_msg=str(shown_first.status))
 
 
 async def test_a_recording_plays_and_shows_the_object(clip: LiveClip, tmp_path: Path) -> None:
@@ -252,9 +262,9 @@ async def test_a_lost_board_fades_the_object_and_a_camera_that_goes_away_says_so
         camera.gives = "nothing"
         assert (await one.state())["failure"] == ClipCamera.AWAY
         # The last picture is shown again and again, for what lies over it may change.
-        still = await watch.until(lambda seen: len(seen) > 3 and len({each.sequence for each in seen[-3:]}) == 1)
+        still = await standing_still_at(watch)
         camera.gives = "board"
-        await newest_until(watch, lambda each: each.sequence > still[-1].sequence and off_px(each, clip) < REGISTERED_PX)
+        await newest_until(watch, lambda each: each.sequence > still and off_px(each, clip) < REGISTERED_PX)
         assert (await one.state())["failure"] is None
         # One that dies ends the pictures.
         camera.gives = "dead"
