@@ -42,7 +42,8 @@ from mrbokeh.compositing.near_and_far import (
     with_told_depth,
 )
 from mrbokeh.compositing.plate import Inserted, Plate, same_size
-from mrbokeh.compositing.pupil_shares import PupilMeans, Rays, pupil_points
+from mrbokeh.compositing.pupil_shares import PupilMeans, Rays
+from mrbokeh.optics.pupil_points import pupil_points
 from mrbokeh.images.layer import Layer, clear, flatten
 from mrbokeh.layering.highlights import find_highlights
 from mrbokeh.renderers.base import Renderer

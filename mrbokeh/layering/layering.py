@@ -29,7 +29,9 @@ import numpy as np
 
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.hidden_background import split_edges
+from mrbokeh.layering.highlights import find_highlights
 from mrbokeh.layering.padded_layers import PaddedLayer, Pixels, coc_px_of, pad_layer
+from mrbokeh.layering.pupil_views import Cut, can_see_through, see_rims
 from mrbokeh.layering.psf_over_field import FIELD_CELLS, AperturePsf, Frame, KernelSum, PsfField
 from mrbokeh.layering.slices import Channels, Slicing, composited
 from mrbokeh.optics.lens import Lens
@@ -47,12 +49,14 @@ class Layering:
     """Settings of how layers are cut and put together.
 
     slices: how many at most over the whole range of circles of confusion. fill: whether an opaque layer is continued
-    behind what is near. field_cells: columns and rows in which the aperture is taken as the same (cat-eyes).
+    behind what is near. field_cells: columns and rows in which the aperture is taken as the same (cat-eyes). sees_rims: whether rims are
+    seen from points of the pupil (mrbokeh.layering.pupil_views).
     """
 
     slices: int = 16
     fill: bool = True
     field_cells: tuple[int, int] = FIELD_CELLS
+    sees_rims: bool = True
 
 
 def render_layers(layers: Sequence[Layer], lens: Lens, kernel_sum: KernelSum | PsfField, layering: Layering) -> Layer:
@@ -69,12 +73,18 @@ def render_layers(layers: Sequence[Layer], lens: Lens, kernel_sum: KernelSum | P
         slicing = Slicing(psf=psf, slices=layering.slices, frame=frame, pool=pool, memory=_KEPT)
         groups = _groups([pad_layer(layer, each, margin, pool) for layer, each in zip(layers, coc_px, strict=True)])
         found: tuple[Channels, Channels] | None = None
+        cuts: list[Cut] = []
         for group in reversed(groups):
+            lit = [find_highlights(layer.values) for layer in group]
             is_filled = layering.fill and group[0].is_opaque
             pixels = _with_hidden(group, pool) if is_filled else [Pixels.covered(layer) for layer in group]
             front = composited(pixels, slicing, by_depth=not group[0].is_opaque)
             front = _shared_out(*front) if any(layer.is_opaque for layer in group) else front
             found = front if found is None else _over(*front, *found)
+            cuts.insert(0, Cut(group, pixels, lit))
+        if layering.sees_rims and layering.fill and isinstance(psf, AperturePsf) and psf.motion is None and can_see_through(psf.aperture):
+            if groups[-1][0].is_opaque:
+                see_rims(found[0], cuts, psf.aperture, frame, pool)
     assert found is not None, "there is a layer"
     return _as_layer(*found, layers)
 

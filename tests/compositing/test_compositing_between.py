@@ -12,7 +12,8 @@ from mrbokeh.compositing.choose import insertion_of
 from mrbokeh.compositing.near_and_far import NO_HIGHLIGHTS, NearAndFar, cut_in_two, nearer_than
 from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.compositing.plate import Plate, plate_of
-from mrbokeh.compositing.pupil_shares import Rays, pupil_points, transmission
+from mrbokeh.compositing.pupil_shares import Rays
+from mrbokeh.optics.pupil_points import pupil_points, transmission
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens

@@ -1,0 +1,234 @@
+"""Rims as the pupil sees them: surfaces looked at from many points of it, and lights cut by what is nearer.
+
+Slices know how much of the pupil is taken, not which part of it. Where two edges cross the pupil, or a lamp stands behind a rim, that is
+not enough: what a near edge leaves free may be just what the next one hides. So near rims the layers are seen from points spread evenly
+over the pupil, one pinhole picture from each (every pixel moved by its share of its circle of confusion, the nearest wins), and their
+mean takes the place of the slices. Pixels that cover a share are there for that share of the points. Lights are far too bright for so few
+points: each is spread by its own kernel, and every pixel of it looks along its one ray whether the way to the light is free.
+
+Elsewhere the slices stay, which are exact there. The more of the pupil sees another surface, the more the views count.
+"""
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int32, Int64
+
+from mrbokeh.layering.highlights import find_highlights
+from mrbokeh.layering.padded_layers import PaddedLayer, Pixels
+from mrbokeh.layering.psf_over_field import FIELD_CELLS, Frame
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.pupil_points import pupil_points, transmission
+
+LEAST_VIEWS, MOST_VIEWS, _PX_PER_VIEW = 24, 96, 12.0
+_TILE_PX, _BLOCK_ROWS, _BLOCK_COLUMNS = 16, 96, 192
+_BESIDE_PX = 2
+_TWO_SURFACES_PX, _ENOUGH = 1.0, 0.06
+_SIZES_PER_PX = 8
+_GOLDEN = np.float32(0.5 * (5.0**0.5 - 1.0))
+
+Mask = Bool[np.ndarray, "rows columns"]
+Places = Int32[np.ndarray, " places"]
+Sizes = Float32[np.ndarray, " places"]
+Colour = Float32[np.ndarray, "height width channels"]
+
+
+class Cut(NamedTuple):
+    """Layers that are blurred together, with their margin, and the surfaces that they were cut into.
+
+    An opaque layer comes first; its own surfaces are the front, then what lies behind its rims, and last what is filled in.
+    """
+
+    layers: Sequence[PaddedLayer]
+    surfaces: Sequence[Pixels]
+    lights: Sequence[Mask]
+
+    @property
+    def dense(self) -> list[PaddedLayer]:
+        """Layers with a pixel at every place: an opaque one as its front is, now that its edges are split."""
+        first, front = self.layers[0], self.surfaces[0]
+        if not first.is_opaque:
+            return list(self.layers)
+        split = PaddedLayer(front.values.reshape(first.values.shape), front.coc_px.reshape(first.coc_px.shape), True)
+        return [split, *self.layers[1:]]
+
+
+def can_see_through(aperture: Aperture) -> bool:
+    """Return whether a pupil is one opening for all colours and both sides of the focus; it may vary over the frame."""
+    return not aperture.is_chromatic and aperture.spherical_aberration == 0.0
+
+
+def see_rims(colour: Colour, cuts: Sequence[Cut], aperture: Aperture, frame: Frame, pool: Executor) -> None:
+    """Put what the pupil sees near rims in place of the first three channels of a picture without holes.
+
+    The light of the surfaces is changed. frame: placement of arrays with their margin.
+    """
+    tiles = _tiles(cuts, aperture, frame)
+    if not tiles.any():
+        return
+    lights = _lights([layer for cut in cuts for layer in cut.dense], [lit for cut in cuts for lit in cut.lights], tiles, aperture, frame)
+    views = _Views([each for cut in cuts for each in cut.surfaces if len(each.places)], aperture, frame)
+    list(pool.map(lambda block: views.see(colour, lights, tiles, block), _blocks(tiles, frame)))
+
+
+def _tiles(cuts: Sequence[Cut], aperture: Aperture, frame: Frame) -> Mask:
+    """Mark the tiles of the picture that light from beside or behind a rim may reach."""
+    from mrbokeh.layering._pupil_views_numba import mark_reach
+
+    tiles = np.zeros((-(-frame.height_px // _TILE_PX), -(-frame.width_px // _TILE_PX)), np.bool_)
+    for places, coc_px in _rims(cuts):
+        reach_px = np.ceil(0.5 * aperture.unit_radius * coc_px).astype(np.int32) + _BESIDE_PX
+        mark_reach(tiles, _TILE_PX, frame.width_px - 2 * frame.left_px, -frame.left_px, places, reach_px)
+    return tiles
+
+
+def _rims(cuts: Sequence[Cut]) -> Iterator[tuple[Places, Sizes]]:
+    """Yield places beside which something hides something else, and the larger circle of confusion of both (without sign)."""
+    from cv2 import erode
+
+    opaque_px = next(cut.surfaces[0].coc_px for cut in cuts if cut.layers[0].is_opaque)
+    for cut in cuts:
+        if cut.layers[0].is_opaque:
+            for behind in (cut.surfaces[1], cut.surfaces[-1]):
+                yield behind.places, np.maximum(np.abs(behind.coc_px), np.abs(opaque_px[behind.places]))
+        for layer in cut.layers:
+            if not layer.is_opaque:
+                covered = (layer.values[..., 3] > 0).astype(np.uint8)
+                places = np.flatnonzero((covered > 0) & (np.asarray(erode(covered, np.ones((3, 3), np.uint8))) == 0)).astype(np.int32)
+                yield places, np.maximum(np.abs(layer.coc_px.reshape(-1)[places]), np.abs(opaque_px[places]))
+
+
+def _blocks(tiles: Mask, frame: Frame) -> Iterator[tuple[int, int, int, int]]:
+    """Yield top, bottom, left and right of what is marked in each block of the picture."""
+    rows, columns = _BLOCK_ROWS // _TILE_PX, _BLOCK_COLUMNS // _TILE_PX
+    for top in range(0, tiles.shape[0], rows):
+        for left in range(0, tiles.shape[1], columns):
+            y, x = np.nonzero(tiles[top : top + rows, left : left + columns])
+            if len(y):
+                corners = (top + y.min(), top + y.max() + 1, left + x.min(), left + x.max() + 1)
+                first, end, begin, stop = (int(each) * _TILE_PX for each in corners)
+                yield first, min(end, frame.height_px), begin, min(stop, frame.width_px)
+
+
+def _lights(layers: Sequence[PaddedLayer], lights: Sequence[Mask], tiles: Mask, aperture: Aperture, frame: Frame) -> Colour:
+    """Return the light of highlights where it arrives in marked tiles (H, W, 3), and leave their surroundings' light in their place."""
+    from mrbokeh.layering._pupil_views_numba import add_cut_lights, darken
+
+    arrives = np.zeros((frame.height_px, frame.width_px, 3), np.float32)
+    occluder_px, alpha = np.stack([layer.coc_px for layer in layers]), np.stack([layer.values[..., 3] for layer in layers])
+    nearest_px = float(occluder_px.min())
+    for layer, lit in zip(layers, lights, strict=True):
+        width, flat = layer.coc_px.shape[1], layer.values.reshape(-1, layer.values.shape[2])
+        places = np.flatnonzero(lit)
+        dark = np.empty((len(places), 3), np.float32)
+        darken(dark, places, flat, width)
+        rgb, coc_px = flat[places, :3] - dark, layer.coc_px.reshape(-1)[places]
+        flat[places, :3] = dark
+        for which, kernel in _kernels(places, coc_px, aperture, frame):
+            each = places[which], rgb[which], coc_px[which]
+            add_cut_lights(
+                arrives, tiles, _TILE_PX, -frame.left_px, *each, kernel, aperture.unit_radius, occluder_px, alpha, nearest_px
+            )
+    return arrives
+
+
+def _kernels(
+    places: Int64[np.ndarray, " lights"], coc_px: Float32[np.ndarray, " lights"], aperture: Aperture, frame: Frame
+) -> Iterator[tuple[Int64[np.ndarray, " _"], np.ndarray]]:
+    """Yield indices of lights that are spread alike, and their kernel."""
+    sizes = np.rint(coc_px * _SIZES_PER_PX).astype(np.int64)
+    width = frame.width_px - 2 * frame.left_px
+    cells = _cells_of(places // width + frame.top_px, places % width + frame.left_px, aperture, frame)
+    for cell, size in np.unique(np.stack([cells, sizes], axis=1), axis=0) if len(places) else ():
+        opening = _opening(aperture, int(cell), frame)
+        yield np.flatnonzero((cells == cell) & (sizes == size)), opening.rasterize(float(size) / _SIZES_PER_PX).kernel
+
+
+def _cells_of(rows: np.ndarray, columns: np.ndarray, aperture: Aperture, frame: Frame) -> np.ndarray:
+    """Return the field cell of places of the picture, counted row by row; 0 where the opening is the same all over it."""
+    if not aperture.varies_over_field:
+        return np.zeros(np.broadcast(rows, columns).shape, np.int64)
+    across, down = FIELD_CELLS
+    cell_row = np.clip(rows * down // frame.height_px, 0, down - 1)
+    return cell_row * across + np.clip(columns * across // frame.width_px, 0, across - 1)
+
+
+def _opening(aperture: Aperture, cell: int, frame: Frame) -> Aperture:
+    """Return the opening that a field cell sees."""
+    if not aperture.varies_over_field:
+        return aperture.seen(1)
+    (row, column), picture = divmod(cell, FIELD_CELLS[0]), replace(frame, left_px=0, top_px=0)
+    return aperture.seen(1, picture.field_at((column + 0.5) * frame.width_px / FIELD_CELLS[0], (row + 0.5) * frame.height_px / FIELD_CELLS[1]))
+
+
+@dataclass(frozen=True)
+class _Views:
+    """Pinhole pictures of surfaces from points of the pupil, block by block of the picture."""
+
+    surfaces: Sequence[Pixels]
+    aperture: Aperture
+    frame: Frame
+
+    @cached_property
+    def _pupil(self) -> Float32[np.ndarray, "points 3"]:
+        """x, y and the coverage from which on a pixel is there for a point: evenly spread for any group of points."""
+        points = pupil_points(self.aperture.seen(1), MOST_VIEWS).astype(np.float32)
+        points[:, 2] = (np.arange(1, MOST_VIEWS + 1, dtype=np.float32) * _GOLDEN) % 1.0
+        return points
+
+    @cached_property
+    def _weights(self) -> Float32[np.ndarray, "cells points"]:
+        xy = self._pupil[:, :2].astype(np.float64)
+        cells = FIELD_CELLS[0] * FIELD_CELLS[1] if self.aperture.varies_over_field else 1
+        return np.stack([transmission(_opening(self.aperture, cell, self.frame), xy) for cell in range(cells)]).astype(np.float32)
+
+    @cached_property
+    def _reach_px(self) -> int:
+        return int(np.ceil(0.5 * self.aperture.unit_radius * max(float(np.abs(each.coc_px).max()) for each in self.surfaces))) + _BESIDE_PX
+
+    def see(self, colour: Colour, lights: Colour, tiles: Mask, block: tuple[int, int, int, int]) -> None:
+        """Put the mean of all views in place of the slices in what is marked of a block."""
+        from mrbokeh.layering._pupil_views_numba import add_views, blend
+
+        top, bottom, left, right = block
+        shape = bottom - top, right - left
+        seen = np.zeros((*shape, 8), np.float32)
+        seen[..., 6], seen[..., 7] = np.inf, -np.inf
+        cells = _cells_of(np.arange(top, bottom)[:, None], np.arange(left, right)[None], self.aperture, self.frame)
+        nearest, which = np.empty((shape[0] + 2, shape[1] + 2), np.float32), np.empty((shape[0] + 2, shape[1] + 2), np.int32)
+        window = self._window(block)
+        largest_px = 2.0 * float(np.abs(window.range_px).max())
+        count = int(np.clip(largest_px**2 / _PX_PER_VIEW, LEAST_VIEWS, MOST_VIEWS))
+        add_views(seen, window, self._pupil[:count], cells, self._weights, nearest, which)
+        blend(colour, seen, lights, tiles, _TILE_PX, top, left, _TWO_SURFACES_PX, _ENOUGH)
+
+    def _window(self, block: tuple[int, int, int, int]):  # type: ignore[no-untyped-def]
+        """Collect the pixels of all surfaces that any view may show in a block."""
+        from mrbokeh.layering._pupil_views_numba import Window, collect
+
+        margin = -self.frame.left_px
+        width, height = self.frame.width_px + 2 * margin, self.frame.height_px + 2 * margin
+        top, bottom, left, right = (each + margin for each in block)
+        around = self._reach_px
+        box = max(top - around, 0), min(bottom + around, height), max(left - around, 0), min(right + around, width)
+        most = (box[1] - box[0]) * (box[3] - box[2]) * len(self.surfaces)
+        x_px, y_px, half_px, alpha = (np.empty(most, np.float32) for _ in range(4))
+        starts = np.zeros((len(self.surfaces), box[1] - box[0] + 1), np.int64)
+        window = Window(
+            x_px=x_px,
+            y_px=y_px,
+            half_px=half_px,
+            alpha=alpha,
+            rgb=np.empty((most, 3), np.float32),
+            starts=starts,
+            range_px=np.array([np.inf, -np.inf], np.float32),
+            top_px=box[0] - (top - 1),
+        )
+        end = 0
+        for number, each in enumerate(self.surfaces):
+            end = collect(window, number, end, (top - 1, left - 1), box, width, each.places, each.values, each.coc_px)
+        return window
