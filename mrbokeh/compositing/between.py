@@ -43,9 +43,9 @@ from mrbokeh.compositing.near_and_far import (
 )
 from mrbokeh.compositing.plate import Inserted, Plate, same_size
 from mrbokeh.compositing.pupil_shares import PupilMeans, Rays
-from mrbokeh.optics.pupil_points import pupil_points
 from mrbokeh.images.layer import Layer, clear, flatten
 from mrbokeh.layering.highlights import find_highlights
+from mrbokeh.optics.pupil_points import pupil_points
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.system.errors import InputError
 

@@ -104,9 +104,7 @@ def add_views(
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _add_view(
-    seen: np.ndarray, nearest: np.ndarray, which: np.ndarray, rgb: np.ndarray, cells: np.ndarray, weights: np.ndarray
-) -> None:
+def _add_view(seen: np.ndarray, nearest: np.ndarray, which: np.ndarray, rgb: np.ndarray, cells: np.ndarray, weights: np.ndarray) -> None:
     """Add one view to the sums (see `add_views`). weights: (cells,) of this point."""
     rows, columns, _ = seen.shape
     for row in range(rows):
@@ -123,6 +121,7 @@ def _add_view(
                 found[column, 5] += weight * half_px * half_px
                 found[column, 6] = min(found[column, 6], half_px)
                 found[column, 7] = max(found[column, 7], half_px)
+                found[column, 8] += weight * (rgb[i, 0] * rgb[i, 0] + rgb[i, 1] * rgb[i, 1] + rgb[i, 2] * rgb[i, 2])
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -184,8 +183,10 @@ def blend(
     tile_px: int,
     top: int,
     left: int,
+    points: int,
     one_surface_px: float,
     enough: float,
+    noise: float,
 ) -> None:
     """Let the views of a block (see `add_views`) and the lights replace colour (H, W, 3 or more) in marked tiles.
 
@@ -201,8 +202,15 @@ def blend(
             apart_px, mean = 2.0 * (found[7] - found[6]), found[4] / found[3]
             share = 4.0 * (found[5] / found[3] - mean * mean) / max(apart_px * apart_px, _LEAST)
             counts = _smooth(apart_px / one_surface_px - 1.0) * _smooth(share / enough)
+            changes, spread = np.float32(0.0), found[8] / found[3]
             for c in range(3):
-                colour[y, x, c] += counts * (found[c] / found[3] + lights[y, x, c] - colour[y, x, c])
+                found[c] /= found[3]
+                spread -= found[c] * found[c]
+                found[c] += lights[y, x, c] - colour[y, x, c]
+                changes += found[c] * found[c]
+            counts *= changes / max(changes + noise * spread / points, _LEAST * _LEAST)
+            for c in range(3):
+                colour[y, x, c] += counts * found[c]
 
 
 @njit(cache=True, nogil=True)

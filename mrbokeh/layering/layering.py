@@ -31,8 +31,8 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.layering.hidden_background import split_edges
 from mrbokeh.layering.highlights import find_highlights
 from mrbokeh.layering.padded_layers import PaddedLayer, Pixels, coc_px_of, pad_layer
-from mrbokeh.layering.pupil_views import Cut, can_see_through, see_rims
 from mrbokeh.layering.psf_over_field import FIELD_CELLS, AperturePsf, Frame, KernelSum, PsfField
+from mrbokeh.layering.pupil_views import Cut, can_see_through, see_rims
 from mrbokeh.layering.slices import Channels, Slicing, composited
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError

@@ -18,16 +18,16 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64
 
-from mrbokeh.layering.highlights import find_highlights
 from mrbokeh.layering.padded_layers import PaddedLayer, Pixels
 from mrbokeh.layering.psf_over_field import FIELD_CELLS, Frame
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.pupil_points import pupil_points, transmission
 
-LEAST_VIEWS, MOST_VIEWS, _PX_PER_VIEW = 24, 96, 12.0
+LEAST_VIEWS, MOST_VIEWS, _PX_PER_VIEW = 24, 96, 6.0
 _TILE_PX, _BLOCK_ROWS, _BLOCK_COLUMNS = 16, 96, 192
 _BESIDE_PX = 2
 _TWO_SURFACES_PX, _ENOUGH = 1.0, 0.06
+_NOISE = 0.8
 _SIZES_PER_PX = 8
 _GOLDEN = np.float32(0.5 * (5.0**0.5 - 1.0))
 
@@ -130,9 +130,7 @@ def _lights(layers: Sequence[PaddedLayer], lights: Sequence[Mask], tiles: Mask, 
         flat[places, :3] = dark
         for which, kernel in _kernels(places, coc_px, aperture, frame):
             each = places[which], rgb[which], coc_px[which]
-            add_cut_lights(
-                arrives, tiles, _TILE_PX, -frame.left_px, *each, kernel, aperture.unit_radius, occluder_px, alpha, nearest_px
-            )
+            add_cut_lights(arrives, tiles, _TILE_PX, -frame.left_px, *each, kernel, aperture.unit_radius, occluder_px, alpha, nearest_px)
     return arrives
 
 
@@ -162,7 +160,9 @@ def _opening(aperture: Aperture, cell: int, frame: Frame) -> Aperture:
     if not aperture.varies_over_field:
         return aperture.seen(1)
     (row, column), picture = divmod(cell, FIELD_CELLS[0]), replace(frame, left_px=0, top_px=0)
-    return aperture.seen(1, picture.field_at((column + 0.5) * frame.width_px / FIELD_CELLS[0], (row + 0.5) * frame.height_px / FIELD_CELLS[1]))
+    return aperture.seen(
+        1, picture.field_at((column + 0.5) * frame.width_px / FIELD_CELLS[0], (row + 0.5) * frame.height_px / FIELD_CELLS[1])
+    )
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ class _Views:
 
         top, bottom, left, right = block
         shape = bottom - top, right - left
-        seen = np.zeros((*shape, 8), np.float32)
+        seen = np.zeros((*shape, 9), np.float32)
         seen[..., 6], seen[..., 7] = np.inf, -np.inf
         cells = _cells_of(np.arange(top, bottom)[:, None], np.arange(left, right)[None], self.aperture, self.frame)
         nearest, which = np.empty((shape[0] + 2, shape[1] + 2), np.float32), np.empty((shape[0] + 2, shape[1] + 2), np.int32)
@@ -204,7 +204,7 @@ class _Views:
         largest_px = 2.0 * float(np.abs(window.range_px).max())
         count = int(np.clip(largest_px**2 / _PX_PER_VIEW, LEAST_VIEWS, MOST_VIEWS))
         add_views(seen, window, self._pupil[:count], cells, self._weights, nearest, which)
-        blend(colour, seen, lights, tiles, _TILE_PX, top, left, _TWO_SURFACES_PX, _ENOUGH)
+        blend(colour, seen, lights, tiles, _TILE_PX, top, left, count, _TWO_SURFACES_PX, _ENOUGH, _NOISE)
 
     def _window(self, block: tuple[int, int, int, int]):  # type: ignore[no-untyped-def]
         """Collect the pixels of all surfaces that any view may show in a block."""

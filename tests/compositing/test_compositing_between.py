@@ -13,10 +13,10 @@ from mrbokeh.compositing.near_and_far import NO_HIGHLIGHTS, NearAndFar, cut_in_t
 from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.compositing.plate import Plate, plate_of
 from mrbokeh.compositing.pupil_shares import Rays
-from mrbokeh.optics.pupil_points import pupil_points, transmission
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.pupil_points import pupil_points, transmission
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 

@@ -136,7 +136,7 @@ def test_slices_on_a_device_are_put_together_as_the_compiled_ones(monkeypatch: p
     monkeypatch.setattr(cutting, "split_edges", split)
     rgb, depth_m, lens = post()
     lens = lens.focused_at(float(depth_m.min()) * 0.9) if is_behind else lens
-    known = PolygonDifferences(layering=Layering(slices=6), precision="double").render([opaque(rgb, depth_m)], lens).rgb
+    known = PolygonDifferences(layering=Layering(slices=6, sees_rims=False), precision="double").render([opaque(rgb, depth_m)], lens).rgb
     coc_px = np.asarray(lens.coc_px(depth_m, rgb.shape[1]), np.float32)
     found = TorchPolygons("cpu", precision="double").render(torch.from_numpy(rgb), torch.from_numpy(coc_px), OCTAGON, 6)
     np.testing.assert_allclose(found[..., :3].numpy(), known, atol=DOUBLE)

@@ -41,7 +41,7 @@ class LayerDepth:
     """
 
     def __init__(self) -> None:
-        self._renderer: Renderer = make_renderer("polygon", threads=1, layering=Layering(slices=8))
+        self._renderer: Renderer = make_renderer("polygon", threads=1, layering=Layering(slices=8, sees_rims=False))
 
     def seen_dioptres(self, layers: Sequence[Layer], lens: Lens) -> Float32[np.ndarray, "rows columns"]:
         """Return 1 / depth on a grid of every 4th pixel of sharp layers, front first, whose sizes are multiples of 4. lens: theirs."""

@@ -56,7 +56,7 @@ class StageSetup:
         return replace(self, renderer_name=name, render_setup=replace(self.render_setup, renderer=renderer))
 
 
-LIVE_LAYERING = Layering(slices=8)
+LIVE_LAYERING = Layering(slices=8, sees_rims=False)
 
 
 def live_renderer(name: str) -> Renderer:

@@ -76,6 +76,6 @@ def slices_row(run: Run, size: tuple[int, int], bar_ms: float | None) -> Row:
     row = Row(f"{SLICES} slices, hidden background, octagon, -70 to 81 px", size_of(coc_px), bar_ms=bar_ms)
     moved = lambda: renderer.render(run.on_device(layer.rgb), run.on_device(coc_px), OCTAGON, SLICES).cpu()  # noqa: E731
     row = run.measured(row, partial(renderer.render, *there, OCTAGON, SLICES), moved)
-    compiled = PolygonDifferences(layering=Layering(slices=SLICES))
+    compiled = PolygonDifferences(layering=Layering(slices=SLICES, sees_rims=False))
     row = row.by_processor(partial(compiled.render, [layer], lens), run, most_s=2.0)
     return row.compared(renderer.render(*there, OCTAGON, SLICES)[..., :3], compiled.render([layer], lens).rgb)
