@@ -12,8 +12,9 @@ from mrbokeh.system.compiled import njit
 _STEP_PX = np.float32(1.0)
 """Circles of confusion that differ by more belong to two surfaces (mrbokeh.layering.hidden_background)."""
 _SLACK_PX = np.float32(0.3)
+_HALF_A_STEP_PX = np.float32(0.5)
 _FAR = np.float32(np.inf)
-_BEFORE = np.int32(4096)
+BEFORE_PX = np.int32(4096)
 """Whole pixels added to places before their fraction is cut off, so that it is cut downwards."""
 _LEAST = np.float32(1e-6)
 _LIT = np.float32(0.004)
@@ -72,7 +73,7 @@ def collect(
         while i < len(places) and places[i] < row * width + right:
             alpha = values[i, 3]
             if alpha > _LEAST:
-                window.x_px[count] = places[i] - row * width - origin[1] + np.float32(0.5) + _BEFORE
+                window.x_px[count] = places[i] - row * width - origin[1] + np.float32(0.5) + BEFORE_PX
                 window.y_px[count] = row - origin[0] + np.float32(0.5)
                 window.half_px[count], window.alpha[count] = np.float32(0.5) * coc_px[i], alpha
                 window.range_px[0] = min(window.range_px[0], window.half_px[count])
@@ -86,51 +87,94 @@ def collect(
 
 
 @njit(cache=True, nogil=True)
-def add_views(
-    seen: np.ndarray, window: Window, pupil: np.ndarray, cells: np.ndarray, weights: np.ndarray, nearest: np.ndarray, which: np.ndarray
+def correlate(
+    sums: np.ndarray,
+    window: Window,
+    pupil: np.ndarray,
+    cells: np.ndarray,
+    weights: np.ndarray,
+    surveyed: int,
+    buffers: tuple[np.ndarray, ...],
 ) -> None:
-    """Add what each point of the pupil sees of a window's surfaces.
+    """Look through the points of the pupil at a window's surfaces, parted at each pixel halfway between the nearest and the farthest seen.
 
-    seen: (rows, columns, 8) of a block: sums of r, g, b, weight, h and h^2, and the least and greatest h, half of the circle of confusion.
-    pupil: (K, 3) x, y, and the coverage from which on a pixel is there. cells: (rows, columns) which row of weights (cells, K) holds.
-    nearest, which: (rows + 2, columns + 2) to work in.
+    sums: (rows, columns, 9) of a block: over points that see something far, of its r, g, b, of the same where something near hides it, of
+    weights, of those where it is hidden, and of the squares of r, g and b. pupil: (K, 3) x, y, and the coverage from which on a pixel is
+    there. cells: (rows, columns) which row of weights (cells, K) holds. surveyed: points that look for the nearest and the farthest.
+    buffers: five of (rows + 2, columns + 2) to work in: half circles of confusion and numbers of the nearest and of the next surface, and
+    where they part.
     """
-    rows, columns, _ = seen.shape
+    nearest, which, second, second_which, parts = buffers
+    columns = sums.shape[1]
+    farthest = np.full_like(nearest, -_FAR)
+    parts[:] = _FAR
+    for k in range(min(surveyed, len(pupil))):
+        _view(nearest, which, second, second_which, window, pupil[k, 0], pupil[k, 1], pupil[k, 2])
+        for row in range(len(parts)):
+            for column in range(columns + 2):
+                if which[row, column] >= 0:
+                    parts[row, column] = min(parts[row, column], nearest[row, column])
+                    last = second[row, column] if second_which[row, column] >= 0 else nearest[row, column]
+                    farthest[row, column] = max(farthest[row, column], last)
+    for row in range(len(parts)):
+        for column in range(columns + 2):
+            apart = farthest[row, column] - parts[row, column]
+            parts[row, column] = np.float32(0.5) * (parts[row, column] + farthest[row, column]) if apart > _HALF_A_STEP_PX else -_FAR
     for k in range(len(pupil)):
-        _view(nearest, which, window, pupil[k, 0], pupil[k, 1], pupil[k, 2])
-        _close_cracks(nearest, which, window, True)
-        _close_cracks(nearest, which, window, False)
-        _add_view(seen, nearest, which, window.rgb, cells, weights[:, k])
+        _view(nearest, which, second, second_which, window, pupil[k, 0], pupil[k, 1], pupil[k, 2])
+        _add_view(sums, buffers, window.rgb, cells, weights[:, k])
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _add_view(seen: np.ndarray, nearest: np.ndarray, which: np.ndarray, rgb: np.ndarray, cells: np.ndarray, weights: np.ndarray) -> None:
-    """Add one view to the sums (see `add_views`). weights: (cells,) of this point."""
-    rows, columns, _ = seen.shape
+def _add_view(sums: np.ndarray, buffers: tuple[np.ndarray, ...], rgb: np.ndarray, cells: np.ndarray, weights: np.ndarray) -> None:
+    """Add one view to the sums (see `correlate`). weights: (cells,) of this point."""
+    nearest, which, second, second_which, parts = buffers
+    rows, columns, _ = sums.shape
     for row in range(rows):
-        found, numbers, halves_px, cell = seen[row], which[row + 1], nearest[row + 1], cells[row]
+        found, cell = sums[row], cells[row]
         for column in range(columns):
-            i, weight = numbers[column + 1], weights[cell[column]]
-            if i >= 0 and weight > 0:
-                half_px = halves_px[column + 1]
-                found[column, 0] += weight * rgb[i, 0]
-                found[column, 1] += weight * rgb[i, 1]
-                found[column, 2] += weight * rgb[i, 2]
-                found[column, 3] += weight
-                found[column, 4] += weight * half_px
-                found[column, 5] += weight * half_px * half_px
-                found[column, 6] = min(found[column, 6], half_px)
-                found[column, 7] = max(found[column, 7], half_px)
-                found[column, 8] += weight * (rgb[i, 0] * rgb[i, 0] + rgb[i, 1] * rgb[i, 1] + rgb[i, 2] * rgb[i, 2])
+            hidden = nearest[row + 1, column + 1] < parts[row + 1, column + 1]
+            i = second_which[row + 1, column + 1] if hidden else which[row + 1, column + 1]
+            weight = weights[cell[column]]
+            if i < 0 or weight <= 0 or (hidden and second[row + 1, column + 1] < parts[row + 1, column + 1]):
+                continue
+            red, green, blue, over = (
+                weight * rgb[i, 0],
+                weight * rgb[i, 1],
+                weight * rgb[i, 2],
+                np.float32(1.0) if hidden else np.float32(0.0),
+            )
+            found[column, 0] += red
+            found[column, 1] += green
+            found[column, 2] += blue
+            found[column, 3] += over * red
+            found[column, 4] += over * green
+            found[column, 5] += over * blue
+            found[column, 6] += weight
+            found[column, 7] += over * weight
+            found[column, 8] += red * rgb[i, 0] + green * rgb[i, 1] + blue * rgb[i, 2]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _view(nearest: np.ndarray, which: np.ndarray, window: Window, u: np.float32, v: np.float32, threshold: np.float32) -> None:
-    """Find the nearest pixel of the window at each pixel of the block, seen from the point (u, v) of the pupil; -1 where nothing is."""
+def _view(
+    nearest: np.ndarray,
+    which: np.ndarray,
+    second: np.ndarray,
+    second_which: np.ndarray,
+    window: Window,
+    u: np.float32,
+    v: np.float32,
+    threshold: np.float32,
+) -> None:
+    """Find the nearest pixel of the window at each pixel of the block seen from the point (u, v) of the pupil, and that of the next surface.
+
+    -1 where there is none.
+    """
     rows, columns = nearest.shape
     for row in range(rows):
         for column in range(columns):
-            nearest[row, column], which[row, column] = np.float32(np.inf), -1
+            nearest[row, column], which[row, column] = _FAR, -1
+            second[row, column], second_which[row, column] = _FAR, -1
     low_px, high_px = min(v * window.range_px[0], v * window.range_px[1]), max(v * window.range_px[0], v * window.range_px[1])
     last = window.starts.shape[1] - 1
     first = min(max(np.int64(np.floor(-high_px)) - 1 - window.top_px, 0), last)
@@ -138,92 +182,49 @@ def _view(nearest: np.ndarray, which: np.ndarray, window: Window, u: np.float32,
     x_px, halves_px, alpha = window.x_px, window.half_px, window.alpha
     for surface in range(len(window.starts)):
         for line in range(first, end):
-            y_px = np.float32(line + window.top_px) + np.float32(0.5) + _BEFORE
+            y_px = np.float32(line + window.top_px) + np.float32(0.5) + BEFORE_PX
             for i in range(window.starts[surface, line], window.starts[surface, line + 1]):
                 half_px = halves_px[i]
-                row = np.uint32(np.int32(y_px + v * half_px) - _BEFORE)
-                column = np.uint32(np.int32(x_px[i] + u * half_px) - _BEFORE)
-                if row < np.uint32(rows) and column < np.uint32(columns) and half_px < nearest[row, column] and alpha[i] > threshold:
-                    nearest[row, column], which[row, column] = half_px, i
+                row = np.uint32(np.int32(y_px + v * half_px) - BEFORE_PX)
+                column = np.uint32(np.int32(x_px[i] + u * half_px) - BEFORE_PX)
+                if row < np.uint32(rows) and column < np.uint32(columns) and half_px < second[row, column] and alpha[i] > threshold:
+                    there_px = nearest[row, column]
+                    if half_px < there_px:
+                        if there_px - half_px > _HALF_A_STEP_PX:
+                            second[row, column], second_which[row, column] = there_px, which[row, column]
+                        nearest[row, column], which[row, column] = half_px, i
+                    elif half_px - there_px > _HALF_A_STEP_PX:
+                        second[row, column], second_which[row, column] = half_px, i
 
 
 @njit(cache=True, nogil=True)
-def _close_cracks(nearest: np.ndarray, which: np.ndarray, window: Window, across: bool) -> None:
-    """Fill pixels between two that are neighbours in the sharp picture, of one surface, nearer than what shows between them."""
-    rows, columns = nearest.shape
-    down, right = (0, 1) if across else (1, 0)
-    for row in range(down, rows - down):
-        before_px, here_px = nearest[row - down, : columns - 2 * right], nearest[row, right : columns - right]
-        after_px = nearest[row + down, 2 * right :]
-        cracks = 0
-        for column in range(len(here_px)):
-            cracks += max(before_px[column], after_px[column]) + _STEP_PX < here_px[column]
-        if cracks == 0:
-            continue
-        for column in range(len(here_px)):
-            if max(before_px[column], after_px[column]) + _STEP_PX < here_px[column]:
-                before, after = which[row - down, column], which[row + down, column + 2 * right]
-                if before != after and _are_neighbours(window, before, after, across):
-                    here_px[column], which[row, column + right] = before_px[column], before
-
-
-@njit(cache=True, nogil=True)
-def _are_neighbours(window: Window, before: int, after: int, across: bool) -> bool:
-    x, y = window.x_px[after] - window.x_px[before], window.y_px[after] - window.y_px[before]
-    along, beside = (x, y) if across else (y, x)
-    return along == 1.0 and abs(beside) <= 1.0 and abs(window.half_px[after] - window.half_px[before]) < _STEP_PX
-
-
-@njit(cache=True, nogil=True)
-def blend(
-    colour: np.ndarray,
-    seen: np.ndarray,
-    lights: np.ndarray,
-    tiles: np.ndarray,
-    tile_px: int,
-    top: int,
-    left: int,
-    points: int,
-    one_surface_px: float,
-    enough: float,
-    noise: float,
+def take_back(
+    colour: np.ndarray, sums: np.ndarray, tiles: np.ndarray, tile_px: int, top: int, left: int, points: int, noise: float
 ) -> None:
-    """Let the views of a block (see `add_views`) and the lights replace colour (H, W, 3 or more) in marked tiles.
+    """Subtract from colour (H, W, 3 or more) of a block, in marked tiles, how far light and what hides it go together (see `correlate`).
 
-    They count where circles of confusion differ by more than one_surface_px (all from twice that on) and by how much of the pupil sees
-    another surface than the rest (all from a share `enough` on).
+    It counts by its square over that and the square of what chance makes of so few points.
     """
-    rows, columns, _ = seen.shape
+    rows, columns, _ = sums.shape
     for row in range(rows):
         for column in range(columns):
-            found, y, x = seen[row, column], top + row, left + column
-            if found[3] <= 0 or not tiles[y // tile_px, x // tile_px]:
+            found, y, x = sums[row, column], top + row, left + column
+            if found[7] <= 0 or found[7] >= found[6] or not tiles[y // tile_px, x // tile_px]:
                 continue
-            apart_px, mean = 2.0 * (found[7] - found[6]), found[4] / found[3]
-            share = 4.0 * (found[5] / found[3] - mean * mean) / max(apart_px * apart_px, _LEAST)
-            counts = _smooth(apart_px / one_surface_px - 1.0) * _smooth(share / enough)
-            changes, spread = np.float32(0.0), found[8] / found[3]
+            hidden, square, spread = found[7] / found[6], np.float32(0.0), found[8] / found[6]
             for c in range(3):
-                found[c] /= found[3]
-                spread -= found[c] * found[c]
-                found[c] += lights[y, x, c] - colour[y, x, c]
-                changes += found[c] * found[c]
-            counts *= changes / max(changes + noise * spread / points, _LEAST * _LEAST)
+                mean = found[c] / found[6]
+                found[c] = found[3 + c] / found[6] - hidden * mean
+                square, spread = square + found[c] * found[c], spread - mean * mean
+            chance = noise * hidden * (np.float32(1.0) - hidden) * max(spread, np.float32(0.0)) / points
+            counts = square / max(square + chance, _LEAST * _LEAST)
             for c in range(3):
-                colour[y, x, c] += counts * found[c]
-
-
-@njit(cache=True, nogil=True)
-def _smooth(x: float) -> float:
-    x = min(max(x, 0.0), 1.0)
-    return x * x * (3.0 - 2.0 * x)
+                colour[y, x, c] = max(colour[y, x, c] - counts * found[c], np.float32(0.0))
 
 
 @njit(cache=True, nogil=True)
 def add_cut_lights(
     out: np.ndarray,
-    tiles: np.ndarray,
-    tile_px: int,
     margin: int,
     places: np.ndarray,
     rgb: np.ndarray,
@@ -234,18 +235,18 @@ def add_cut_lights(
     occluder_alpha: np.ndarray,
     nearest_px: float,
 ) -> None:
-    """Add lights of one size to marked tiles of a picture (H, W, 3), as far as what is nearer leaves the way free.
+    """Add lights of one size to a picture (H, W, 3 or more), as far as what is nearer leaves the way free.
 
     places, rgb, coc_px: of the lights, in the frame with its margin; kernel: of that size, sum 1. occluder_px, occluder_alpha:
     (surfaces, rows, columns) circles of confusion and coverage in the frame with its margin, the nearest of them at nearest_px.
     """
-    (height, width, _), around, half = out.shape, occluder_px.shape[2], len(kernel) // 2
+    height, width, around, half = out.shape[0], out.shape[1], occluder_px.shape[2], len(kernel) // 2
     for i in range(len(places)):
         row, column, half_px = places[i] // around, places[i] % around, 0.5 * coc_px[i]
         for y in range(max(row - margin - half, 0), min(row - margin + half + 1, height)):
             for x in range(max(column - margin - half, 0), min(column - margin + half + 1, width)):
                 share = kernel[y - row + margin + half, x - column + margin + half]
-                if share <= 0.0 or not tiles[y // tile_px, x // tile_px]:
+                if share <= 0.0:
                     continue
                 free = np.float32(0.0)
                 for ray in range(4):
@@ -291,15 +292,23 @@ def _free(
 
 
 @njit(cache=True, nogil=True)
-def darken(dark: np.ndarray, places: np.ndarray, values: np.ndarray, width: int) -> None:
-    """Set dark (N, 3) to the median of the 5x5 pixels around each place, per colour, at most its own light. values: (rows * width, 4+)."""
+def darken(dark: np.ndarray, places: np.ndarray, values: np.ndarray, width: int, ratio: float) -> None:
+    """Set dark (N, 3) to the light that each place would have if it were no light: its coverage times the median around, at most its own.
+
+    values: (rows * width, 4 or more) premultiplied; medians are of 5x5 pixels as far as they cover anything. A place that is not `ratio`
+    times as bright keeps its own light.
+    """
     rows, around = len(values) // width, np.empty(25, np.float32)
     for i in range(len(places)):
-        row, column = places[i] // width, places[i] % width
+        row, column, own = places[i] // width, places[i] % width, values[places[i]]
         for c in range(3):
             count = 0
             for y in range(max(row - 2, 0), min(row + 3, rows)):
                 for x in range(max(column - 2, 0), min(column + 3, width)):
-                    around[count] = values[y * width + x, c]
-                    count += 1
-            dark[i, c] = min(np.median(around[:count]), values[places[i], c])
+                    alpha = values[y * width + x, 3]
+                    if alpha > 0:
+                        around[count] = values[y * width + x, c] / alpha
+                        count += 1
+            dark[i, c] = min(own[3] * np.median(around[:count]), own[c]) if count else 0.0
+        if max(own[0], own[1], own[2]) <= ratio * max(dark[i, 0], dark[i, 1], dark[i, 2]):
+            dark[i] = own[:3]

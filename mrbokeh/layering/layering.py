@@ -32,7 +32,7 @@ from mrbokeh.layering.hidden_background import split_edges
 from mrbokeh.layering.highlights import find_highlights
 from mrbokeh.layering.padded_layers import PaddedLayer, Pixels, coc_px_of, pad_layer
 from mrbokeh.layering.psf_over_field import FIELD_CELLS, AperturePsf, Frame, KernelSum, PsfField
-from mrbokeh.layering.pupil_views import Cut, can_see_through, see_rims
+from mrbokeh.layering.pupil_views import Cut, Rims, can_see_through
 from mrbokeh.layering.slices import Channels, Slicing, composited
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
@@ -72,21 +72,33 @@ def render_layers(layers: Sequence[Layer], lens: Lens, kernel_sum: KernelSum | P
     with ThreadPoolExecutor(cores()) as pool:
         slicing = Slicing(psf=psf, slices=layering.slices, frame=frame, pool=pool, memory=_KEPT)
         groups = _groups([pad_layer(layer, each, margin, pool) for layer, each in zip(layers, coc_px, strict=True)])
+        cuts = [_cut(group, layering.fill, pool) for group in groups]
+        rims = _rims(cuts, psf, frame) if layering.sees_rims and layering.fill else None
+        lights = rims.take_lights() if rims else []
         found: tuple[Channels, Channels] | None = None
-        cuts: list[Cut] = []
-        for group in reversed(groups):
-            lit = [find_highlights(layer.values) for layer in group]
-            is_filled = layering.fill and group[0].is_opaque
-            pixels = _with_hidden(group, pool) if is_filled else [Pixels.covered(layer) for layer in group]
-            front = composited(pixels, slicing, by_depth=not group[0].is_opaque)
-            front = _shared_out(*front) if any(layer.is_opaque for layer in group) else front
+        for cut in reversed(cuts):
+            front = composited(cut.surfaces, slicing, by_depth=not cut.is_opaque)
+            front = _shared_out(*front) if any(layer.is_opaque for layer in cut.layers) else front
             found = front if found is None else _over(*front, *found)
-            cuts.insert(0, Cut(group, pixels, lit))
-        if layering.sees_rims and layering.fill and isinstance(psf, AperturePsf) and psf.motion is None and can_see_through(psf.aperture):
-            if groups[-1][0].is_opaque:
-                see_rims(found[0], cuts, psf.aperture, frame, pool)
+        if rims and found is not None:
+            rims.correct(found[0], pool)
+            rims.put_lights(found[0], lights)
     assert found is not None, "there is a layer"
     return _as_layer(*found, layers)
+
+
+def _cut(group: Sequence[PaddedLayer], fill: bool, pool: Executor) -> Cut:
+    lights = [find_highlights(layer.values) for layer in group]
+    pixels = _with_hidden(group, pool) if fill and group[0].is_opaque else [Pixels.covered(layer) for layer in group]
+    return Cut(group, pixels, lights)
+
+
+def _rims(cuts: Sequence[Cut], psf: PsfField, frame: Frame) -> Rims | None:
+    """Return the rims of a scene without holes, if it has any and the lens has one opening for all that it sees."""
+    if not (isinstance(psf, AperturePsf) and psf.motion is None and can_see_through(psf.aperture) and cuts[-1].is_opaque):
+        return None
+    rims = Rims.of(cuts, psf.aperture, frame)
+    return rims if rims.tiles.any() else None
 
 
 def _check(layers: Sequence[Layer]) -> None:

@@ -18,20 +18,22 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64
 
+from mrbokeh.layering.highlights import LIGHT_OVER_SURROUNDINGS
 from mrbokeh.layering.padded_layers import PaddedLayer, Pixels
 from mrbokeh.layering.psf_over_field import FIELD_CELLS, Frame
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.pupil_points import pupil_points, transmission
 
-LEAST_VIEWS, MOST_VIEWS, _PX_PER_VIEW = 24, 96, 6.0
+_LEAST_VIEWS, _MOST_VIEWS, _PX_PER_VIEW = 24, 96, 6.0
 _TILE_PX, _BLOCK_ROWS, _BLOCK_COLUMNS = 16, 96, 192
 _BESIDE_PX = 2
-_TWO_SURFACES_PX, _ENOUGH = 1.0, 0.06
+_SURVEYED = 16
+_BUFFERS = (np.float32, np.int32, np.float32, np.int32, np.float32)
 _NOISE = 0.8
 _SIZES_PER_PX = 8
 _GOLDEN = np.float32(0.5 * (5.0**0.5 - 1.0))
 
-Mask = Bool[np.ndarray, "rows columns"]
+Mask = Bool[np.ndarray, "_ _"]
 Places = Int32[np.ndarray, " places"]
 Sizes = Float32[np.ndarray, " places"]
 Colour = Float32[np.ndarray, "height width channels"]
@@ -40,7 +42,8 @@ Colour = Float32[np.ndarray, "height width channels"]
 class Cut(NamedTuple):
     """Layers that are blurred together, with their margin, and the surfaces that they were cut into.
 
-    An opaque layer comes first; its own surfaces are the front, then what lies behind its rims, and last what is filled in.
+    An opaque layer comes first; its own surfaces are the front, then what lies behind its rims (where other layers are known), and last
+    what is filled in. lights: which pixels of each layer are far brighter than those around them, before it was cut.
     """
 
     layers: Sequence[PaddedLayer]
@@ -48,13 +51,23 @@ class Cut(NamedTuple):
     lights: Sequence[Mask]
 
     @property
-    def dense(self) -> list[PaddedLayer]:
-        """Layers with a pixel at every place: an opaque one as its front is, now that its edges are split."""
+    def is_opaque(self) -> bool:
+        return self.layers[0].is_opaque
+
+    @property
+    def pairs(self) -> list[tuple[PaddedLayer, Pixels, Mask]]:
+        """Each layer with a pixel at every place, an opaque one as its front is, then its surface and its lights."""
         first, front = self.layers[0], self.surfaces[0]
-        if not first.is_opaque:
-            return list(self.layers)
+        if not self.is_opaque:
+            return list(zip(self.layers, self.surfaces, self.lights, strict=True))
         split = PaddedLayer(front.values.reshape(first.values.shape), front.coc_px.reshape(first.coc_px.shape), True)
-        return [split, *self.layers[1:]]
+        behind = zip(self.layers[1:], self.surfaces[2:-1], self.lights[1:], strict=True)
+        return [(split, front, self.lights[0]), *behind]
+
+    @property
+    def hidden(self) -> list[Pixels]:
+        """Surfaces behind the rims of an opaque layer."""
+        return [self.surfaces[1], self.surfaces[-1]] if self.is_opaque else []
 
 
 def can_see_through(aperture: Aperture) -> bool:
@@ -62,17 +75,78 @@ def can_see_through(aperture: Aperture) -> bool:
     return not aperture.is_chromatic and aperture.spherical_aberration == 0.0
 
 
-def see_rims(colour: Colour, cuts: Sequence[Cut], aperture: Aperture, frame: Frame, pool: Executor) -> None:
-    """Put what the pupil sees near rims in place of the first three channels of a picture without holes.
+@dataclass(frozen=True)
+class Rims:
+    """Rims of a scene without holes as the pupil sees them.
 
-    The light of the surfaces is changed. frame: placement of arrays with their margin.
+    tiles: marked where light from beside or behind a rim may arrive. frame: placement of arrays with their margin.
     """
-    tiles = _tiles(cuts, aperture, frame)
-    if not tiles.any():
-        return
-    lights = _lights([layer for cut in cuts for layer in cut.dense], [lit for cut in cuts for lit in cut.lights], tiles, aperture, frame)
-    views = _Views([each for cut in cuts for each in cut.surfaces if len(each.places)], aperture, frame)
-    list(pool.map(lambda block: views.see(colour, lights, tiles, block), _blocks(tiles, frame)))
+
+    cuts: Sequence[Cut]
+    aperture: Aperture
+    frame: Frame
+    tiles: Mask
+
+    @classmethod
+    def of(cls, cuts: Sequence[Cut], aperture: Aperture, frame: Frame) -> "Rims":
+        return cls(cuts, aperture, frame, _tiles(cuts, aperture, frame))
+
+    def take_lights(self) -> "list[_Lights]":
+        """Take lights whose blur reaches a rim out of the surfaces, which keep what is around them in their place."""
+        from mrbokeh.layering._pupil_views_numba import darken
+
+        found = []
+        for layer, surface, lit in (pair for cut in self.cuts for pair in cut.pairs):
+            width, places = layer.coc_px.shape[1], np.flatnonzero(lit)
+            places = places[self._reach_rims(places, layer.coc_px.reshape(-1)[places], width)]
+            flat, dark = layer.values.reshape(-1, layer.values.shape[2]), np.empty((len(places), 3), np.float32)
+            darken(dark, places, flat, width, float(LIGHT_OVER_SURROUNDINGS))
+            rgb = flat[places, :3] - dark
+            kept = rgb.max(axis=1, initial=0.0) > 0
+            found.append(_Lights(places[kept], rgb[kept], layer.coc_px.reshape(-1)[places[kept]]))
+            at = np.searchsorted(surface.places, places[kept])
+            there = (at < len(surface.places)) & (surface.places[np.minimum(at, len(surface.places) - 1)] == places[kept])
+            surface.values[at[there], :3] = dark[kept][there]
+        return found
+
+    def _reach_rims(self, places: Int64[np.ndarray, " lights"], coc_px: Sizes, width: int) -> Bool[np.ndarray, " lights"]:
+        from cv2 import integral
+
+        counts = integral(self.tiles.astype(np.uint8))
+        reach = np.ceil(0.5 * self.aperture.unit_radius * np.abs(coc_px)).astype(np.int64) + 1
+        row, column = places // width + self.frame.top_px, places % width + self.frame.left_px
+        rows, columns = self.tiles.shape
+        top, bottom = (np.clip(each // _TILE_PX, 0, rows) for each in (row - reach, row + reach + _TILE_PX))
+        left, right = (np.clip(each // _TILE_PX, 0, columns) for each in (column - reach, column + reach + _TILE_PX))
+        return counts[bottom, right] - counts[top, right] - counts[bottom, left] + counts[top, left] > 0
+
+    def put_lights(self, colour: Colour, lights: "Sequence[_Lights]") -> None:
+        """Add lights where they arrive past all that is nearer."""
+        from mrbokeh.layering._pupil_views_numba import add_cut_lights
+
+        if not any(len(each.places) for each in lights):
+            return
+        layers = [layer for cut in self.cuts for layer, _, _ in cut.pairs]
+        occluder_px, alpha = np.stack([each.coc_px for each in layers]), np.stack([each.values[..., 3] for each in layers])
+        nearest_px, radius = float(occluder_px.min()), self.aperture.unit_radius
+        for each in lights:
+            for which, kernel in _kernels(each.places, each.coc_px, self.aperture, self.frame):
+                lit = each.places[which], each.rgb[which], each.coc_px[which]
+                add_cut_lights(colour, -self.frame.left_px, *lit, kernel, radius, occluder_px, alpha, nearest_px)
+
+    def correct(self, colour: Colour, pool: Executor) -> None:
+        """Take back from a picture made of slices how far light and what hides it go together over the pupil."""
+        views = _Views([each for cut in self.cuts for each in cut.surfaces if len(each.places)], self.aperture, self.frame)
+        list(pool.map(lambda block: views.correct(colour, self.tiles, block), _blocks(self.tiles, self.frame)))
+
+
+@dataclass(frozen=True)
+class _Lights:
+    """Lights: places in the frame with its margin, light beyond what is around them, circles of confusion."""
+
+    places: Int64[np.ndarray, " lights"]
+    rgb: Float32[np.ndarray, "lights 3"]
+    coc_px: Float32[np.ndarray, " lights"]
 
 
 def _tiles(cuts: Sequence[Cut], aperture: Aperture, frame: Frame) -> Mask:
@@ -90,10 +164,10 @@ def _rims(cuts: Sequence[Cut]) -> Iterator[tuple[Places, Sizes]]:
     """Yield places beside which something hides something else, and the larger circle of confusion of both (without sign)."""
     from cv2 import erode
 
-    opaque_px = next(cut.surfaces[0].coc_px for cut in cuts if cut.layers[0].is_opaque)
+    opaque_px = next(cut.surfaces[0].coc_px for cut in cuts if cut.is_opaque)
     for cut in cuts:
-        if cut.layers[0].is_opaque:
-            for behind in (cut.surfaces[1], cut.surfaces[-1]):
+        if cut.is_opaque:
+            for behind in cut.hidden:
                 yield behind.places, np.maximum(np.abs(behind.coc_px), np.abs(opaque_px[behind.places]))
         for layer in cut.layers:
             if not layer.is_opaque:
@@ -112,26 +186,6 @@ def _blocks(tiles: Mask, frame: Frame) -> Iterator[tuple[int, int, int, int]]:
                 corners = (top + y.min(), top + y.max() + 1, left + x.min(), left + x.max() + 1)
                 first, end, begin, stop = (int(each) * _TILE_PX for each in corners)
                 yield first, min(end, frame.height_px), begin, min(stop, frame.width_px)
-
-
-def _lights(layers: Sequence[PaddedLayer], lights: Sequence[Mask], tiles: Mask, aperture: Aperture, frame: Frame) -> Colour:
-    """Return the light of highlights where it arrives in marked tiles (H, W, 3), and leave their surroundings' light in their place."""
-    from mrbokeh.layering._pupil_views_numba import add_cut_lights, darken
-
-    arrives = np.zeros((frame.height_px, frame.width_px, 3), np.float32)
-    occluder_px, alpha = np.stack([layer.coc_px for layer in layers]), np.stack([layer.values[..., 3] for layer in layers])
-    nearest_px = float(occluder_px.min())
-    for layer, lit in zip(layers, lights, strict=True):
-        width, flat = layer.coc_px.shape[1], layer.values.reshape(-1, layer.values.shape[2])
-        places = np.flatnonzero(lit)
-        dark = np.empty((len(places), 3), np.float32)
-        darken(dark, places, flat, width)
-        rgb, coc_px = flat[places, :3] - dark, layer.coc_px.reshape(-1)[places]
-        flat[places, :3] = dark
-        for which, kernel in _kernels(places, coc_px, aperture, frame):
-            each = places[which], rgb[which], coc_px[which]
-            add_cut_lights(arrives, tiles, _TILE_PX, -frame.left_px, *each, kernel, aperture.unit_radius, occluder_px, alpha, nearest_px)
-    return arrives
 
 
 def _kernels(
@@ -176,8 +230,8 @@ class _Views:
     @cached_property
     def _pupil(self) -> Float32[np.ndarray, "points 3"]:
         """x, y and the coverage from which on a pixel is there for a point: evenly spread for any group of points."""
-        points = pupil_points(self.aperture.seen(1), MOST_VIEWS).astype(np.float32)
-        points[:, 2] = (np.arange(1, MOST_VIEWS + 1, dtype=np.float32) * _GOLDEN) % 1.0
+        points = pupil_points(self.aperture.seen(1), _MOST_VIEWS).astype(np.float32)
+        points[:, 2] = (np.arange(1, _MOST_VIEWS + 1, dtype=np.float32) * _GOLDEN) % 1.0
         return points
 
     @cached_property
@@ -190,21 +244,18 @@ class _Views:
     def _reach_px(self) -> int:
         return int(np.ceil(0.5 * self.aperture.unit_radius * max(float(np.abs(each.coc_px).max()) for each in self.surfaces))) + _BESIDE_PX
 
-    def see(self, colour: Colour, lights: Colour, tiles: Mask, block: tuple[int, int, int, int]) -> None:
-        """Put the mean of all views in place of the slices in what is marked of a block."""
-        from mrbokeh.layering._pupil_views_numba import add_views, blend
+    def correct(self, colour: Colour, tiles: Mask, block: tuple[int, int, int, int]) -> None:
+        """Correct what is marked of a block."""
+        from mrbokeh.layering._pupil_views_numba import correlate, take_back
 
-        top, bottom, left, right = block
-        shape = bottom - top, right - left
-        seen = np.zeros((*shape, 9), np.float32)
-        seen[..., 6], seen[..., 7] = np.inf, -np.inf
-        cells = _cells_of(np.arange(top, bottom)[:, None], np.arange(left, right)[None], self.aperture, self.frame)
-        nearest, which = np.empty((shape[0] + 2, shape[1] + 2), np.float32), np.empty((shape[0] + 2, shape[1] + 2), np.int32)
-        window = self._window(block)
+        (top, bottom, left, right), window = block, self._window(block)
+        shape, around = (bottom - top, right - left), (bottom - top + 2, right - left + 2)
         largest_px = 2.0 * float(np.abs(window.range_px).max())
-        count = int(np.clip(largest_px**2 / _PX_PER_VIEW, LEAST_VIEWS, MOST_VIEWS))
-        add_views(seen, window, self._pupil[:count], cells, self._weights, nearest, which)
-        blend(colour, seen, lights, tiles, _TILE_PX, top, left, count, _TWO_SURFACES_PX, _ENOUGH, _NOISE)
+        points = int(np.clip(largest_px**2 / _PX_PER_VIEW, _LEAST_VIEWS, _MOST_VIEWS))
+        cells = _cells_of(np.arange(top, bottom)[:, None], np.arange(left, right)[None], self.aperture, self.frame)
+        sums, buffers = np.zeros((*shape, 9), np.float32), tuple(np.empty(around, dtype) for dtype in _BUFFERS)
+        correlate(sums, window, self._pupil[:points], cells, self._weights, _SURVEYED, buffers)
+        take_back(colour, sums, tiles, _TILE_PX, top, left, points, _NOISE)
 
     def _window(self, block: tuple[int, int, int, int]):  # type: ignore[no-untyped-def]
         """Collect the pixels of all surfaces that any view may show in a block."""
