@@ -13,11 +13,12 @@ _STEP_PX = np.float32(1.0)
 """Circles of confusion that differ by more belong to two surfaces (mrbokeh.layering.hidden_background)."""
 _SLACK_PX = np.float32(0.3)
 _HALF_A_STEP_PX = np.float32(0.5)
-_FAR = np.float32(np.inf)
+_FAR = np.float32(1e30)
 BEFORE_PX = np.int32(4096)
 """Whole pixels added to places before their fraction is cut off, so that it is cut downwards."""
 _LEAST = np.float32(1e-6)
 _LIT = np.float32(0.004)
+_MUCH = np.float32(0.1)
 
 
 class Window(NamedTuple):
@@ -292,11 +293,11 @@ def _free(
 
 
 @njit(cache=True, nogil=True)
-def darken(dark: np.ndarray, places: np.ndarray, values: np.ndarray, width: int, ratio: float) -> None:
+def darken(dark: np.ndarray, places: np.ndarray, values: np.ndarray, lit: np.ndarray, width: int, ratio: float) -> None:
     """Set dark (N, 3) to the light that each place would have if it were no light: its coverage times the median around, at most its own.
 
-    values: (rows * width, 4 or more) premultiplied; medians are of 5x5 pixels as far as they cover anything. A place that is not `ratio`
-    times as bright keeps its own light.
+    values: (rows * width, 4 or more) premultiplied, lit: (rows * width,) all lights; medians are of those of the 5x5 pixels that cover much
+    and are no lights. A place that is not `ratio` times as bright keeps its own light.
     """
     rows, around = len(values) // width, np.empty(25, np.float32)
     for i in range(len(places)):
@@ -306,7 +307,7 @@ def darken(dark: np.ndarray, places: np.ndarray, values: np.ndarray, width: int,
             for y in range(max(row - 2, 0), min(row + 3, rows)):
                 for x in range(max(column - 2, 0), min(column + 3, width)):
                     alpha = values[y * width + x, 3]
-                    if alpha > 0:
+                    if alpha > _MUCH and not lit[y * width + x]:
                         around[count] = values[y * width + x, c] / alpha
                         count += 1
             dark[i, c] = min(own[3] * np.median(around[:count]), own[c]) if count else 0.0

@@ -100,7 +100,7 @@ class Rims:
             width, places = layer.coc_px.shape[1], np.flatnonzero(lit)
             places = places[self._reach_rims(places, layer.coc_px.reshape(-1)[places], width)]
             flat, dark = layer.values.reshape(-1, layer.values.shape[2]), np.empty((len(places), 3), np.float32)
-            darken(dark, places, flat, width, float(LIGHT_OVER_SURROUNDINGS))
+            darken(dark, places, flat, lit.reshape(-1), width, float(LIGHT_OVER_SURROUNDINGS))
             rgb = flat[places, :3] - dark
             kept = rgb.max(axis=1, initial=0.0) > 0
             found.append(_Lights(places[kept], rgb[kept], layer.coc_px.reshape(-1)[places[kept]]))
