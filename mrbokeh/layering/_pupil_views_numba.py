@@ -12,7 +12,6 @@ from mrbokeh.system.compiled import njit
 _STEP_PX = np.float32(1.0)
 """Circles of confusion that differ by more belong to two surfaces (mrbokeh.layering.hidden_background)."""
 _SLACK_PX = np.float32(0.3)
-_HALF_A_STEP_PX = np.float32(0.5)
 _FAR = np.float32(1e30)
 BEFORE_PX = np.int32(4096)
 """Whole pixels added to places before their fraction is cut off, so that it is cut downwards."""
@@ -24,8 +23,8 @@ _MUCH = np.float32(0.1)
 class Window(NamedTuple):
     """Pixels of all surfaces around a block, surface by surface, row by row.
 
-    x_px, y_px: (N,) middles, from the corner of the block's margin of one pixel; half_px: (N,) half their circle of confusion;
-    alpha: (N,); rgb: (N, 3) not premultiplied; starts: (surfaces, rows + 1) where rows begin; top_px: the first row, from the same corner.
+    x_px, y_px: (N,) middles, from the block's corner (x by BEFORE_PX more); half_px: (N,) half their circle of confusion;
+    alpha: (N,); rgb: (N, 3) not premultiplied; starts: (surfaces, rows + 1) where rows begin; top_px: the first row, from there.
     range_px: (2,) the least and the greatest of half_px.
     """
 
@@ -64,7 +63,7 @@ def collect(
 ) -> int:
     """Add the pixels of one surface that lie in a box (top, bottom, left, right) to a window from its pixel `first` on; return its end.
 
-    origin: row and column of the corner of the block's margin.
+    origin: row and column of the block's corner.
     """
     top, bottom, left, right = box
     count = first
@@ -91,136 +90,106 @@ def collect(
 def correlate(
     sums: np.ndarray,
     window: Window,
+    groups: np.ndarray,
     pupil: np.ndarray,
     cells: np.ndarray,
     weights: np.ndarray,
-    surveyed: int,
-    buffers: tuple[np.ndarray, ...],
+    nearest: np.ndarray,
+    which: np.ndarray,
 ) -> None:
-    """Look through the points of the pupil at a window's surfaces, parted at each pixel halfway between the nearest and the farthest seen.
+    """Look through the points of the pupil at groups of a window's surfaces, and at what each group hides.
 
-    sums: (rows, columns, 9) of a block: over points that see something far, of its r, g, b, of the same where something near hides it, of
-    weights, of those where it is hidden, and of the squares of r, g and b. pupil: (K, 3) x, y, and the coverage from which on a pixel is
-    there. cells: (rows, columns) which row of weights (cells, K) holds. surveyed: points that look for the nearest and the farthest.
-    buffers: five of (rows + 2, columns + 2) to work in: half circles of confusion and numbers of the nearest and of the next surface, and
-    where they part.
+    sums: (rows, columns, groups - 1, 9) of a block: for each group but the last, over the points that see something behind it: weights, of
+    those in whose way it lies, r, g, b of what is behind, the same where it is hidden, and the squares of r, g and b. groups: (surfaces,)
+    group of each, front first. pupil: (K, 3) x, y, and the coverage from which on a pixel is there. cells: (rows, columns) which row of
+    weights (cells, K) holds. nearest, which: (groups, rows, columns) to work in.
     """
-    nearest, which, second, second_which, parts = buffers
-    columns = sums.shape[1]
-    farthest = np.full_like(nearest, -_FAR)
-    parts[:] = _FAR
-    for k in range(min(surveyed, len(pupil))):
-        _view(nearest, which, second, second_which, window, pupil[k, 0], pupil[k, 1], pupil[k, 2])
-        for row in range(len(parts)):
-            for column in range(columns + 2):
-                if which[row, column] >= 0:
-                    parts[row, column] = min(parts[row, column], nearest[row, column])
-                    last = second[row, column] if second_which[row, column] >= 0 else nearest[row, column]
-                    farthest[row, column] = max(farthest[row, column], last)
-    for row in range(len(parts)):
-        for column in range(columns + 2):
-            apart = farthest[row, column] - parts[row, column]
-            parts[row, column] = np.float32(0.5) * (parts[row, column] + farthest[row, column]) if apart > _HALF_A_STEP_PX else -_FAR
     for k in range(len(pupil)):
-        _view(nearest, which, second, second_which, window, pupil[k, 0], pupil[k, 1], pupil[k, 2])
-        _add_view(sums, buffers, window.rgb, cells, weights[:, k])
+        _view(nearest, which, window, groups, pupil[k, 0], pupil[k, 1], pupil[k, 2])
+        _add_view(sums, which, window.rgb, cells, weights[:, k])
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _add_view(sums: np.ndarray, buffers: tuple[np.ndarray, ...], rgb: np.ndarray, cells: np.ndarray, weights: np.ndarray) -> None:
+def _add_view(sums: np.ndarray, which: np.ndarray, rgb: np.ndarray, cells: np.ndarray, weights: np.ndarray) -> None:
     """Add one view to the sums (see `correlate`). weights: (cells,) of this point."""
-    nearest, which, second, second_which, parts = buffers
-    rows, columns, _ = sums.shape
+    rows, columns, steps, _ = sums.shape
     for row in range(rows):
-        found, cell = sums[row], cells[row]
         for column in range(columns):
-            hidden = nearest[row + 1, column + 1] < parts[row + 1, column + 1]
-            i = second_which[row + 1, column + 1] if hidden else which[row + 1, column + 1]
-            weight = weights[cell[column]]
-            if i < 0 or weight <= 0 or (hidden and second[row + 1, column + 1] < parts[row + 1, column + 1]):
+            weight, behind = weights[cells[row, column]], which[steps, row, column]
+            if weight <= 0:
                 continue
-            red, green, blue, over = (
-                weight * rgb[i, 0],
-                weight * rgb[i, 1],
-                weight * rgb[i, 2],
-                np.float32(1.0) if hidden else np.float32(0.0),
-            )
-            found[column, 0] += red
-            found[column, 1] += green
-            found[column, 2] += blue
-            found[column, 3] += over * red
-            found[column, 4] += over * green
-            found[column, 5] += over * blue
-            found[column, 6] += weight
-            found[column, 7] += over * weight
-            found[column, 8] += red * rgb[i, 0] + green * rgb[i, 1] + blue * rgb[i, 2]
+            for group in range(steps - 1, -1, -1):
+                before = which[group, row, column]
+                if behind >= 0:
+                    found, over = sums[row, column, group], np.float32(1.0) if before >= 0 else np.float32(0.0)
+                    red, green, blue = weight * rgb[behind, 0], weight * rgb[behind, 1], weight * rgb[behind, 2]
+                    found[0] += weight
+                    found[1] += over * weight
+                    found[2] += red
+                    found[3] += green
+                    found[4] += blue
+                    found[5] += over * red
+                    found[6] += over * green
+                    found[7] += over * blue
+                    found[8] += red * rgb[behind, 0] + green * rgb[behind, 1] + blue * rgb[behind, 2]
+                if before >= 0:
+                    behind = before
 
 
 @njit(cache=True, nogil=True, fastmath=True)
 def _view(
-    nearest: np.ndarray,
-    which: np.ndarray,
-    second: np.ndarray,
-    second_which: np.ndarray,
-    window: Window,
-    u: np.float32,
-    v: np.float32,
-    threshold: np.float32,
+    nearest: np.ndarray, which: np.ndarray, window: Window, groups: np.ndarray, u: np.float32, v: np.float32, threshold: np.float32
 ) -> None:
-    """Find the nearest pixel of the window at each pixel of the block seen from the point (u, v) of the pupil, and that of the next surface.
-
-    -1 where there is none.
-    """
-    rows, columns = nearest.shape
-    for row in range(rows):
-        for column in range(columns):
-            nearest[row, column], which[row, column] = _FAR, -1
-            second[row, column], second_which[row, column] = _FAR, -1
+    """Find the nearest pixel of each group between every pixel of a block and the point (u, v) of the pupil; -1 where there is none."""
+    _, rows, columns = nearest.shape
+    nearest[:], which[:] = _FAR, -1
     low_px, high_px = min(v * window.range_px[0], v * window.range_px[1]), max(v * window.range_px[0], v * window.range_px[1])
     last = window.starts.shape[1] - 1
     first = min(max(np.int64(np.floor(-high_px)) - 1 - window.top_px, 0), last)
     end = min(max(np.int64(np.ceil(rows - low_px)) + 1 - window.top_px, first), last)
     x_px, halves_px, alpha = window.x_px, window.half_px, window.alpha
     for surface in range(len(window.starts)):
+        near, numbers = nearest[groups[surface]], which[groups[surface]]
         for line in range(first, end):
             y_px = np.float32(line + window.top_px) + np.float32(0.5) + BEFORE_PX
             for i in range(window.starts[surface, line], window.starts[surface, line + 1]):
                 half_px = halves_px[i]
                 row = np.uint32(np.int32(y_px + v * half_px) - BEFORE_PX)
                 column = np.uint32(np.int32(x_px[i] + u * half_px) - BEFORE_PX)
-                if row < np.uint32(rows) and column < np.uint32(columns) and half_px < second[row, column] and alpha[i] > threshold:
-                    there_px = nearest[row, column]
-                    if half_px < there_px:
-                        if there_px - half_px > _HALF_A_STEP_PX:
-                            second[row, column], second_which[row, column] = there_px, which[row, column]
-                        nearest[row, column], which[row, column] = half_px, i
-                    elif half_px - there_px > _HALF_A_STEP_PX:
-                        second[row, column], second_which[row, column] = half_px, i
+                if row < np.uint32(rows) and column < np.uint32(columns) and half_px < near[row, column] and alpha[i] > threshold:
+                    near[row, column], numbers[row, column] = half_px, i
 
 
 @njit(cache=True, nogil=True)
 def take_back(
     colour: np.ndarray, sums: np.ndarray, tiles: np.ndarray, tile_px: int, top: int, left: int, points: int, noise: float
 ) -> None:
-    """Subtract from colour (H, W, 3 or more) of a block, in marked tiles, how far light and what hides it go together (see `correlate`).
+    """Subtract from colour (H, W, 3 or more), in marked tiles of a block, how far groups and what they hide go together (`correlate`).
 
     It counts by its square over that and the square of what chance makes of so few points.
     """
-    rows, columns, _ = sums.shape
+    rows, columns, steps, _ = sums.shape
+    change = np.empty(3, np.float32)
     for row in range(rows):
         for column in range(columns):
-            found, y, x = sums[row, column], top + row, left + column
-            if found[7] <= 0 or found[7] >= found[6] or not tiles[y // tile_px, x // tile_px]:
+            y, x, free = top + row, left + column, np.float32(1.0)
+            if not tiles[y // tile_px, x // tile_px]:
                 continue
-            hidden, square, spread = found[7] / found[6], np.float32(0.0), found[8] / found[6]
-            for c in range(3):
-                mean = found[c] / found[6]
-                found[c] = found[3 + c] / found[6] - hidden * mean
-                square, spread = square + found[c] * found[c], spread - mean * mean
-            chance = noise * hidden * (np.float32(1.0) - hidden) * max(spread, np.float32(0.0)) / points
-            counts = square / max(square + chance, _LEAST * _LEAST)
-            for c in range(3):
-                colour[y, x, c] = max(colour[y, x, c] - counts * found[c], np.float32(0.0))
+            for group in range(steps):
+                found = sums[row, column, group]
+                if found[1] <= 0 or found[1] >= found[0]:
+                    free = free if found[1] <= 0 else np.float32(0.0)
+                    continue
+                hidden, square, spread = found[1] / found[0], np.float32(0.0), found[8] / found[0]
+                for c in range(3):
+                    mean = found[2 + c] / found[0]
+                    change[c] = found[5 + c] / found[0] - hidden * mean
+                    square, spread = square + change[c] * change[c], spread - mean * mean
+                chance = noise * hidden * (np.float32(1.0) - hidden) * max(spread, np.float32(0.0)) / points
+                counts = free * square / max(square + chance, _LEAST * _LEAST)
+                for c in range(3):
+                    colour[y, x, c] = max(colour[y, x, c] - counts * change[c], np.float32(0.0))
+                free *= np.float32(1.0) - hidden
 
 
 @njit(cache=True, nogil=True)

@@ -72,7 +72,7 @@ def render_layers(layers: Sequence[Layer], lens: Lens, kernel_sum: KernelSum | P
     with ThreadPoolExecutor(cores()) as pool:
         slicing = Slicing(psf=psf, slices=layering.slices, frame=frame, pool=pool, memory=_KEPT)
         groups = _groups([pad_layer(layer, each, margin, pool) for layer, each in zip(layers, coc_px, strict=True)])
-        cuts = [_cut(group, layering.fill, pool) for group in groups]
+        cuts = [_cut(group, layering, pool) for group in groups]
         rims = _rims(cuts, psf, frame) if layering.sees_rims and layering.fill else None
         lights = rims.take_lights() if rims else []
         found: tuple[Channels, Channels] | None = None
@@ -87,9 +87,9 @@ def render_layers(layers: Sequence[Layer], lens: Lens, kernel_sum: KernelSum | P
     return _as_layer(*found, layers)
 
 
-def _cut(group: Sequence[PaddedLayer], fill: bool, pool: Executor) -> Cut:
-    lights = [find_highlights(layer.values) for layer in group]
-    pixels = _with_hidden(group, pool) if fill and group[0].is_opaque else [Pixels.covered(layer) for layer in group]
+def _cut(group: Sequence[PaddedLayer], layering: Layering, pool: Executor) -> Cut:
+    lights = [find_highlights(layer.values) for layer in group] if layering.sees_rims else []
+    pixels = _with_hidden(group, pool) if layering.fill and group[0].is_opaque else [Pixels.covered(layer) for layer in group]
     return Cut(group, pixels, lights)
 
 

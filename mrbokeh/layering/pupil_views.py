@@ -1,19 +1,21 @@
-"""Rims as the pupil sees them: surfaces looked at from many points of it, and lights cut by what is nearer.
+"""What slices cannot know at rims: which part of the pupil is taken.
 
-Slices know how much of the pupil is taken, not which part of it. Where two edges cross the pupil, or a lamp stands behind a rim, that is
-not enough: what a near edge leaves free may be just what the next one hides. So near rims the layers are seen from points spread evenly
-over the pupil, one pinhole picture from each (every pixel moved by its share of its circle of confusion, the nearest wins), and their
-mean takes the place of the slices. Pixels that cover a share are there for that share of the points. Lights are far too bright for so few
-points: each is spread by its own kernel, and every pixel of it looks along its one ray whether the way to the light is free.
+Layers that lie over one another are blurred by themselves, then the front hides as much of what is behind as it covers. That is right
+only where both take parts of the pupil that have nothing to do with each other: beside a rim in front the free part of the pupil may see just the
+bright side of an edge behind. How far they go together (their covariance) is found by looking at the layers from points spread evenly over
+the pupil: one pinhole picture from each, in which every pixel moves by its share of its circle of confusion and the nearest wins. Only this
+difference is taken from so few points, as much of it as chance does not explain; coverage and light come from the renderer. A pixel that
+covers a share is there for that share of the points.
 
-Elsewhere the slices stay, which are exact there. The more of the pupil sees another surface, the more the views count.
+Lights are too bright for that. Those whose blur reaches a rim are taken out before, spread by their own kernels, and at each pixel of its
+blur one sees along single rays whether something nearer is in the way: a lamp behind a twig is cut by it as by a knife.
 """
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64
@@ -24,13 +26,14 @@ from mrbokeh.layering.psf_over_field import FIELD_CELLS, Frame
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.pupil_points import pupil_points, transmission
 
+if TYPE_CHECKING:
+    from mrbokeh.layering._pupil_views_numba import Window
+
 _LEAST_VIEWS, _MOST_VIEWS, _PX_PER_VIEW = 24, 96, 6.0
 _TILE_PX, _BLOCK_ROWS, _BLOCK_COLUMNS = 16, 96, 192
 _BESIDE_PX = 2
-_SURVEYED = 16
-_BUFFERS = (np.float32, np.int32, np.float32, np.int32, np.float32)
 _NOISE = 0.8
-_SIZES_PER_PX = 8
+_SIZES_PER_PX = 64
 _GOLDEN = np.float32(0.5 * (5.0**0.5 - 1.0))
 
 Mask = Bool[np.ndarray, "_ _"]
@@ -135,8 +138,12 @@ class Rims:
                 add_cut_lights(colour, -self.frame.left_px, *lit, kernel, radius, occluder_px, alpha, nearest_px)
 
     def correct(self, colour: Colour, pool: Executor) -> None:
-        """Take back from a picture made of slices how far light and what hides it go together over the pupil."""
-        views = _Views([each for cut in self.cuts for each in cut.surfaces if len(each.places)], self.aperture, self.frame)
+        """Take back, where cuts were laid over one another, how far light and what hides it go together over the pupil."""
+        if len(self.cuts) == 1:
+            return
+        surfaces = [(each, group) for group, cut in enumerate(self.cuts) for each in cut.surfaces if len(each.places)]
+        groups = np.array([group for _, group in surfaces])
+        views = _Views([each for each, _ in surfaces], groups, self.aperture, self.frame)
         list(pool.map(lambda block: views.correct(colour, self.tiles, block), _blocks(self.tiles, self.frame)))
 
 
@@ -224,14 +231,16 @@ class _Views:
     """Pinhole pictures of surfaces from points of the pupil, block by block of the picture."""
 
     surfaces: Sequence[Pixels]
+    groups: Int64[np.ndarray, " surfaces"]
     aperture: Aperture
     frame: Frame
 
     @cached_property
     def _pupil(self) -> Float32[np.ndarray, "points 3"]:
         """x, y and the coverage from which on a pixel is there for a point: evenly spread for any group of points."""
-        points = pupil_points(self.aperture.seen(1), _MOST_VIEWS).astype(np.float32)
-        points[:, 2] = (np.arange(1, _MOST_VIEWS + 1, dtype=np.float32) * _GOLDEN) % 1.0
+        count = int(np.clip((2.0 * self._reach_px) ** 2 / _PX_PER_VIEW, _LEAST_VIEWS, _MOST_VIEWS))
+        points = pupil_points(self.aperture.seen(1), count).astype(np.float32)
+        points[:, 2] = (np.arange(1, count + 1, dtype=np.float32) * _GOLDEN) % 1.0
         return points
 
     @cached_property
@@ -248,16 +257,15 @@ class _Views:
         """Correct what is marked of a block."""
         from mrbokeh.layering._pupil_views_numba import correlate, take_back
 
-        (top, bottom, left, right), window = block, self._window(block)
-        shape, around = (bottom - top, right - left), (bottom - top + 2, right - left + 2)
-        largest_px = 2.0 * float(np.abs(window.range_px).max())
-        points = int(np.clip(largest_px**2 / _PX_PER_VIEW, _LEAST_VIEWS, _MOST_VIEWS))
+        top, bottom, left, right = block
         cells = _cells_of(np.arange(top, bottom)[:, None], np.arange(left, right)[None], self.aperture, self.frame)
-        sums, buffers = np.zeros((*shape, 9), np.float32), tuple(np.empty(around, dtype) for dtype in _BUFFERS)
-        correlate(sums, window, self._pupil[:points], cells, self._weights, _SURVEYED, buffers)
-        take_back(colour, sums, tiles, _TILE_PX, top, left, points, _NOISE)
+        count, shape = int(self.groups[-1]) + 1, (bottom - top, right - left)
+        sums = np.zeros((*shape, count - 1, 9), np.float32)
+        nearest, which = np.empty((count, *shape), np.float32), np.empty((count, *shape), np.int32)
+        correlate(sums, self._window(block), self.groups, self._pupil, cells, self._weights, nearest, which)
+        take_back(colour, sums, tiles, _TILE_PX, top, left, len(self._pupil), _NOISE)
 
-    def _window(self, block: tuple[int, int, int, int]):  # type: ignore[no-untyped-def]
+    def _window(self, block: tuple[int, int, int, int]) -> "Window":
         """Collect the pixels of all surfaces that any view may show in a block."""
         from mrbokeh.layering._pupil_views_numba import Window, collect
 
@@ -277,9 +285,9 @@ class _Views:
             rgb=np.empty((most, 3), np.float32),
             starts=starts,
             range_px=np.array([np.inf, -np.inf], np.float32),
-            top_px=box[0] - (top - 1),
+            top_px=box[0] - top,
         )
         end = 0
         for number, each in enumerate(self.surfaces):
-            end = collect(window, number, end, (top - 1, left - 1), box, width, each.places, each.values, each.coc_px)
+            end = collect(window, number, end, (top, left), box, width, each.places, each.values, each.coc_px)
         return window
