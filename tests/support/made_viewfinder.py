@@ -96,6 +96,9 @@ class MadeControls:
             can_capture=True,
             can_record=True,
             recording=self.values.get("recording", False),
+            recorded_s=self.values.get("recorded_s"),
+            room_s=self.values.get("room_s"),
+            notices=self.values.get("notices", []),
             smoothing=self.values.get("smoothing", False),
             failure=None,
         )

@@ -179,10 +179,28 @@ async def capture_and_record(page: Page, made: Made) -> None:
     await page.tap("#record")
     await page.comes_true("document.getElementById('record').getAttribute('aria-pressed') === 'true'")
     assert made.controls.asked[-1] == ("recording", True)
+    await tell_of_the_take(page, made)
     # What others set is followed.
     made.controls.set_lens("fifty")
     made.controls.focus_at_distance(4.0)
     await page.comes_true("document.getElementById('lens').value === 'fifty' && document.getElementById('metres').textContent === '4.00 m'")
+
+
+async def tell_of_the_take(page: Page, made: Made) -> None:
+    """A red frame, how long it is, how long the disk will do, and what became of it."""
+    frame = "getComputedStyle(document.getElementById('stage'), '::after').borderTopColor"
+    assert await page.value(frame) == "rgb(221, 51, 51)"
+    made.controls.values |= {"recorded_s": 75.0, "room_s": 7200.0}
+    await page.comes_true("/^1:1[5-9]$/.test(document.getElementById('timer').textContent)")
+    made.controls.values["room_s"] = 130.5
+    await page.comes_true("/^1:1\\d · disk full in 2:10$/.test(document.getElementById('timer').textContent)")
+    made.controls.values |= {"recording": False, "notices": [{"number": 1, "sentence": "saved a.mp4"}, {"number": 2, "sentence": "room"}]}
+    await page.comes_true(f"{MESSAGE} === 'saved a.mp4 · room' && document.getElementById('timer').hidden")
+    # Each is shown once.
+    await page.value("viewfinder.model.say('')")
+    made.controls.values["notices"] = [{"number": 2, "sentence": "room"}, {"number": 3, "sentence": "saved b.mp4"}]
+    await page.comes_true(f"{MESSAGE} === 'saved b.mp4'")
+    assert await page.value(frame) != "rgb(221, 51, 51)"
 
 
 async def test_marks_are_drawn_where_the_picture_has_edges_on_the_real_and_the_virtual_apart(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ import asyncio
 import gc
 import json
 import os
+import shutil
 import socket
 import sys
 import threading
@@ -24,11 +25,13 @@ from mrbokeh.images.layer import clear
 from mrbokeh.optics.camera import Camera
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
+from mrbokeh.video.clip import read_frames
 from mrbokeh.video.color import code_from_linear, linear_from_code
 from tests.support.layer_viewfinder import HEIGHT, LENS, WIDTH, bright_square, running, set_focus, until, viewfinder, watching
 from tests.support.live_clip import write_live_clip
 from tests.support.live_viewfinder import Live, live
 from tests.support.refusals import refused
+from tests.support.streaming_viewers import noise, output
 from tests.support.told_parts import ToldCamera, ToldTracker
 from tests.support.waiting import comes_true
 from viewfinder.app.live_compositor import LiveCompositor
@@ -43,6 +46,8 @@ from viewfinder.sources.choose import open_source
 from viewfinder.sources.frame_source import ExactSize, SizeLimit
 from viewfinder.sources.playback import PatternSource, VideoFileSource
 from viewfinder.stage.static_layer import StaticLayer
+from viewfinder.streaming.recording import Recorder
+from viewfinder.streaming.take_file import playable_bytes
 from viewfinder.tracking.tracker import TrackedPose
 
 
@@ -189,6 +194,22 @@ def test_a_file_plays_in_its_own_time(plate: tuple[Path, np.ndarray]) -> None:
         assert times_s[-1] - times_s[0] == pytest.approx((20 // every - 1) * every / 50, abs=0.1)
     refused("aspect ratio", next, ExactSize(open_source(str(plate[0])), 100, 100).frames(Event()))
     assert next(ExactSize(open_source(str(plate[0])), 320, 180).frames(Event())).bgr.shape == (180, 320, 3)
+
+
+def test_a_take_that_was_cut_off_is_recovered_and_told_of_at_the_next_start(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    left, recorder = tmp_path / "viewfinder-1.recording.mp4", Recorder(lambda: "bt709", lambda _: None, waiting=100)
+    recorder.start(tmp_path / "viewfinder-2.mp4")
+    for i in range(60):
+        recorder.show(output(noise(i), i, i / 30))
+    comes = time.monotonic() + 20
+    while not left.exists() or playable_bytes(left.open("rb")) == 0:
+        assert time.monotonic() < comes
+        shutil.copy(next(tmp_path.glob("*2.recording.mp4"), __file__), left)
+    recorder.stop()
+    with viewfinder(PatternSource(WIDTH, HEIGHT), tmp_path) as running_one:
+        [notice] = running_one.site.controls.state()["notices"]
+    assert "viewfinder-1.mp4" in notice["sentence"] and notice["sentence"] in capsys.readouterr().out
+    assert len(list(read_frames(tmp_path / "viewfinder-1.mp4"))) >= 15, "half a second"
 
 
 async def test_a_slow_viewer_skips_frames_and_sees_the_newest(plate: tuple[Path, np.ndarray]) -> None:

@@ -1,7 +1,8 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 78dec699af0ee159284529b425d4af1e7eb9c4f8919bdc5bcdedf92f77a4e690
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: d9b9c5446e06dd2b2ecc575b476e33bc423fa891ab1e009f2fc0a23bddba7eaa
 "use strict";
 (() => {
   // src/model.ts
+  var NOTICE_S = 10;
   var Model = class extends EventTarget {
     state = null;
     shown = null;
@@ -9,9 +10,14 @@
     sentence = "";
     silence = 0;
     failing = false;
+    noticed = 0;
     setState(state) {
       this.state = state;
       this.dispatchEvent(new Event("state"));
+      const unseen = (state.notices ?? []).filter((each) => each.number > this.noticed);
+      if (unseen.length === 0) return;
+      this.noticed = Math.max(...unseen.map((each) => each.number));
+      this.say(unseen.map((each) => each.sentence).join(" · "), NOTICE_S);
     }
     show(frame) {
       this.shown = frame;

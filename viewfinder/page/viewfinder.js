@@ -1,7 +1,8 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 78dec699af0ee159284529b425d4af1e7eb9c4f8919bdc5bcdedf92f77a4e690
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: d9b9c5446e06dd2b2ecc575b476e33bc423fa891ab1e009f2fc0a23bddba7eaa
 "use strict";
 (() => {
   // src/model.ts
+  var NOTICE_S = 10;
   var Model = class extends EventTarget {
     state = null;
     shown = null;
@@ -9,9 +10,14 @@
     sentence = "";
     silence = 0;
     failing = false;
+    noticed = 0;
     setState(state) {
       this.state = state;
       this.dispatchEvent(new Event("state"));
+      const unseen = (state.notices ?? []).filter((each) => each.number > this.noticed);
+      if (unseen.length === 0) return;
+      this.noticed = Math.max(...unseen.map((each) => each.number));
+      this.say(unseen.map((each) => each.sentence).join(" · "), NOTICE_S);
     }
     show(frame) {
       this.shown = frame;
@@ -422,13 +428,17 @@
     if (name === void 0) return "";
     return name === null ? "from the file of the lens" : name.startsWith("by ") ? name : `from ${name}`;
   }
+  var SHORT_OF_ROOM_S = 300;
   var Shutter = class extends HTMLElement {
+    began_ms = 0;
     connectedCallback() {
-      this.innerHTML = `<button id="record" aria-label="record" aria-pressed="false"></button>
+      this.innerHTML = `<output id="timer" aria-live="off" hidden></output>
+      <button id="record" aria-label="record" aria-pressed="false"></button>
       <button id="capture" aria-label="capture"></button>`;
       this.button("capture").addEventListener("click", () => void this.capture());
       this.button("record").addEventListener("click", () => void this.record());
       model.addEventListener("state", () => this.onState());
+      setInterval(() => this.showTime(), 250);
     }
     button(id) {
       return this.querySelector(`#${id}`);
@@ -445,14 +455,30 @@
       await refreshState().catch(() => void 0);
     }
     onState() {
-      const { can_capture, can_record, recording } = model.state;
+      const { can_capture, can_record, recording, recorded_s } = model.state;
+      this.began_ms = performance.now() - 1e3 * (recorded_s ?? 0);
+      document.body.classList.toggle("recording", recording === true);
+      this.showTime();
       this.button("capture").hidden = !can_capture;
       this.button("record").hidden = !can_record;
       this.button("capture").disabled = this.button("record").disabled = !model.mayControl;
       this.button("record").setAttribute("aria-pressed", String(recording === true));
       this.hidden = !can_capture && !can_record;
     }
+    /** How long the take is, and how much longer the disk will do where that is not long. */
+    showTime() {
+      const { recording, room_s } = model.state ?? {};
+      const timer = this.querySelector("#timer");
+      timer.hidden = recording !== true;
+      const short = room_s !== void 0 && room_s !== null && room_s < SHORT_OF_ROOM_S;
+      timer.textContent = minutes(performance.now() - this.began_ms) + (short ? ` · disk full in ${minutes(1e3 * room_s)}` : "");
+      timer.classList.toggle("short", short);
+    }
   };
+  function minutes(time_ms) {
+    const seconds = Math.floor(time_ms / 1e3);
+    return `${Math.floor(seconds / 60)}:${String(seconds % 60).padStart(2, "0")}`;
+  }
   var WAYS = { whep: "video", jpeg: "pictures" };
   var Readout = class extends HTMLElement {
     connectedCallback() {

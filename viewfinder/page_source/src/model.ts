@@ -28,6 +28,11 @@ export interface State {
   can_capture?: boolean;
   can_record?: boolean;
   recording?: boolean;
+  /** Of the take under way; how much longer the disk will do. */
+  recorded_s?: number | null;
+  room_s?: number | null;
+  /** What happened by itself, such as a full disk; numbers grow. */
+  notices?: { number: number; sentence: string }[];
   smoothing?: boolean | null;
   failure?: string | null;
 }
@@ -52,6 +57,8 @@ export interface ShownFrame {
   header: FrameHeader | null;
 }
 
+const NOTICE_S = 10;
+
 class Model extends EventTarget {
   state: State | null = null;
   shown: ShownFrame | null = null;
@@ -59,10 +66,15 @@ class Model extends EventTarget {
   sentence = "";
   private silence = 0;
   private failing = false;
+  private noticed = 0;
 
   setState(state: State): void {
     this.state = state;
     this.dispatchEvent(new Event("state"));
+    const unseen = (state.notices ?? []).filter((each) => each.number > this.noticed);
+    if (unseen.length === 0) return;
+    this.noticed = Math.max(...unseen.map((each) => each.number));
+    this.say(unseen.map((each) => each.sentence).join(" · "), NOTICE_S);
   }
 
   show(frame: ShownFrame): void {
