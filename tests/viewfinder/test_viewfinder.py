@@ -33,7 +33,7 @@ from tests.support.live_viewfinder import Live, live
 from tests.support.refusals import refused
 from tests.support.streaming_viewers import noise, output
 from tests.support.told_parts import ToldCamera, ToldTracker
-from tests.support.waiting import comes_true
+from tests.support.waiting import comes_true, wait_until
 from viewfinder.app.live_compositor import LiveCompositor
 from viewfinder.app.live_controls import Captures
 from viewfinder.app.opening import LensBook, Parts
@@ -201,10 +201,14 @@ def test_a_take_that_was_cut_off_is_recovered_and_told_of_at_the_next_start(tmp_
     recorder.start(tmp_path / "viewfinder-2.mp4")
     for i in range(60):
         recorder.show(output(noise(i), i, i / 30))
-    comes = time.monotonic() + 20
-    while not left.exists() or playable_bytes(left.open("rb")) == 0:
-        assert time.monotonic() < comes
-        shutil.copy(next(tmp_path.glob("*2.recording.mp4"), __file__), left)
+
+    def is_copied() -> bool:
+        for working in tmp_path.glob("*2.recording.mp4"):
+            shutil.copy(working, left)
+        with left.open("ab+") as file:
+            return playable_bytes(file) > 0
+
+    wait_until(is_copied)
     recorder.stop()
     with viewfinder(PatternSource(WIDTH, HEIGHT), tmp_path) as running_one:
         [notice] = running_one.site.controls.state()["notices"]
