@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: d9b9c5446e06dd2b2ecc575b476e33bc423fa891ab1e009f2fc0a23bddba7eaa
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 3e0d38026f631f496512214ebd5c6c53fc87a0ee0d921739873f7332c7d6479d
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: d9b9c5446e06dd2b2ecc575b476e33bc423fa891ab1e009f2fc0a23bddba7eaa
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 3e0d38026f631f496512214ebd5c6c53fc87a0ee0d921739873f7332c7d6479d
 "use strict";
 (() => {
   // src/model.ts
@@ -838,6 +838,8 @@ void main() {
     </div>
     <canvas id="histogram" width="128" height="48" hidden aria-label="histogram"></canvas>
     <span id="tracking" hidden></span>
+    <p id="remark" role="status" hidden></p>
+    <svg id="arrow" viewBox="-12 -12 24 24" hidden aria-hidden="true"><path d="M-9 -5H1V-10L11 0L1 10V5H-9Z"/></svg>
     <p id="message" role="status">connecting</p>`;
       this.stage = this.find("stage");
       this.zoom = new Zoom(this, this.stage);
@@ -846,6 +848,7 @@ void main() {
       showLevel(this.find("level"), () => aids.has("level"));
       listen(this, this.gestures());
       model.addEventListener("frame", () => this.onFrame());
+      model.addEventListener("state", () => this.showRemark(model.state?.remark ?? null));
       model.addEventListener("sentence", () => this.find("message").textContent = model.sentence);
       aids.addEventListener("change", () => this.onAids());
       this.onAids();
@@ -887,7 +890,22 @@ void main() {
         this.marks.draw(pixels, { peakReal: aids.has("peakReal"), peakVirtual: aids.has("peakVirtual"), zebra: aids.has("zebra") });
         if (aids.has("histogram")) this.histogram.draw(this.marks);
       }
-      if (header) this.showTracking(header.tracking ?? null, header.tracking_unsure === true);
+      if (!header) return;
+      this.showTracking(header.tracking ?? null, header.tracking_unsure === true);
+      this.showRemark(header.remark ?? null);
+    }
+    /** A sentence at the top, and an arrow near the edge where the object went out of the picture. */
+    showRemark(remark) {
+      const line = this.find("remark");
+      const arrow = this.find("arrow");
+      line.hidden = remark === null;
+      arrow.toggleAttribute("hidden", !remark?.arrow);
+      if (remark !== null && line.textContent !== remark.sentence) line.textContent = remark.sentence;
+      if (!remark?.arrow) return;
+      const [right, down] = remark.arrow;
+      const reach = 42 / Math.max(Math.abs(right), Math.abs(down));
+      [arrow.style.left, arrow.style.top] = [`${50 + reach * right}%`, `${50 + reach * down}%`];
+      arrow.style.transform = `translate(-50%, -50%) rotate(${Math.atan2(down, right)}rad)`;
     }
     get marking() {
       return ["peakReal", "peakVirtual", "zebra", "histogram"].some((aid) => aids.has(aid));
