@@ -18,6 +18,7 @@ from mrbokeh.video.color import code_from_linear
 from tests.support.made_viewfinder import LENS_RGB, VIEW_RGB, Made, made_viewfinder
 from tests.support.streaming_viewers import BARS, Feed, bars, output, serving_routes, streaming
 from tests.support.waiting import comes_true
+from viewfinder.frames import Remark
 from viewfinder.server.access import LOOPBACK_NAMES, Access
 from viewfinder.server.sessions import Role, Sessions
 from viewfinder.sources.browser_camera import BrowserCameraSource
@@ -93,6 +94,7 @@ async def test_taps_pickers_and_buttons_control_the_viewfinder(tmp_path: Path) -
         await level_against_the_phone(page)
         await tell_where_the_focus_came_from(page, made)
         assert page.errors == []
+        await say_why_nothing_is_seen(page, made)
         await focus_by_touch(page, made)
         await choose_lens_and_view(page, made)
         await capture_and_record(page, made)
@@ -141,6 +143,29 @@ async def tell_where_the_focus_came_from(page: Page, made: Made) -> None:
     await page.comes_true(f"{badge}.textContent === 'tilt unsure: go nearer' && {badge}.dataset.quality === 'unsure'")
     made.controls.values |= {"tracking": 0.9, "tracking_unsure": False}
     await page.comes_true(f"{badge}.textContent === 'tracking 90 %'")
+
+
+async def say_why_nothing_is_seen(page: Page, made: Made) -> None:
+    """With each picture, and an arrow to where the object went, which points there and lies at the edge on that side."""
+    remark = "document.getElementById('remark')"
+    place = "(([x, y, w, h], a) => [(a.x + a.width / 2 - x) / w, (a.y + a.height / 2 - y) / h])"
+    for arrow, at in (((1.0, 0.0), (0.92, 0.5)), ((-0.6, 0.8), (0.5 - 0.42 * 0.75, 0.92)), ((0.0, -1.0), (0.5, 0.08))):
+        made.controls.values["remark"] = Remark(f"the object is at {arrow}", arrow)
+        await page.comes_true(f"{remark}.textContent === 'the object is at {arrow}' && !{remark}.hidden")
+        box = list(await page.box("vf-picture"))
+        shown = await page.value(f"{place}({box}, document.getElementById('arrow').getBoundingClientRect())")
+        np.testing.assert_allclose(shown, at, atol=0.01)
+    made.controls.values["remark"] = Remark("the camera is not tracked")
+    await page.comes_true(
+        f"{remark}.textContent === 'the camera is not tracked' && document.getElementById('arrow').hasAttribute('hidden')"
+    )
+    # Where no pictures come the state says it.
+    made.pictures.rest()
+    made.controls.values["remark"] = Remark("made is late")
+    await page.comes_true(f"{remark}.textContent === 'made is late'")
+    made.pictures.go_on()
+    made.controls.values["remark"] = None
+    await page.comes_true(f"{remark}.hidden")
 
 
 async def focus_by_touch(page: Page, made: Made) -> None:

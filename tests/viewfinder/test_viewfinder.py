@@ -31,6 +31,7 @@ from tests.support.layer_viewfinder import HEIGHT, LENS, WIDTH, bright_square, r
 from tests.support.live_clip import write_live_clip
 from tests.support.live_viewfinder import Live, live
 from tests.support.refusals import refused
+from tests.support.stage_scenes import ONE_CARD, backend, scene_file
 from tests.support.streaming_viewers import noise, output
 from tests.support.told_parts import ToldCamera, ToldTracker
 from tests.support.waiting import comes_true, wait_until
@@ -45,6 +46,7 @@ from viewfinder.server.endpoint import serving_site
 from viewfinder.sources.choose import open_source
 from viewfinder.sources.frame_source import ExactSize, SizeLimit
 from viewfinder.sources.playback import PatternSource, VideoFileSource
+from viewfinder.stage.stage import Stage
 from viewfinder.stage.static_layer import StaticLayer
 from viewfinder.streaming.recording import Recorder
 from viewfinder.streaming.take_file import playable_bytes
@@ -271,6 +273,34 @@ def test_of_a_pose_that_is_not_certain_the_page_is_told_and_nothing_is_captured(
     headers = [frame_header(each) for each in (certain, unsure)]
     assert [(each["tracking"], each["tracking_unsure"]) for each in headers] == [(0.2, False), (0.2, True)]
     assert compositor.last_tracked is not None and compositor.last_tracked.frame.sequence == 0
+
+
+def test_every_picture_says_why_nothing_virtual_is_in_it(tmp_path: Path) -> None:
+    poses = {0: None, 1: (False, 0.0), 2: (True, 0.0), 3: (True, 0.0)}
+
+    def pose_of(frame: CameraFrame) -> TrackedPose | None:
+        known = poses[frame.sequence]
+        return None if known is None else TrackedPose(np.eye(4), 0.2, frame.captured_s, is_certain=known[0])
+
+    scene = scene_file(tmp_path, ONE_CARD)
+    for tracker, sentences in (
+        (ToldTracker(pose_of), ["told does not tell where it is", "tilt of the board is unsure", "behind the camera", "is late"]),
+        (None, ["behind the camera: turn round, along the arrow. Nothing tells where the camera is: start with --board"] * 3 + ["is late"]),
+    ):
+        stage = Stage(scene, backend())
+        stage.set_renderer("scatter", ScatterReference())
+        parts = Parts(
+            ViewfinderOptions("test"), PatternSource(WIDTH, HEIGHT), stage, LensBook({"test": LENS}), {"scatter": ScatterReference}
+        )
+        with closing(LiveCompositor(parts, ManualFocus(), tracker)) as compositor:
+            for number, sentence in enumerate(sentences):
+
+                def says(number: int = number, sentence: str = sentence, late_s: float = 0.0 if number < 3 else 2.5) -> bool:
+                    frame = CameraFrame(np.zeros((HEIGHT, WIDTH, 3), np.uint8), time.monotonic() - late_s, number)
+                    remark = compositor(frame, 0).status.remark
+                    return remark is not None and sentence in remark.sentence
+
+                wait_until(says)
 
 
 SOAK_S = float(os.environ.get("MRBOKEH_SOAK_S", "600"))

@@ -258,11 +258,14 @@ async def test_a_lost_board_fades_the_object_and_a_camera_that_goes_away_says_so
         grey = np.full_like(clip.plates[0], 90)
         lost = await newest_until(watch, lambda each: each.status["tracking"] == 0.0 and seen_centroid_px(each.bgr, grey) is None)
         assert psnr_db(lost.bgr, grey) > CODEC_DB
+        why = "the camera is not tracked: show it the board, whole, lit and not too blurred"
+        await newest_until(watch, lambda each: each.status["remark"] == {"sentence": why, "arrow": None})
+        assert (await one.state())["remark"]["sentence"] == why
         status, answer = await one.ask({"capture": {}})
         assert status == 400 and "board" in answer["error"]
         camera.gives = "board"
         back = await newest_until(watch, lambda each: each.status["tracking"] > 0.5 and off_px(each, clip) < REGISTERED_PX)
-        assert (await one.state())["failure"] is None and back.sequence > lost.sequence
+        assert (await one.state())["failure"] is None and back.sequence > lost.sequence and back.status["remark"] is None
         camera.gives = "nothing"
         assert (await one.state())["failure"] == ClipCamera.AWAY
         # The last picture is shown again and again, for what lies over it may change.

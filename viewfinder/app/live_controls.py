@@ -20,7 +20,7 @@ from mrbokeh.tracking.world_axes import turned, turned_back
 from viewfinder.app.live_compositor import CompositedFrame, LiveCompositor
 from viewfinder.app.opening import Parts
 from viewfinder.focus.sources import FirstKnown, ManualFocus
-from viewfinder.frames import Bgr, CameraFrame
+from viewfinder.frames import Bgr, CameraFrame, Remark, remark_json
 from viewfinder.server.controls import Notice, ObjectState, State
 from viewfinder.stage.shown_scene import ground_from_picture
 from viewfinder.stage.stage import Stage
@@ -217,6 +217,7 @@ class LiveControls:
             notices=list(self._takes.notices.newest),
             smoothing=None if self._smoothed is None else self._smoothed.smoothing,
             failure=self._trouble() or status.problem,
+            remark=remark_json(moment.output.status.remark if moment else Remark(f"{self._parts.source.name} has not given a picture yet")),
         )
 
     def _ground(self, moment: CompositedFrame | None) -> list[list[float]] | None:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypedDict, runtime_checkable
 
 from mrbokeh.system.errors import InputError
-from viewfinder.frames import finite
+from viewfinder.frames import RemarkJson, finite
 from viewfinder.server.access import LARGEST_MESSAGE, json_value
 from viewfinder.server.sessions import RateLimit, Role
 
@@ -184,7 +184,7 @@ class State(TypedDict, total=False):
     lenses, renderers, views is on. ground_from_picture: (3, 3) homography from the picture (x right, y down, 0 to 1) to metres on the
     plane on which objects stand, (x, z) of `move_object`, as nested lists; None while nothing is tracked. can_record, can_capture: whether
     the buttons are shown. recorded_s: of the take under way; room_s: how much longer the disk will do. failure: a sentence if the source
-    died.
+    died. remark: why nothing virtual is in the newest picture, or that it is old.
     """
 
     source: str
@@ -211,6 +211,7 @@ class State(TypedDict, total=False):
     notices: list[Notice]
     smoothing: bool | None
     failure: str | None
+    remark: RemarkJson | None
 
 
 @runtime_checkable

@@ -35,6 +35,13 @@ export interface State {
   notices?: { number: number; sentence: string }[];
   smoothing?: boolean | null;
   failure?: string | null;
+  remark?: Remark | null;
+}
+
+/** Why nothing virtual is seen, or that the picture is old; arrow: right and down, to where the object is. */
+export interface Remark {
+  sentence: string;
+  arrow: [number, number] | null;
 }
 
 /** What comes with each picture. captured_ms: in the server's time. */
@@ -49,6 +56,7 @@ export interface FrameHeader {
   layer_age_ms?: number;
   stages_ms?: Record<string, number>;
   dropped?: number;
+  remark?: Remark | null;
 }
 
 /** A picture on the page: where its pixels are, and what is known of it. */
