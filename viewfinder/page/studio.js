@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 3e0d38026f631f496512214ebd5c6c53fc87a0ee0d921739873f7332c7d6479d
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 5f111b78604c61d38eadeeaa87da0dcfe6c68cffd51ea8e6d121562b0be73bba
 "use strict";
 (() => {
   // src/model.ts

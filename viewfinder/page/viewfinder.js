@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 3e0d38026f631f496512214ebd5c6c53fc87a0ee0d921739873f7332c7d6479d
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 5f111b78604c61d38eadeeaa87da0dcfe6c68cffd51ea8e6d121562b0be73bba
 "use strict";
 (() => {
   // src/model.ts
@@ -195,6 +195,7 @@
     await peer.setLocalDescription();
     await gathered(peer);
     const body = peer.localDescription.sdp;
+    if (!body.includes("a=candidate:")) throw new Error("without a network this browser has no video, trying pictures");
     const answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/sdp" }, body });
     if (!answer.ok) throw new Error(await sentenceOf(answer));
     await peer.setRemoteDescription({ type: "answer", sdp: await answer.text() });
