@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 5f111b78604c61d38eadeeaa87da0dcfe6c68cffd51ea8e6d121562b0be73bba
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 52173732457aaffddf78a484a6bc7eb417edbfe993c995467d99d87267a6e918
 "use strict";
 (() => {
   // src/model.ts
@@ -71,7 +71,7 @@
     await peer.setLocalDescription();
     await gathered(peer);
     const body = peer.localDescription.sdp;
-    if (!body.includes("a=candidate:")) throw new Error("without a network this browser has no video, trying pictures");
+    if (!body.includes("a=candidate:")) throw new Error("this browser has no network address for video");
     const answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/sdp" }, body });
     if (!answer.ok) throw new Error(await sentenceOf(answer));
     await peer.setRemoteDescription({ type: "answer", sdp: await answer.text() });

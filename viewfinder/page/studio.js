@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 5f111b78604c61d38eadeeaa87da0dcfe6c68cffd51ea8e6d121562b0be73bba
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 52173732457aaffddf78a484a6bc7eb417edbfe993c995467d99d87267a6e918
 "use strict";
 (() => {
   // src/model.ts
