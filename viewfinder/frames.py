@@ -1,5 +1,6 @@
 """Frames of the viewfinder: from the camera, finished, and as viewers are told of them; and the slot that keeps the newest."""
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from threading import Condition
@@ -122,6 +123,14 @@ def finite(metres: float) -> float | None:
     return metres if abs(metres) != float("inf") else None
 
 
+_FOLDERS = re.compile(r"""(?<![\w/:.])(?:[A-Za-z]:)?[\\/](?:[^\s\\/:,;'"()]+[\\/])+(?=[^\s\\/])""")
+
+
+def without_folders(sentence: str) -> str:
+    """Return a sentence for viewers, whom the folders of this machine do not concern: of each path the last name."""
+    return _FOLDERS.sub("", sentence)
+
+
 class RemarkJson(TypedDict):
     """Remark as the page gets it."""
 
@@ -130,7 +139,9 @@ class RemarkJson(TypedDict):
 
 
 def remark_json(remark: Remark | None) -> RemarkJson | None:
-    return None if remark is None else RemarkJson(sentence=remark.sentence, arrow=None if remark.arrow is None else list(remark.arrow))
+    if remark is None:
+        return None
+    return RemarkJson(sentence=without_folders(remark.sentence), arrow=None if remark.arrow is None else list(remark.arrow))
 
 
 def frame_header(frame: OutputFrame) -> dict[str, Any]:

@@ -483,6 +483,16 @@ async def test_pictures_come_where_video_is_refused(tmp_path: Path) -> None:
         assert await page.value("viewfinder.counts.shown") == 0
 
 
+async def test_without_a_network_the_page_shows_pictures_at_once(tmp_path: Path) -> None:
+    """Then browsers have no address to offer; before, the connection was waited for until 6 s had passed without a picture."""
+    flag = "--webrtc-ip-handling-policy=disable_non_proxied_udp"
+    with streaming() as stream:
+        async with made_viewfinder(sinks=[stream], whep=Whep(stream)) as made, chromium_page(made.url, tmp_path / "profile", flag) as page:
+            await page.comes_true(f"{SHOWN} && document.getElementById('way').textContent === 'pictures' && {MESSAGE} === ''")
+            asked = await page.value("performance.getEntriesByType('resource').map((each) => new URL(each.name).pathname)")
+            assert "/state" in asked and "/whep" not in asked
+
+
 async def test_the_camera_page_needs_a_secure_page_and_sends_what_the_camera_sees(tmp_path: Path) -> None:
     """A name that resolves to this machine but is not called localhost is as insecure for the browser as a LAN address. Then Chromium's own
     test camera: a green picture with a white pie and a clock."""

@@ -293,7 +293,7 @@ def test_the_failure_of_the_camera_is_told_until_it_is_back() -> None:
     told = []
     with streaming() as stream:
         viewer = stream.watch("H264", lambda: told.append(viewer.failure))
-        stream.fail("the camera was unplugged")
+        stream.fail("/dev/bus/the camera was unplugged")
         assert told == ["the camera was unplugged"]
         assert stream.watch("H264", ignore).failure == "the camera was unplugged"
         push(stream, 0)

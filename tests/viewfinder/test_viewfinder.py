@@ -107,23 +107,28 @@ def test_a_blur_that_ends_while_a_frame_is_made_is_told_of_with_the_next() -> No
         assert still.status.lens == nearer and not still.pending
 
 
-def dying(may_die: Event | None = None) -> ToldCamera:
+def dying(may_die: Event | None = None, sentence: str = "camera 7 stopped giving pictures") -> ToldCamera:
     """A camera that dies after its first frame, then or when it may."""
 
     def frames(stopping: Event) -> Iterator[CameraFrame]:
         yield CameraFrame(np.zeros((HEIGHT, WIDTH, 3), np.uint8), time.monotonic(), 0)
         assert (may_die is None or may_die.wait(5.0)) and not stopping.is_set()
-        raise InputError("camera 7 stopped giving pictures")
+        raise InputError(sentence)
 
     return ToldCamera(frames)
 
 
 async def test_a_failing_camera_says_so() -> None:
-    async with running(dying()) as url, watching(url) as viewer:
+    """Without the folders of this machine, in the stream and in the state."""
+    trouble = "/home/me/clips/of today/camera 7.mp4 is broken: see C:\\made\\notes.txt, and /whip"
+    shown = "of today/camera 7.mp4 is broken: see notes.txt, and /whip"
+    async with running(dying(sentence=trouble)) as url, watching(url) as viewer:
         # The one picture may come before.
         while (message := await viewer.stream.receive(timeout=5)).type is not aiohttp.WSMsgType.TEXT:
             pass
-        assert json.loads(message.data) == {"failure": "camera 7 stopped giving pictures"}
+        assert json.loads(message.data) == {"failure": shown}
+        async with aiohttp.ClientSession() as session, session.get(url + "state") as answer:
+            assert (await answer.json())["failure"] == shown
 
 
 @pytest.mark.parametrize("trouble", [None, InputError("the layer is missing")])

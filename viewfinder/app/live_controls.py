@@ -20,7 +20,7 @@ from mrbokeh.tracking.world_axes import turned, turned_back
 from viewfinder.app.live_compositor import CompositedFrame, LiveCompositor
 from viewfinder.app.opening import Parts
 from viewfinder.focus.sources import FirstKnown, ManualFocus
-from viewfinder.frames import Bgr, CameraFrame, Remark, remark_json
+from viewfinder.frames import Bgr, CameraFrame, Remark, remark_json, without_folders
 from viewfinder.server.controls import Notice, ObjectState, State
 from viewfinder.stage.shown_scene import ground_from_picture
 from viewfinder.stage.stage import Stage
@@ -112,7 +112,7 @@ class Notices:
     def say(self, sentence: str) -> None:
         """Tell everybody; from any thread."""
         say(sentence)
-        self.newest = (*self.newest, Notice(number=next(self._numbers), sentence=sentence))[-_MOST_NOTICES:]
+        self.newest = (*self.newest, Notice(number=next(self._numbers), sentence=without_folders(sentence)))[-_MOST_NOTICES:]
 
 
 @dataclass(frozen=True)
@@ -191,7 +191,7 @@ class LiveControls:
         lenses, status = compositor.lenses, compositor.overlays.status
         lens = moment.lens if moment else lenses.lens
         height, width = moment.frame.bgr.shape[:2] if moment else (0, 0)
-        take = self._takes.recorder.take
+        take, failure = self._takes.recorder.take, self._trouble() or status.problem
         return State(
             source=self._parts.source.name,
             width_px=width,
@@ -216,7 +216,7 @@ class LiveControls:
             room_s=None if take is None else take.room_s,
             notices=list(self._takes.notices.newest),
             smoothing=None if self._smoothed is None else self._smoothed.smoothing,
-            failure=self._trouble() or status.problem,
+            failure=None if failure is None else without_folders(failure),
             remark=remark_json(moment.output.status.remark if moment else Remark(f"{self._parts.source.name} has not given a picture yet")),
         )
 
