@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 52173732457aaffddf78a484a6bc7eb417edbfe993c995467d99d87267a6e918
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: e4a493989b5b609182d5060fa3df364ac52c1c0fd05fe029bfb0689280898c6c
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 52173732457aaffddf78a484a6bc7eb417edbfe993c995467d99d87267a6e918
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: e4a493989b5b609182d5060fa3df364ac52c1c0fd05fe029bfb0689280898c6c
 "use strict";
 (() => {
   // src/model.ts
@@ -904,6 +904,7 @@ void main() {
       if (remark !== null && line.textContent !== remark.sentence) line.textContent = remark.sentence;
       if (!remark?.arrow) return;
       const [right, down] = remark.arrow;
+      line.classList.toggle("low", down < 0);
       const reach = 42 / Math.max(Math.abs(right), Math.abs(down));
       [arrow.style.left, arrow.style.top] = [`${50 + reach * right}%`, `${50 + reach * down}%`];
       arrow.style.transform = `translate(-50%, -50%) rotate(${Math.atan2(down, right)}rad)`;
