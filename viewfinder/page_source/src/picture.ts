@@ -98,6 +98,7 @@ export class PictureView extends HTMLElement {
     if (remark !== null && line.textContent !== remark.sentence) line.textContent = remark.sentence;
     if (!remark?.arrow) return;
     const [right, down] = remark.arrow;
+    line.classList.toggle("low", down < 0);
     // On the rim of a box of 84 % of the picture, where a ray from its middle meets it.
     const reach = 42 / Math.max(Math.abs(right), Math.abs(down));
     [arrow.style.left, arrow.style.top] = [`${50 + reach * right}%`, `${50 + reach * down}%`];
