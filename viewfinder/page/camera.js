@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: e4a493989b5b609182d5060fa3df364ac52c1c0fd05fe029bfb0689280898c6c
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 6de05757473e41f01367e401c20c35b9712014fbe1a78a863a0057d7335fb452
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: e4a493989b5b609182d5060fa3df364ac52c1c0fd05fe029bfb0689280898c6c
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 6de05757473e41f01367e401c20c35b9712014fbe1a78a863a0057d7335fb452
 "use strict";
 (() => {
   // src/model.ts
@@ -114,11 +114,11 @@
       this.innerHTML = "<details><summary>Aids</summary><div></div></details>";
       for (const aid of Object.keys(AIDS)) {
         if (aid === "level" && !levelAllowed) continue;
-        const button = document.createElement("button");
-        button.id = `aid_${aid}`;
-        button.textContent = AIDS[aid];
-        button.addEventListener("click", () => aids.set(aid, !aids.has(aid)));
-        this.querySelector("div").append(button);
+        const button2 = document.createElement("button");
+        button2.id = `aid_${aid}`;
+        button2.textContent = AIDS[aid];
+        button2.addEventListener("click", () => aids.set(aid, !aids.has(aid)));
+        this.querySelector("div").append(button2);
       }
       aids.addEventListener("change", () => this.refresh());
       model.addEventListener("state", () => this.refresh());
@@ -191,12 +191,12 @@
     return { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(message) };
   }
   var GATHERING_MS = 1e3;
-  async function offerTo(path, peer) {
+  async function offerTo(path2, peer) {
     await peer.setLocalDescription();
     await gathered(peer);
     const body = peer.localDescription.sdp;
     if (!body.includes("a=candidate:")) throw new Error("this browser has no network address for video");
-    const answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/sdp" }, body });
+    const answer = await fetch(path2, { method: "POST", headers: { "Content-Type": "application/sdp" }, body });
     if (!answer.ok) throw new Error(await sentenceOf(answer));
     await peer.setRemoteDescription({ type: "answer", sdp: await answer.text() });
     return answer.headers.get("Location");
@@ -210,6 +210,100 @@
       setTimeout(done, GATHERING_MS);
       peer.addEventListener("icegatheringstatechange", () => peer.iceGatheringState === "complete" && done());
     });
+  }
+
+  // src/gallery.ts
+  var ANSWER_S2 = 6;
+  var SURE_MS = 4e3;
+  var Gallery = class extends HTMLElement {
+    dialog;
+    list;
+    connectedCallback() {
+      this.innerHTML = `<button id="open_gallery" hidden>Saved</button>
+      <dialog id="gallery" aria-label="saved takes and captures">
+        <header><h2>Saved</h2><button id="close_gallery">Close</button></header>
+        <div id="playing"></div>
+        <ul id="saved"></ul>
+      </dialog>`;
+      this.dialog = this.querySelector("#gallery");
+      this.list = this.querySelector("#saved");
+      this.querySelector("#open_gallery").addEventListener("click", () => void this.open());
+      this.querySelector("#close_gallery").addEventListener("click", () => this.dialog.close());
+      this.dialog.addEventListener("close", () => this.querySelector("#playing").replaceChildren());
+      model.addEventListener("state", () => this.querySelector("#open_gallery").hidden = model.state?.gallery !== true);
+    }
+    async open() {
+      if (await this.refresh()) this.dialog.showModal();
+    }
+    /** Whether the server gave a list. */
+    async refresh() {
+      const answer = await fetch("/gallery").catch(() => null);
+      if (!answer?.ok) {
+        model.say(answer ? await sentenceOf(answer) : "the viewfinder does not answer", ANSWER_S2);
+        return false;
+      }
+      const all = await answer.json();
+      this.list.replaceChildren(...all.map((each) => this.entry(each)));
+      if (all.length === 0) this.list.textContent = "Nothing was saved yet: the red button records, the white one captures.";
+      return true;
+    }
+    entry(listed) {
+      const entry = document.createElement("li");
+      const small = document.createElement("img");
+      small.loading = "lazy";
+      small.alt = "";
+      small.src = path(listed, "small");
+      const play = button(listed.kind === "take" ? "Play" : "Show", () => this.show(listed));
+      const keep = document.createElement("a");
+      keep.href = path(listed, "file");
+      keep.download = "";
+      keep.textContent = "Download";
+      const words = document.createElement("p");
+      words.textContent = [listed.name, length(listed.length_s), megabytes(listed.size_bytes)].filter(Boolean).join(" · ");
+      const remove = button("Delete", () => void this.erase(listed, remove));
+      for (const each of [play, keep, remove]) each.setAttribute("aria-label", `${each.textContent} ${listed.name}`);
+      entry.append(small, words, play, keep, remove);
+      return entry;
+    }
+    show(listed) {
+      const shown = document.createElement(listed.kind === "take" ? "video" : "img");
+      shown.src = path(listed, "shown");
+      if (shown instanceof HTMLVideoElement) Object.assign(shown, { controls: true, autoplay: true, playsInline: true, muted: true });
+      else shown.alt = `capture ${listed.name}`;
+      this.querySelector("#playing").replaceChildren(shown);
+      this.dialog.scrollTo(0, 0);
+    }
+    /** At the second press: what is deleted is gone. */
+    async erase(listed, pressed) {
+      if (pressed.dataset["sure"] === void 0) {
+        pressed.dataset["sure"] = "";
+        pressed.textContent = "Really?";
+        setTimeout(() => {
+          delete pressed.dataset["sure"];
+          pressed.textContent = "Delete";
+        }, SURE_MS);
+        return;
+      }
+      this.querySelector("#playing").replaceChildren();
+      const answer = await fetch(path(listed, ""), { method: "DELETE" }).catch(() => null);
+      if (!answer?.ok) model.say(answer ? await sentenceOf(answer) : "the viewfinder does not answer", ANSWER_S2);
+      await this.refresh();
+    }
+  };
+  function path(listed, what) {
+    return `/gallery/${encodeURIComponent(listed.name)}${what && "/"}${what}`;
+  }
+  function button(text, press) {
+    const made = document.createElement("button");
+    made.textContent = text;
+    made.addEventListener("click", press);
+    return made;
+  }
+  function length(length_s) {
+    return length_s === null ? "" : `${Math.floor(length_s / 60)}:${String(Math.round(length_s) % 60).padStart(2, "0")}`;
+  }
+  function megabytes(size_bytes) {
+    return `${(size_bytes / 1e6).toFixed(1)} MB`;
   }
 
   // src/timing.ts
@@ -296,12 +390,12 @@
     lastView = "plate";
     connectedCallback() {
       for (const choice of CHOICES) this.append(this.picker(choice));
-      const button = document.createElement("button");
-      button.id = "ab";
-      button.textContent = "A/B";
-      button.title = "back to the view before this one";
-      button.addEventListener("click", () => void this.choose(CHOICES[0], this.lastView));
-      this.querySelector("#view").after(button);
+      const button2 = document.createElement("button");
+      button2.id = "ab";
+      button2.textContent = "A/B";
+      button2.title = "back to the view before this one";
+      button2.addEventListener("click", () => void this.choose(CHOICES[0], this.lastView));
+      this.querySelector("#view").after(button2);
       model.addEventListener("state", () => this.onState());
     }
     picker(choice) {
@@ -333,8 +427,8 @@
         select.parentElement.hidden = choice.names(state).length === 0;
         select.disabled = !model.mayControl;
       }
-      const button = this.querySelector("#ab");
-      button.disabled = !model.mayControl || !state.views?.includes(this.lastView);
+      const button2 = this.querySelector("#ab");
+      button2.disabled = !model.mayControl || !state.views?.includes(this.lastView);
     }
   };
   var selection = { name: "" };
@@ -1010,9 +1104,9 @@ void main() {
       else if (message.error !== void 0) model.say(message.error, 6);
     }
     async draw(data) {
-      const length = new DataView(data).getUint32(0);
-      const header = JSON.parse(this.decoder.decode(new Uint8Array(data, 4, length)));
-      const jpeg = new Blob([new Uint8Array(data, 4 + length)], { type: "image/jpeg" });
+      const length2 = new DataView(data).getUint32(0);
+      const header = JSON.parse(this.decoder.decode(new Uint8Array(data, 4, length2)));
+      const jpeg = new Blob([new Uint8Array(data, 4 + length2)], { type: "image/jpeg" });
       const bitmap = await createImageBitmap(jpeg).catch(() => null);
       if (bitmap) {
         if (this.canvas.width !== bitmap.width || this.canvas.height !== bitmap.height) {
@@ -1157,6 +1251,7 @@ void main() {
   customElements.define("vf-objects", ObjectPicker);
   customElements.define("vf-aids", AidSwitches);
   customElements.define("vf-shutter", Shutter);
+  customElements.define("vf-gallery", Gallery);
   Object.assign(window, {
     viewfinder: {
       counts,
