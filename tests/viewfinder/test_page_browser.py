@@ -18,8 +18,10 @@ from mrbokeh.video.color import code_from_linear
 from tests.support.made_viewfinder import LENS_RGB, VIEW_RGB, Made, made_viewfinder
 from tests.support.streaming_viewers import BARS, Feed, bars, output, serving_routes, streaming
 from tests.support.waiting import comes_true
+from tests.viewfinder.test_server_gallery import TAKE, saved
 from viewfinder.frames import Remark
 from viewfinder.server.access import LOOPBACK_NAMES, Access
+from viewfinder.server.gallery import Gallery
 from viewfinder.server.sessions import Role, Sessions
 from viewfinder.sources.browser_camera import BrowserCameraSource
 from viewfinder.streaming.other_programs import AlphaStream, obs_routes
@@ -481,6 +483,27 @@ async def test_pictures_come_where_video_is_refused(tmp_path: Path) -> None:
         await page.send("Page.navigate", url=made.url + "?transport=whep")
         await page.comes_true(f"{MESSAGE} === 'all places are taken'")
         assert await page.value("viewfinder.counts.shown") == 0
+
+
+async def test_what_was_saved_is_played_and_deleted_at_the_second_press(tmp_path: Path) -> None:
+    folder = saved(tmp_path / "captures")
+    async with made_viewfinder(gallery=Gallery(folder)) as made, opened(made, tmp_path / "profile") as page:
+        await page.comes_true("!document.getElementById('open_gallery').hidden")
+        await click(page, "open_gallery")
+        entry = "[...document.querySelectorAll('#saved li')].find((each) => each.textContent.includes('.mp4'))"
+        await page.comes_true(f"document.getElementById('gallery').open && {entry}?.textContent.includes('0:02')")
+        await page.comes_true(f"{entry}.querySelector('img').naturalWidth === 320")
+        assert await page.value(f"{entry}.querySelector('a').getAttribute('href')") == f"/gallery/{TAKE}/file"
+        await page.value(f"{entry}.querySelector('button').click()")
+        if await page.value("document.createElement('video').canPlayType('video/mp4; codecs=avc1.640028') !== ''"):
+            await page.comes_true("document.querySelector('#playing video').currentTime > 0.3")
+        remove = f"{entry}.querySelector('button:last-child')"
+        await page.value(f"{remove}.click()")
+        await page.comes_true(f"{remove}.textContent === 'Really?'")
+        assert (folder / TAKE).exists()
+        await page.value(f"{remove}.click()")
+        await page.comes_true("document.querySelectorAll('#saved li').length === 1")
+        assert not (folder / TAKE).exists() and page.errors == []
 
 
 async def test_without_a_network_the_page_shows_pictures_at_once(tmp_path: Path) -> None:

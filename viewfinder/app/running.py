@@ -30,6 +30,7 @@ from viewfinder.frames import CameraFrame, Newest, OutputFrame
 from viewfinder.options import ViewfinderOptions
 from viewfinder.server.access import Access
 from viewfinder.server.endpoint import Endpoint, on_stop, open_endpoint, serving_site
+from viewfinder.server.gallery import Gallery
 from viewfinder.server.jpeg_stream import JpegStream
 from viewfinder.server.site import Part, Site
 from viewfinder.sources.frame_source import FrameSource
@@ -241,7 +242,7 @@ def running(parts: Parts) -> Iterator[Viewfinder]:
             Takes(recorder, notices),
             trouble=lambda: pipeline.failure or pipeline.problem or _remark(parts),
         )
-        of_site: dict[str, Part] = {"whep": Whep(stream), "obs": ObsPart(Whep(alone))}
+        of_site: dict[str, Part] = {"whep": Whep(stream), "obs": ObsPart(Whep(alone)), "gallery": Gallery(parts.options.captures)}
         if isinstance(parts.source, Part):
             of_site["whip"] = parts.source
         of_site |= parts.cameras

@@ -98,6 +98,11 @@ def under_way(path: Path) -> Path:
     return path.with_name(f"{path.stem}{_UNDER_WAY}{path.suffix}")
 
 
+def is_under_way(path: Path) -> bool:
+    """Tell by its name whether a take is being written, or was when a process was killed."""
+    return path.stem.endswith(_UNDER_WAY)
+
+
 def settle(working: Path, path: Path) -> bool:
     """Cut a file to what plays and give it its name; one without a picture is removed, and False returned."""
     with working.open("r+b") as file:
@@ -140,7 +145,7 @@ def recover_takes(folder: Path) -> list[str]:
         path = free_name(working.with_name(working.name.replace(_UNDER_WAY, "")), own=working)
         with suppress(InputError), writing_alone(working):
             if settle(working, path):
-                told.append(f"a take that was cut off was recovered: {path.name} ({_length_s(path):.0f} s)")
+                told.append(f"a take that was cut off was recovered: {path.name} ({length_s(path):.0f} s)")
     return told
 
 
@@ -153,7 +158,8 @@ def free_name(path: Path, own: Path | None = None) -> Path:
     return free
 
 
-def _length_s(path: Path) -> float:
+def length_s(path: Path) -> float:
+    """Return how long a video is."""
     import av
 
     with av.open(str(path)) as container:

@@ -8,6 +8,7 @@ export interface State {
   transports: string[];
   matte: boolean;
   can_send: boolean;
+  gallery?: boolean;
   source?: string;
   width_px?: number;
   height_px?: number;
