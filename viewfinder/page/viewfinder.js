@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 6de05757473e41f01367e401c20c35b9712014fbe1a78a863a0057d7335fb452
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 462c91854223147638278f24a6edb8fa10955c678cb26b4a8fea55021d3c2fd6
 "use strict";
 (() => {
   // src/model.ts
