@@ -78,7 +78,9 @@ class Take:
     def _begin(self, width_px: int, height_px: int, at_s: float) -> None:
         path = free_name(self._path)
         form = self._form
-        writer = TakeWriter(path, width_px, height_px, form.frame_rate, TIME_BASE, encoding=form.encoding)
+        writer = TakeWriter(
+            path=path, width_px=width_px, height_px=height_px, frame_rate=form.frame_rate, time_base=TIME_BASE, encoding=form.encoding
+        )
         self._writer, self._first_s, self._last_s = writer.__enter__(), at_s, at_s
 
     def _look_at_the_disk(self, writer: TakeWriter) -> None:
@@ -120,7 +122,7 @@ class Recording:
 
     @property
     def sentence(self) -> str:
-        """What became of it, for the page and the log."""
+        """Sentence for the page and the log about what became of it."""
         names = " and ".join(each.name for each in self.parts)
         return f"saved {names} ({self.duration_s:.0f} s)" + (f"; it ended there by itself: {self.note}" if self.note else "")
 
