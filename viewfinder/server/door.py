@@ -131,6 +131,7 @@ class Door:
             guest = self._guests[protocol] = _Guest(protocol)
             task = self._strangers[protocol] = asyncio.create_task(self._serve(accepted, guest))
             task.add_done_callback(partial(self._left, protocol, accepted))
+            await asyncio.sleep(0)  # where many wait, taking one waits for nothing: those who were shown out leave meanwhile
 
     async def _serve(self, accepted: socket.socket, guest: _Guest) -> None:
         loop = asyncio.get_running_loop()

@@ -19,7 +19,7 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.video.encodings import encoding_for
 from viewfinder.frames import Bgr, OutputFrame
 from viewfinder.streaming.encoders import TIME_BASE, even_size
-from viewfinder.streaming.take_file import SUFFIXES, TakeWriter, free_bytes, free_name
+from viewfinder.streaming.take_file import SUFFIXES, TakeWriter, free_bytes, free_name, length_s
 
 RESERVE_BYTES = 64 << 20
 """A take ends before the disk has less than this: a file that ends well needs a little, and the system does."""
@@ -242,9 +242,10 @@ class Recorder:
 
     def _outcome(self, take: Take, note: str | None) -> Recording | InputError:
         if take.parts:
-            return Recording(
-                parts=tuple(take.parts), frame_count=take.frame_count, dropped=self._dropped, duration_s=take.duration_s, note=note
-            )
+            # Of what was cut off the files tell how much is left.
+            duration_s = take.duration_s if note is None else sum(map(length_s, take.parts))
+            parts = tuple(take.parts)
+            return Recording(parts=parts, frame_count=take.frame_count, dropped=self._dropped, duration_s=duration_s, note=note)
         if note is None:
             return InputError(f"{self._path.name}: expected at least one picture, got none; nothing was recorded")
         return InputError(f"{self._path.name} could not be written ({note}): check the folder and the space on the disk")
