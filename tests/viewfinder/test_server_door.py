@@ -13,7 +13,7 @@ import aiohttp
 import pytest
 
 from tests.support.made_viewfinder import Made, made_viewfinder
-from tests.support.streaming_viewers import SDP, Viewer, streaming
+from tests.support.streaming_viewers import SDP, WIDTH, Feed, Viewer, streaming, watching
 from tests.support.waiting import comes_true
 from tests.viewfinder.conftest import Make
 from viewfinder.server.access import LOOPBACK_NAMES, Access
@@ -148,3 +148,13 @@ async def test_sockets_of_webrtc_stand_at_the_address_served_only() -> None:
                 found = re.findall(r"a=candidate:(?:\S+ ){4}(\S+)", await answer.text())
             assert len(found) >= 1 and set(found) == {"127.0.0.1"}
             await viewer.peer.close()
+
+
+async def test_an_aiortc_without_the_known_parts_goes_on_and_says_so(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("viewfinder.streaming.local_sockets._TRANSPORTS", "_not_there")
+    with streaming() as stream, Feed(stream):
+        async with made_viewfinder(whep=Whep(stream)) as made, watching(made.url.rstrip("/")) as viewer:
+            assert (await viewer.next()).width == WIDTH
+    assert "listens on every address" in caplog.text

@@ -27,7 +27,8 @@ class Stopwatch:
         self.stages_ms[name] = 1000.0 * (time.perf_counter() - started_s)
 
 
-_LATE_S = 1.0
+# A board is found a moment after the first picture, and a track that is lost for a picture is not worth a word.
+_LATE_S, _UNSEEN_S = 1.0, 0.5
 _HINTS = {"board": "show it the board, whole, lit and not too blurred", "map": "show it what the map was made of"}
 _NO_POSE = "Nothing tells where the camera is: start with --board, --pose, --map or a tracking system"
 
@@ -43,6 +44,7 @@ class LiveCompositor:
         self.overlays, self.lenses, self.focus, self.tracker = parts.overlays, parts.lenses, focus, tracker
         self._source, self._known_intrinsics = parts.source, parts.intrinsics
         self.view = "final"
+        self._seen_s: float | None = None
         self.last: CompositedFrame | None = None
         self.last_tracked: CompositedFrame | None = None
 
@@ -110,7 +112,9 @@ class LiveCompositor:
         age_s = time.monotonic() - frame.captured_s
         if age_s > _LATE_S:
             return Remark(self._source.status or f"{self._source.name} is late: its last picture is {age_s:.0f} s old")
-        if overlay.rgb.size:
+        if overlay.rgb.size or self._seen_s is None:
+            self._seen_s = time.monotonic()
+        if time.monotonic() - self._seen_s < _UNSEEN_S:
             return None
         if pose is None:
             name = "" if self.tracker is None else self.tracker.name

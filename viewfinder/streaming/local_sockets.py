@@ -4,12 +4,15 @@ aiortc would open one on every address of the machine but loopback: neighbours o
 network nobody.
 """
 
+import logging
 from functools import partial
 from typing import Any
 
 from aiohttp import web
 
-# Private in aiortc and aioice; a release without them is noticed by the tests.
+log = logging.getLogger(__name__)
+
+# Private in aiortc and aioice, so that each release has to be asked whether they are there.
 _TRANSPORTS, _CONNECTION = "_RTCPeerConnection__iceTransports", "_connection"
 _GATHERING = "get_component_candidates"
 
@@ -24,8 +27,12 @@ def listen_only_at(peer: Any, host: str | None) -> None:
     """Let a peer connection open its sockets at one address; after the offer is set, and before the answer is made."""
     if host is None:
         return
-    for transport in getattr(peer, _TRANSPORTS):
-        connection = getattr(transport.iceGatherer, _CONNECTION)
+    gatherers = [transport.iceGatherer for transport in getattr(peer, _TRANSPORTS, ())]
+    connections = [getattr(each, _CONNECTION, None) for each in gatherers]
+    if not connections or not all(hasattr(each, _GATHERING) for each in connections):
+        log.warning("this aiortc is not one that is known: WebRTC listens on every address of this machine")
+        return
+    for connection in connections:
         setattr(connection, _GATHERING, partial(_candidates_at, getattr(connection, _GATHERING), host))
 
 
