@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 462c91854223147638278f24a6edb8fa10955c678cb26b4a8fea55021d3c2fd6
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 59bc23d7eb9a4c49972b783d393f89531f758afb296d6d802baf0c3f2d99159b
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 462c91854223147638278f24a6edb8fa10955c678cb26b4a8fea55021d3c2fd6
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 59bc23d7eb9a4c49972b783d393f89531f758afb296d6d802baf0c3f2d99159b
 "use strict";
 (() => {
   // src/model.ts
@@ -221,7 +221,7 @@
     connectedCallback() {
       this.innerHTML = `<button id="open_gallery" hidden>Saved</button>
       <dialog id="gallery" aria-label="saved takes and captures">
-        <header><h2>Saved</h2><button id="close_gallery">Close</button></header>
+        <header><h2>Saved</h2><span id="room"></span><button id="close_gallery">Close</button></header>
         <div id="playing"></div>
         <ul id="saved"></ul>
       </dialog>`;
@@ -242,7 +242,8 @@
         model.say(answer ? await sentenceOf(answer) : "the viewfinder does not answer", ANSWER_S2);
         return false;
       }
-      const all = await answer.json();
+      const { saved: all, free_bytes } = await answer.json();
+      this.querySelector("#room").textContent = `${(free_bytes / 1e9).toFixed(1)} GB free`;
       this.list.replaceChildren(...all.map((each) => this.entry(each)));
       if (all.length === 0) this.list.textContent = "Nothing was saved yet: the red button records, the white one captures.";
       return true;
