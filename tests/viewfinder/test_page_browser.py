@@ -493,6 +493,7 @@ async def test_what_was_saved_is_played_and_deleted_at_the_second_press(tmp_path
         entry = "[...document.querySelectorAll('#saved li')].find((each) => each.textContent.includes('.mp4'))"
         await page.comes_true(f"document.getElementById('gallery').open && {entry}?.textContent.includes('0:02')")
         await page.comes_true(f"{entry}.querySelector('img').naturalWidth === 320")
+        assert await page.value("/^[\\d.]+ GB free$/.test(document.getElementById('room').textContent)")
         assert await page.value(f"{entry}.querySelector('a').getAttribute('href')") == f"/gallery/{TAKE}/file"
         await page.value(f"{entry}.querySelector('button').click()")
         if await page.value("document.createElement('video').canPlayType('video/mp4; codecs=avc1.640028') !== ''"):

@@ -1,6 +1,7 @@
 """The gallery over a real server: takes that the recorder wrote and a bundle; only its own files, and only for who controls."""
 
 import io
+import shutil
 import zipfile
 from pathlib import Path
 
@@ -47,7 +48,9 @@ async def test_what_was_saved_is_listed_shown_kept_and_deleted(tmp_path: Path) -
         async with client.get("/state") as answer:
             assert (await answer.json())["gallery"] is True
         async with client.get("/gallery") as answer:
-            listed = {each["name"]: each for each in await answer.json()}
+            told = await answer.json()
+        listed = {each["name"]: each for each in told["saved"]}
+        assert told["free_bytes"] == pytest.approx(shutil.disk_usage(folder).free, rel=0.2)
         assert set(listed) == {TAKE, CAPTURE} and [listed[each]["kind"] for each in (TAKE, CAPTURE)] == ["take", "capture"]
         assert listed[TAKE]["size_bytes"] == (folder / TAKE).stat().st_size and listed[TAKE]["length_s"] == pytest.approx(2.0, abs=0.1)
         for name, height in ((TAKE, 180), (CAPTURE, HEIGHT)):
@@ -102,4 +105,4 @@ async def test_nothing_but_its_own_files_can_be_named_and_guests_see_nothing(tmp
 async def test_before_anything_was_saved_the_list_is_empty(tmp_path: Path) -> None:
     gallery = Gallery(tmp_path / "not_there")
     async with made_viewfinder(gallery=gallery) as made, aiohttp.ClientSession() as client, client.get(made.url + "gallery") as answer:
-        assert answer.status == 200 and await answer.json() == []
+        assert answer.status == 200 and (await answer.json())["saved"] == []

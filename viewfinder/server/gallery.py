@@ -16,7 +16,7 @@ from aiohttp import web
 from mrbokeh.stacks.capture_bundle import is_bundle
 from mrbokeh.system.errors import InputError
 from viewfinder.server.access import error
-from viewfinder.streaming.take_file import SUFFIXES, is_under_way, length_s
+from viewfinder.streaming.take_file import SUFFIXES, free_bytes, is_under_way, length_s
 
 _MOST_LISTED = 200
 _SMALL_PX = 320
@@ -54,7 +54,8 @@ class Gallery:
         """Close nothing: nothing runs."""
 
     async def _list(self, _request: web.Request) -> web.Response:
-        return web.json_response(await asyncio.to_thread(self.listed))
+        """Answer {"saved": [Listed], "free_bytes": of the disk}."""
+        return web.json_response({"saved": await asyncio.to_thread(self.listed), "free_bytes": free_bytes(self.folder)})
 
     def listed(self) -> list[Listed]:
         """Return what is there, the newest first; a take that is being written is not."""

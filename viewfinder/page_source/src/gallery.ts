@@ -20,7 +20,7 @@ export class Gallery extends HTMLElement {
   connectedCallback(): void {
     this.innerHTML = `<button id="open_gallery" hidden>Saved</button>
       <dialog id="gallery" aria-label="saved takes and captures">
-        <header><h2>Saved</h2><button id="close_gallery">Close</button></header>
+        <header><h2>Saved</h2><span id="room"></span><button id="close_gallery">Close</button></header>
         <div id="playing"></div>
         <ul id="saved"></ul>
       </dialog>`;
@@ -44,7 +44,8 @@ export class Gallery extends HTMLElement {
       model.say(answer ? await sentenceOf(answer) : "the viewfinder does not answer", ANSWER_S);
       return false;
     }
-    const all = (await answer.json()) as Listed[];
+    const { saved: all, free_bytes } = (await answer.json()) as { saved: Listed[]; free_bytes: number };
+    this.querySelector("#room")!.textContent = `${(free_bytes / 1e9).toFixed(1)} GB free`;
     this.list.replaceChildren(...all.map((each) => this.entry(each)));
     if (all.length === 0) this.list.textContent = "Nothing was saved yet: the red button records, the white one captures.";
     return true;
