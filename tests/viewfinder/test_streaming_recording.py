@@ -191,6 +191,14 @@ def test_a_full_disk_ends_the_take_keeps_it_and_the_next_press_works(tmp_path: P
     assert recorder.stop().note is None
 
 
+def test_a_disk_that_is_full_at_the_end_is_told_of_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """40 pictures of noise are more than a fragment: the last one does not fit."""
+    [whole] = recorded(tmp_path / "whole.mp4", [output(noise(i), i, i / 30) for i in range(40)]).parts
+    monkeypatch.setattr(TakeFile, "_put", refusing_after(whole.stat().st_size - 100_000, []))
+    recording = recorded(tmp_path / "clip.mp4", [output(noise(i), i, i / 30) for i in range(40)])
+    assert recording.note == "no space left on device" and 10 <= len(list(read_frames(recording.parts[0]))) < 40
+
+
 def test_the_disk_is_looked_at_before_it_is_full(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """2 MB more than the reserve is less than five minutes of noise, of which a second has more than 1 MB."""
     free = [of_recording.RESERVE_BYTES + 2_000_000]

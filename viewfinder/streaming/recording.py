@@ -41,7 +41,7 @@ class Form:
 class Take:
     """Take that goes on in a new part, NAME-2, where the size of the pictures changes. Their rate may change: each has its own time.
 
-    parts: the files that were ended. room_s: how long the disk will do, None while that is not known.
+    parts: the files that were ended. trouble: why one of them did not take everything. room_s: how long the disk will do, None while that is not known.
     """
 
     def __init__(self, path: Path, form: Form) -> None:
@@ -49,6 +49,7 @@ class Take:
         self.parts: list[Path] = []
         self.frame_count, self.duration_s = 0, 0.0
         self.room_s: float | None = None
+        self.trouble: str | None = None
         self._writer: TakeWriter | None = None
         self._first_s = self._last_s = self._looked_s = 0.0
 
@@ -74,6 +75,7 @@ class Take:
         if writer is not None:
             writer.__exit__(None, None, None)
             self.parts += [writer.path] if writer.kept else []
+            self.trouble = self.trouble or writer.trouble
 
     def _begin(self, width_px: int, height_px: int, at_s: float) -> None:
         path = free_name(self._path)
@@ -237,7 +239,7 @@ class Recorder:
         except Exception as error:
             log.debug("the recording failed", exc_info=True)
             note = f"a picture could not be written ({error})"
-        self._ended = self._outcome(take, note)
+        self._ended = self._outcome(take, note or take.trouble)
         self._say(self._ended.sentence if isinstance(self._ended, Recording) else str(self._ended))
 
     def _outcome(self, take: Take, note: str | None) -> Recording | InputError:

@@ -33,18 +33,18 @@ class TakeFile:
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("x+b", buffering=0)
-        self._trouble: OSError | None = None
+        self.trouble: OSError | None = None
         self.seek, self.tell, self.read, self.close = self._file.seek, self._file.tell, self._file.read, self._file.close
 
     def write(self, data: bytes) -> int:
-        if self._trouble is not None:
-            raise self._trouble
+        if self.trouble is not None:
+            raise self.trouble
         left = memoryview(data)
         try:
             while left:
                 left = left[self._put(left) :]
         except OSError as error:
-            self._trouble = error
+            self.trouble = error
             raise
         return len(data)
 
@@ -87,6 +87,12 @@ class TakeWriter(VideoWriter):
     def _container_options(self) -> dict[str, str]:
         fragments = {"movflags": "+hybrid_fragmented+default_base_moof", "frag_duration": str(round(_FRAGMENT_S * _MICROSECONDS))}
         return {**super()._container_options(), **fragments, "flush_packets": "1"}
+
+    @property
+    def trouble(self) -> str | None:
+        """Reason why the file did not take everything, None where it did."""
+        error = self._file.trouble
+        return None if error is None else (error.strerror or str(error)).lower()
 
     @property
     def size_bytes(self) -> int:
