@@ -41,7 +41,8 @@ class Form:
 class Take:
     """Take that goes on in a new part, NAME-2, where the size of the pictures changes. Their rate may change: each has its own time.
 
-    parts: the files that were ended. trouble: why one of them did not take everything. room_s: how long the disk will do, None while that is not known.
+    parts: the files that were ended. trouble: why one of them did not take everything. room_s: how long the disk will do, None while
+    that is not known.
     """
 
     def __init__(self, path: Path, form: Form) -> None:
