@@ -71,10 +71,6 @@ class Door:
         self._socket: socket.socket | None = None
         self._accepting: asyncio.Task[None] | None = None
 
-    @property
-    def strangers(self) -> int:
-        return len(self._strangers)
-
     def open(self, host: str, port: int) -> int:
         """Listen, and return the port; OSError where that cannot be."""
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
