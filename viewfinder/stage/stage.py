@@ -284,7 +284,7 @@ class Stage:
             return Remark(self._thread.problem or preparing(self._thread.busy))
         if self.seen.overlay.rgb.size or drawn.setup is not setup:
             return None
-        remark = reason_unseen(setup.staged, wanted.time_s, self.seen.camera)
+        remark = reason_unseen(setup.staged.description.objects, drawn.drawing.extent_m, self.seen.camera)
         soon_seen = remark.arrow is None and is_outdated(drawn.drawing, wanted, setup.staged.is_animated)
         return None if soon_seen else remark
 
