@@ -1,9 +1,10 @@
 """Frames of the viewfinder: from the camera, finished, and as viewers are told of them; and the slot that keeps the newest."""
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from threading import Condition
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, NamedTuple, TypedDict, TypeVar
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -49,6 +50,13 @@ class CameraFrame:
     full_picture: Callable[[], Bgr] | None = None
 
 
+class Remark(NamedTuple):
+    """Remark on a picture that is not what the user waits for. arrow: right and down, of length 1, to where the object is; or None."""
+
+    sentence: str
+    arrow: tuple[float, float] | None = None
+
+
 @dataclass(frozen=True)
 class FrameStatus:
     """Status that the page shows with a picture.
@@ -57,6 +65,7 @@ class FrameStatus:
     tracking: quality of the pose from 0 (lost) to 1, None without a tracker. tracking_unsure: another pose would fit as well, so that
       nothing is shown by this one. layer_age_ms: since the virtual layer was drawn.
     stages_ms: how long each stage took, by name, in the order in which they ran. dropped: captures so far that were never composited.
+    remark: why nothing virtual is seen, or that the picture is old; None where all is well.
     """
 
     focus_distance_m: float
@@ -67,6 +76,7 @@ class FrameStatus:
     layer_age_ms: float = 0.0
     stages_ms: Mapping[str, float] = field(default_factory=dict)
     dropped: int = 0
+    remark: Remark | None = None
 
 
 @dataclass(frozen=True)
@@ -113,6 +123,27 @@ def finite(metres: float) -> float | None:
     return metres if abs(metres) != float("inf") else None
 
 
+_FOLDERS = re.compile(r"""(?<![\w/:.])(?:[A-Za-z]:)?[\\/](?:[^\s\\/:,;'"()]+[\\/])+(?=[^\s\\/])""")
+
+
+def without_folders(sentence: str) -> str:
+    """Return a sentence for viewers, whom the folders of this machine do not concern: of each path the last name."""
+    return _FOLDERS.sub("", sentence)
+
+
+class RemarkJson(TypedDict):
+    """Remark as the page gets it."""
+
+    sentence: str
+    arrow: list[float] | None
+
+
+def remark_json(remark: Remark | None) -> RemarkJson | None:
+    if remark is None:
+        return None
+    return RemarkJson(sentence=without_folders(remark.sentence), arrow=None if remark.arrow is None else list(remark.arrow))
+
+
 def frame_header(frame: OutputFrame) -> dict[str, Any]:
     """Return what the page is told of a picture, ready for JSON; captured_ms is `time.monotonic`, as the clock's answers are."""
     status = frame.status
@@ -127,4 +158,5 @@ def frame_header(frame: OutputFrame) -> dict[str, Any]:
         "layer_age_ms": round(status.layer_age_ms, 1),
         "stages_ms": {name: round(took_ms, 2) for name, took_ms in status.stages_ms.items()},
         "dropped": status.dropped,
+        "remark": remark_json(status.remark),
     }

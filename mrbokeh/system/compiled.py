@@ -272,24 +272,29 @@ class _Compiling(event.Listener):  # type: ignore[misc]
     """Says on standard error that kernels are being compiled, how many, and that this happens once a machine."""
 
     def __init__(self) -> None:
-        self._depth, self._count, self._took_s, self._began_s, self._told_s = 0, 0, 0.0, 0.0, 0.0
+        self._depth, self.count, self._took_s, self._began_s, self._told_s = 0, 0, 0.0, 0.0, 0.0
 
     def on_start(self, event: Any) -> None:
         self._depth += self._depth > 0 or isinstance(event.data["dispatcher"]._cache, _KernelCache)
         if self._depth != 1:  # what a kernel calls
             return
-        self._count, self._began_s = self._count + 1, _now_s()
-        if self._count == 2:
+        self.count, self._began_s = self.count + 1, _now_s()
+        if self.count == 2:
             print("compiling for this machine, which happens once and takes up to a minute ...", file=sys.stderr, flush=True)
             self._told_s = self._began_s
-        elif self._count > 2 and self._began_s - self._told_s > TELL_EVERY_S:
-            print(f"compiled {self._count - 1} kernels in {self._took_s:.0f} s ...", file=sys.stderr, flush=True)
+        elif self.count > 2 and self._began_s - self._told_s > TELL_EVERY_S:
+            print(f"compiled {self.count - 1} kernels in {self._took_s:.0f} s ...", file=sys.stderr, flush=True)
             self._told_s = self._began_s
 
     def on_end(self, _event: Any) -> None:
         self._depth = max(0, self._depth - 1)
         if self._depth == 0 and self._began_s:
             self._took_s, self._began_s = self._took_s + _now_s() - self._began_s, 0.0
+
+
+def kernels_compiled() -> int:
+    """Return how many kernels this process compiled, or began to, because nobody had done it on this machine."""
+    return _COMPILING.count
 
 
 def _path_of(module: str) -> str:
@@ -344,4 +349,5 @@ def _as_shipped() -> None:
 
 
 _as_shipped()
-event.register("numba:compile", _Compiling())
+_COMPILING = _Compiling()
+event.register("numba:compile", _COMPILING)

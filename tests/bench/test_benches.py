@@ -10,7 +10,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from tests.bench import bench_device
+from tests.bench import bench_device, bench_viewfinder
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in Path(__file__).parent.glob("bench_*.py")))
@@ -48,6 +48,12 @@ def test_a_part_that_takes_too_long_keeps_its_rows(monkeypatch: pytest.MonkeyPat
     run = Run(torch.device("cpu"), False, time.monotonic() + 0.5, said.append)
     result = bench_device.run_part("endless", run, said.append)
     assert [row.met for row in result.rows] == [True] and "stopped" in result.failed
+
+
+def test_the_viewfinder_benchmark_says_nothing_of_a_run_that_says_nothing() -> None:
+    assert bench_viewfinder.refusal([12.0, 11.0], 0) is None
+    for draws_per_s, compiled, word in (([9.0, 10.5], 0, "9.8 times"), ([], 0, "0.0 times"), ([30.0], 2, "2 kernels")):
+        assert word in str(bench_viewfinder.refusal(draws_per_s, compiled))
 
 
 def test_outcomes_are_read_of_what_pytest_prints_alone_and_with_several_workers() -> None:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from mrbokeh.system.errors import InputError
-from viewfinder.frames import FrameStatus, OutputFrame, finite
+from viewfinder.frames import FrameStatus, OutputFrame, finite, remark_json
 from viewfinder.server.access import Access
 from viewfinder.server.controls import VIEWS, State
 from viewfinder.server.endpoint import Tls, serving_site
@@ -96,8 +96,12 @@ class MadeControls:
             can_capture=True,
             can_record=True,
             recording=self.values.get("recording", False),
+            recorded_s=self.values.get("recorded_s"),
+            room_s=self.values.get("room_s"),
+            notices=self.values.get("notices", []),
             smoothing=self.values.get("smoothing", False),
             failure=None,
+            remark=remark_json(self.values.get("remark")),
         )
 
     def _remember(self, name: str, value: Any) -> None:
@@ -118,6 +122,7 @@ def made_frame(controls: MadeControls, sequence: int) -> OutputFrame:
         tracking=controls.values.get("tracking", 0.9),
         tracking_unsure=controls.values.get("tracking_unsure", False),
         stages_ms={"composite": 1.25},
+        remark=controls.values.get("remark"),
     )
     return OutputFrame(bgr, time.monotonic(), sequence, status)
 

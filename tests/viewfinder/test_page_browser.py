@@ -18,7 +18,10 @@ from mrbokeh.video.color import code_from_linear
 from tests.support.made_viewfinder import LENS_RGB, VIEW_RGB, Made, made_viewfinder
 from tests.support.streaming_viewers import BARS, Feed, bars, output, serving_routes, streaming
 from tests.support.waiting import comes_true
+from tests.viewfinder.test_server_gallery import TAKE, saved
+from viewfinder.frames import Remark
 from viewfinder.server.access import LOOPBACK_NAMES, Access
+from viewfinder.server.gallery import Gallery
 from viewfinder.server.sessions import Role, Sessions
 from viewfinder.sources.browser_camera import BrowserCameraSource
 from viewfinder.streaming.other_programs import AlphaStream, obs_routes
@@ -93,6 +96,7 @@ async def test_taps_pickers_and_buttons_control_the_viewfinder(tmp_path: Path) -
         await level_against_the_phone(page)
         await tell_where_the_focus_came_from(page, made)
         assert page.errors == []
+        await say_why_nothing_is_seen(page, made)
         await focus_by_touch(page, made)
         await choose_lens_and_view(page, made)
         await capture_and_record(page, made)
@@ -143,6 +147,29 @@ async def tell_where_the_focus_came_from(page: Page, made: Made) -> None:
     await page.comes_true(f"{badge}.textContent === 'tracking 90 %'")
 
 
+async def say_why_nothing_is_seen(page: Page, made: Made) -> None:
+    """With each picture, and an arrow to where the object went, which points there and lies at the edge on that side."""
+    remark = "document.getElementById('remark')"
+    place = "(([x, y, w, h], a) => [(a.x + a.width / 2 - x) / w, (a.y + a.height / 2 - y) / h])"
+    for arrow, at in (((1.0, 0.0), (0.92, 0.5)), ((-0.6, 0.8), (0.5 - 0.42 * 0.75, 0.92)), ((0.0, -1.0), (0.5, 0.08))):
+        made.controls.values["remark"] = Remark(f"the object is at {arrow}", arrow)
+        await page.comes_true(f"{remark}.textContent === 'the object is at {arrow}' && !{remark}.hidden")
+        box = list(await page.box("vf-picture"))
+        shown = await page.value(f"{place}({box}, document.getElementById('arrow').getBoundingClientRect())")
+        np.testing.assert_allclose(shown, at, atol=0.01)
+    made.controls.values["remark"] = Remark("the camera is not tracked")
+    await page.comes_true(
+        f"{remark}.textContent === 'the camera is not tracked' && document.getElementById('arrow').hasAttribute('hidden')"
+    )
+    # Where no pictures come the state says it.
+    made.pictures.rest()
+    made.controls.values["remark"] = Remark("made is late")
+    await page.comes_true(f"{remark}.textContent === 'made is late'")
+    made.pictures.go_on()
+    made.controls.values["remark"] = None
+    await page.comes_true(f"{remark}.hidden")
+
+
 async def focus_by_touch(page: Page, made: Made) -> None:
     await page.tap("#stage", 0.25, 0.75)
     await page.comes_true("document.getElementById('spot').textContent === '1.50 m'")
@@ -179,10 +206,28 @@ async def capture_and_record(page: Page, made: Made) -> None:
     await page.tap("#record")
     await page.comes_true("document.getElementById('record').getAttribute('aria-pressed') === 'true'")
     assert made.controls.asked[-1] == ("recording", True)
+    await tell_of_the_take(page, made)
     # What others set is followed.
     made.controls.set_lens("fifty")
     made.controls.focus_at_distance(4.0)
     await page.comes_true("document.getElementById('lens').value === 'fifty' && document.getElementById('metres').textContent === '4.00 m'")
+
+
+async def tell_of_the_take(page: Page, made: Made) -> None:
+    """A red frame, how long it is, how long the disk will do, and what became of it."""
+    frame = "getComputedStyle(document.getElementById('stage'), '::after').borderTopColor"
+    assert await page.value(frame) == "rgb(221, 51, 51)"
+    made.controls.values |= {"recorded_s": 75.0, "room_s": 7200.0}
+    await page.comes_true("/^1:1[5-9]$/.test(document.getElementById('timer').textContent)")
+    made.controls.values["room_s"] = 130.5
+    await page.comes_true("/^1:1\\d · disk full in 2:10$/.test(document.getElementById('timer').textContent)")
+    made.controls.values |= {"recording": False, "notices": [{"number": 1, "sentence": "saved a.mp4"}, {"number": 2, "sentence": "room"}]}
+    await page.comes_true(f"{MESSAGE} === 'saved a.mp4 · room' && document.getElementById('timer').hidden")
+    # Each is shown once.
+    await page.value("viewfinder.model.say('')")
+    made.controls.values["notices"] = [{"number": 2, "sentence": "room"}, {"number": 3, "sentence": "saved b.mp4"}]
+    await page.comes_true(f"{MESSAGE} === 'saved b.mp4'")
+    assert await page.value(frame) != "rgb(221, 51, 51)"
 
 
 async def test_marks_are_drawn_where_the_picture_has_edges_on_the_real_and_the_virtual_apart(tmp_path: Path) -> None:
@@ -438,6 +483,38 @@ async def test_pictures_come_where_video_is_refused(tmp_path: Path) -> None:
         await page.send("Page.navigate", url=made.url + "?transport=whep")
         await page.comes_true(f"{MESSAGE} === 'all places are taken'")
         assert await page.value("viewfinder.counts.shown") == 0
+
+
+async def test_what_was_saved_is_played_and_deleted_at_the_second_press(tmp_path: Path) -> None:
+    folder = saved(tmp_path / "captures")
+    async with made_viewfinder(gallery=Gallery(folder)) as made, opened(made, tmp_path / "profile") as page:
+        await page.comes_true("!document.getElementById('open_gallery').hidden")
+        await click(page, "open_gallery")
+        entry = "[...document.querySelectorAll('#saved li')].find((each) => each.textContent.includes('.mp4'))"
+        await page.comes_true(f"document.getElementById('gallery').open && {entry}?.textContent.includes('0:02')")
+        await page.comes_true(f"{entry}.querySelector('img').naturalWidth === 320")
+        assert await page.value("/^[\\d.]+ GB free$/.test(document.getElementById('room').textContent)")
+        assert await page.value(f"{entry}.querySelector('a').getAttribute('href')") == f"/gallery/{TAKE}/file"
+        await page.value(f"{entry}.querySelector('button').click()")
+        if await page.value("document.createElement('video').canPlayType('video/mp4; codecs=avc1.640028') !== ''"):
+            await page.comes_true("document.querySelector('#playing video').currentTime > 0.3")
+        remove = f"{entry}.querySelector('button:last-child')"
+        await page.value(f"{remove}.click()")
+        await page.comes_true(f"{remove}.textContent === 'Really?'")
+        assert (folder / TAKE).exists()
+        await page.value(f"{remove}.click()")
+        await page.comes_true("document.querySelectorAll('#saved li').length === 1")
+        assert not (folder / TAKE).exists() and page.errors == []
+
+
+async def test_without_a_network_the_page_shows_pictures_at_once(tmp_path: Path) -> None:
+    """Then browsers have no address to offer; before, the connection was waited for until 6 s had passed without a picture."""
+    flag = "--webrtc-ip-handling-policy=disable_non_proxied_udp"
+    with streaming() as stream:
+        async with made_viewfinder(sinks=[stream], whep=Whep(stream)) as made, chromium_page(made.url, tmp_path / "profile", flag) as page:
+            await page.comes_true(f"{SHOWN} && document.getElementById('way').textContent === 'pictures' && {MESSAGE} === ''")
+            asked = await page.value("performance.getEntriesByType('resource').map((each) => new URL(each.name).pathname)")
+            assert "/state" in asked and "/whep" not in asked
 
 
 async def test_the_camera_page_needs_a_secure_page_and_sends_what_the_camera_sees(tmp_path: Path) -> None:

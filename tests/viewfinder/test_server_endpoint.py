@@ -4,9 +4,6 @@ import asyncio
 import os
 import signal
 import ssl
-from collections.abc import Callable
-from datetime import UTC, datetime, timedelta
-from ipaddress import ip_address
 from pathlib import Path
 
 import aiohttp
@@ -16,6 +13,7 @@ import pytest
 
 from tests.support.made_viewfinder import made_viewfinder
 from tests.support.refusals import refused
+from tests.viewfinder.conftest import Make
 from viewfinder.options import ListeningOptions
 from viewfinder.server.access import LOOPBACK_NAMES, Access
 from viewfinder.server.endpoint import Endpoint, Interface, choose, interfaces, load_tls, on_stop, open_endpoint, page_url, qr_text
@@ -73,37 +71,6 @@ def drawn(text: str) -> np.ndarray:
     modules = cells.transpose(0, 2, 1).reshape(-1, cells.shape[1])
     bordered = np.pad(255 * modules, 2, constant_values=255)
     return np.kron(bordered, np.ones((8, 8), np.uint8))
-
-
-x509 = pytest.importorskip("cryptography.x509")
-
-Make = Callable[..., tuple[Path, Path]]
-
-
-@pytest.fixture
-def make_certificate(tmp_path: Path) -> Make:
-    """(certificate, key) as PEM files, signed by themselves."""
-    from cryptography.hazmat.primitives import hashes, serialization
-    from cryptography.hazmat.primitives.asymmetric import ec
-
-    def make(name: str = "one", days: int = 1, passphrase: bytes | None = None, *, named: bool = True) -> tuple[Path, Path]:
-        key = ec.generate_private_key(ec.SECP256R1())
-        subject = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, name)])
-        now = datetime.now(UTC)
-        builder = x509.CertificateBuilder().subject_name(subject).issuer_name(subject).public_key(key.public_key())
-        builder = builder.serial_number(x509.random_serial_number()).not_valid_before(now - timedelta(days=9))
-        builder = builder.not_valid_after(now + timedelta(days=days))
-        if named:
-            names = [x509.DNSName("Box.local"), x509.DNSName("*.example"), x509.IPAddress(ip_address("127.0.0.1"))]
-            builder = builder.add_extension(x509.SubjectAlternativeName(names), critical=False)
-        encryption = serialization.BestAvailableEncryption(passphrase) if passphrase else serialization.NoEncryption()
-        key_pem = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, encryption)
-        paths = tmp_path / f"{name}.pem", tmp_path / f"{name}-key.pem"
-        paths[0].write_bytes(builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM))
-        paths[1].write_bytes(key_pem)
-        return paths
-
-    return make
 
 
 async def test_the_page_the_stream_and_the_cookie_travel_encrypted(make_certificate: Make) -> None:

@@ -4,6 +4,7 @@ import asyncio
 import json
 import math
 import random
+import re
 import threading
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.system.errors import InputError
-from tests.support.browser_sender import HEIGHT, WIDTH, Canvas, sending
+from tests.support.browser_sender import HEIGHT, WIDTH, Canvas, Sender, sending
 from tests.support.streaming_viewers import serving_routes
 from tests.support.waiting import comes_true
 from viewfinder.frames import CameraFrame
@@ -180,6 +181,30 @@ async def test_a_camera_goes_is_replaced_and_comes_again() -> None:
                 async with sending(url, Canvas(RED)):
                     await comes_true(lambda: reader.shows(RED) and source.status is None)
         await comes_true(lambda: "waiting" in str(source.status))
+
+
+async def test_an_offer_whose_connection_never_stands_takes_nobodys_place() -> None:
+    source = BrowserCameraSource()
+    async with serving(source) as (url, reader), sending(url, Canvas(RED)) as sender, aiohttp.ClientSession() as session:
+        await comes_true(lambda: reader.shows(RED))
+        source._connect_within_s = 0.2
+        for _ in range(3):
+            silent = Sender(url, Canvas(GREEN))
+            await silent.peer.setLocalDescription(await silent.peer.createOffer())
+            offer = silent.peer.localDescription.sdp
+            # Its addresses are those of somebody who never answers (RFC 5737).
+            offer = re.sub(r"(a=candidate:(?:\S+ ){4})\S+", r"\g<1>192.0.2.254", offer)
+            async with session.post(url + "/whip", data=offer, headers={"Content-Type": "application/sdp"}) as answer:
+                assert answer.status == 201
+                found = re.findall(r"a=candidate:(?:\S+ ){4}(\S+)", await answer.text())
+            # Sockets are opened at the address at which the page is served, and nowhere else.
+            assert set(found) == {"127.0.0.1"}
+            await silent.peer.close()
+        before = reader.sequences[-1]
+        await comes_true(lambda: reader.sequences[-1] > before + 5)
+        assert reader.shows(RED) and sender.peer.connectionState == "connected"
+        await comes_true(lambda: source._offering is None)
+        assert source.status is None and source._session is not None
 
 
 async def test_offers_that_make_no_sense_change_nothing() -> None:

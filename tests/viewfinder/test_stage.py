@@ -22,6 +22,7 @@ from mrbokeh.system.errors import InputError
 from tests.scene.test_scene_gltf import GlbWriter
 from tests.support.refusals import refused
 from tests.support.stage_scenes import FOCAL_PX, HEIGHT, LENS, ONE_CARD, WIDTH, backend, camera, centroid, scene_file
+from viewfinder.stage.out_of_sight import preparing
 from viewfinder.stage.stage import FADE_S, AdaptiveResolution, Fade, Stage
 from viewfinder.stage.stage_setup import live_renderer
 from viewfinder.tracking.tracker import TrackedPose
@@ -93,6 +94,33 @@ def test_the_object_appears_where_it_stands_and_moves_with_every_frame(stage: St
     # 2 cm to the right at 1 m are 3 px; the very next frame shows it, drawn or not.
     stream.view = aside(0.02)
     assert centre_px(stream.frame(), camera())[0] == pytest.approx(80 - FOCAL_PX * 0.02, abs=0.1)
+
+
+def test_it_says_why_nothing_is_seen_and_where_the_object_is(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("viewfinder.stage.out_of_sight.kernels_compiled", lambda: 3)
+    assert preparing(busy=True).startswith("preparing the scene; compiling for this machine, kernel 3: ")
+    stream = Stream(stage, camera())
+    while stage.seen is None:
+        stream.frame()
+        assert stage.seen is not None or stage.remark is not None
+    stream.settled()
+    assert stage.remark is None
+    # From 2 m to its left it lies to the right, from 2 m above it below; who turned round has it behind, and to the left.
+    for view, word, arrow in (
+        (aside(-2.0), "outside", (1.0, 0.0)),
+        (camera((0.0, 1.0, -2.1), (0.0, 0.0, -2.1)), "outside", (0.0, 1.0)),
+        (camera((-0.5, 1.0, -0.1), (-0.5, 2.0, -0.1)), "behind", (-1.0, 0.0)),
+    ):
+        stream.view = view
+        stream.until(lambda word=word: stage.remark is not None and word in stage.remark.sentence)
+        assert stage.remark.arrow == pytest.approx(arrow, abs=0.05)
+    # On the way back it says nothing wrong before the new drawing is there.
+    stream.view = camera()
+    while not stream.frame().rgb.size:
+        assert stage.remark is None or stage.remark.arrow is not None
+    stage.show_object("card", False)
+    stream.until(lambda: stage.remark is not None)
+    assert stage.remark == ("every object is hidden: show one", None)
 
 
 def test_nothing_is_drawn_again_when_nothing_moved(stage: Stage) -> None:

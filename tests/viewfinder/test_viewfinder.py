@@ -4,6 +4,7 @@ import asyncio
 import gc
 import json
 import os
+import shutil
 import socket
 import sys
 import threading
@@ -24,13 +25,16 @@ from mrbokeh.images.layer import clear
 from mrbokeh.optics.camera import Camera
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
+from mrbokeh.video.clip import read_frames
 from mrbokeh.video.color import code_from_linear, linear_from_code
 from tests.support.layer_viewfinder import HEIGHT, LENS, WIDTH, bright_square, running, set_focus, until, viewfinder, watching
 from tests.support.live_clip import write_live_clip
 from tests.support.live_viewfinder import Live, live
 from tests.support.refusals import refused
+from tests.support.stage_scenes import ONE_CARD, backend, scene_file
+from tests.support.streaming_viewers import noise, output
 from tests.support.told_parts import ToldCamera, ToldTracker
-from tests.support.waiting import comes_true
+from tests.support.waiting import comes_true, wait_until
 from viewfinder.app.live_compositor import LiveCompositor
 from viewfinder.app.live_controls import Captures
 from viewfinder.app.opening import LensBook, Parts
@@ -42,7 +46,10 @@ from viewfinder.server.endpoint import serving_site
 from viewfinder.sources.choose import open_source
 from viewfinder.sources.frame_source import ExactSize, SizeLimit
 from viewfinder.sources.playback import PatternSource, VideoFileSource
+from viewfinder.stage.stage import Stage
 from viewfinder.stage.static_layer import StaticLayer
+from viewfinder.streaming.recording import Recorder
+from viewfinder.streaming.take_file import playable_bytes
 from viewfinder.tracking.tracker import TrackedPose
 
 
@@ -100,23 +107,28 @@ def test_a_blur_that_ends_while_a_frame_is_made_is_told_of_with_the_next() -> No
         assert still.status.lens == nearer and not still.pending
 
 
-def dying(may_die: Event | None = None) -> ToldCamera:
+def dying(may_die: Event | None = None, sentence: str = "camera 7 stopped giving pictures") -> ToldCamera:
     """A camera that dies after its first frame, then or when it may."""
 
     def frames(stopping: Event) -> Iterator[CameraFrame]:
         yield CameraFrame(np.zeros((HEIGHT, WIDTH, 3), np.uint8), time.monotonic(), 0)
         assert (may_die is None or may_die.wait(5.0)) and not stopping.is_set()
-        raise InputError("camera 7 stopped giving pictures")
+        raise InputError(sentence)
 
     return ToldCamera(frames)
 
 
 async def test_a_failing_camera_says_so() -> None:
-    async with running(dying()) as url, watching(url) as viewer:
+    """Without the folders of this machine, in the stream and in the state."""
+    trouble = "/home/me/clips/of today/camera 7.mp4 is broken: see C:\\made\\notes.txt, and /whip"
+    shown = "of today/camera 7.mp4 is broken: see notes.txt, and /whip"
+    async with running(dying(sentence=trouble)) as url, watching(url) as viewer:
         # The one picture may come before.
         while (message := await viewer.stream.receive(timeout=5)).type is not aiohttp.WSMsgType.TEXT:
             pass
-        assert json.loads(message.data) == {"failure": "camera 7 stopped giving pictures"}
+        assert json.loads(message.data) == {"failure": shown}
+        async with aiohttp.ClientSession() as session, session.get(url + "state") as answer:
+            assert (await answer.json())["failure"] == shown
 
 
 @pytest.mark.parametrize("trouble", [None, InputError("the layer is missing")])
@@ -191,6 +203,26 @@ def test_a_file_plays_in_its_own_time(plate: tuple[Path, np.ndarray]) -> None:
     assert next(ExactSize(open_source(str(plate[0])), 320, 180).frames(Event())).bgr.shape == (180, 320, 3)
 
 
+def test_a_take_that_was_cut_off_is_recovered_and_told_of_at_the_next_start(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    left, recorder = tmp_path / "viewfinder-1.recording.mp4", Recorder(lambda: "bt709", lambda _: None, waiting=100)
+    recorder.start(tmp_path / "viewfinder-2.mp4")
+    for i in range(60):
+        recorder.show(output(noise(i), i, i / 30))
+
+    def is_copied() -> bool:
+        for working in tmp_path.glob("*2.recording.mp4"):
+            shutil.copy(working, left)
+        with left.open("ab+") as file:
+            return playable_bytes(file) > 0
+
+    wait_until(is_copied)
+    recorder.stop()
+    with viewfinder(PatternSource(WIDTH, HEIGHT), tmp_path) as running_one:
+        [notice] = running_one.site.controls.state()["notices"]
+    assert "viewfinder-1.mp4" in notice["sentence"] and notice["sentence"] in capsys.readouterr().out
+    assert len(list(read_frames(tmp_path / "viewfinder-1.mp4"))) >= 15, "half a second"
+
+
 async def test_a_slow_viewer_skips_frames_and_sees_the_newest(plate: tuple[Path, np.ndarray]) -> None:
     async with running(VideoFileSource(plate[0], SizeLimit(WIDTH, HEIGHT))) as url, watching(url) as slow, watching(url) as quick:
         numbers, ages_ms = [], []
@@ -246,6 +278,34 @@ def test_of_a_pose_that_is_not_certain_the_page_is_told_and_nothing_is_captured(
     headers = [frame_header(each) for each in (certain, unsure)]
     assert [(each["tracking"], each["tracking_unsure"]) for each in headers] == [(0.2, False), (0.2, True)]
     assert compositor.last_tracked is not None and compositor.last_tracked.frame.sequence == 0
+
+
+def test_every_picture_says_why_nothing_virtual_is_in_it(tmp_path: Path) -> None:
+    poses = {0: None, 1: (False, 0.0), 2: (True, 0.0), 3: (True, 0.0)}
+
+    def pose_of(frame: CameraFrame) -> TrackedPose | None:
+        known = poses[frame.sequence]
+        return None if known is None else TrackedPose(np.eye(4), 0.2, frame.captured_s, is_certain=known[0])
+
+    scene = scene_file(tmp_path, ONE_CARD)
+    for tracker, sentences in (
+        (ToldTracker(pose_of), ["told does not tell where it is", "tilt of the board is unsure", "behind the camera", "is late"]),
+        (None, ["behind the camera: turn round, along the arrow. Nothing tells where the camera is: start with --board"] * 3 + ["is late"]),
+    ):
+        stage = Stage(scene, backend())
+        stage.set_renderer("scatter", ScatterReference())
+        parts = Parts(
+            ViewfinderOptions("test"), PatternSource(WIDTH, HEIGHT), stage, LensBook({"test": LENS}), {"scatter": ScatterReference}
+        )
+        with closing(LiveCompositor(parts, ManualFocus(), tracker)) as compositor:
+            for number, sentence in enumerate(sentences):
+
+                def says(number: int = number, sentence: str = sentence, late_s: float = 0.0 if number < 3 else 2.5) -> bool:
+                    frame = CameraFrame(np.zeros((HEIGHT, WIDTH, 3), np.uint8), time.monotonic() - late_s, number)
+                    remark = compositor(frame, 0).status.remark
+                    return remark is not None and sentence in remark.sentence
+
+                wait_until(says)
 
 
 SOAK_S = float(os.environ.get("MRBOKEH_SOAK_S", "600"))

@@ -199,7 +199,8 @@ async def test_the_command_serves_until_it_is_stopped_and_writes_to_the_captures
                 pass
             assert viewer.stream.close_code == aiohttp.WSCloseCode.GOING_AWAY
         output, errors = process.communicate(timeout=30)
-    assert (process.returncode, output, errors) == (0, "viewfinder stopped\n", "")
+    assert (process.returncode, errors) == (0, "")
+    assert re.fullmatch(r"saved viewfinder-\d{8}-\d{6}\.mp4 \(\d+ s\)\nviewfinder stopped\n", output)
     assert {path.name for path in folder.iterdir()} == before | {"shots"}
     assert [path.name for path in (folder / "shots").iterdir()] == ["today"]
     assert "" in {path.suffix for path in (folder / "shots" / "today").iterdir()}, "the bundle is a folder"

@@ -237,8 +237,10 @@ async def test_a_recording_plays_and_shows_the_object(clip: LiveClip, tmp_path: 
         await one.done({"record": True})
         assert (await one.state())["recording"] and (await one.ask({"record": True}))[0] == 400
         await watch.more(15)
+        assert (await one.state())["recorded_s"] > 0
         await one.done({"record": False})
-        assert not (await one.state())["recording"]
+        state = await one.state()
+        assert not state["recording"] and state["notices"][0]["sentence"].startswith("saved viewfinder-")
     [path] = tmp_path.iterdir()
     recorded = list(read_display_frames(path, WIDTH, HEIGHT))
     assert len(recorded) >= 5 and np.all(np.diff([frame.time_s for frame in recorded]) > 0)
@@ -256,11 +258,14 @@ async def test_a_lost_board_fades_the_object_and_a_camera_that_goes_away_says_so
         grey = np.full_like(clip.plates[0], 90)
         lost = await newest_until(watch, lambda each: each.status["tracking"] == 0.0 and seen_centroid_px(each.bgr, grey) is None)
         assert psnr_db(lost.bgr, grey) > CODEC_DB
+        why = "the camera is not tracked: show it the board, whole, lit and not too blurred"
+        await newest_until(watch, lambda each: each.status["remark"] == {"sentence": why, "arrow": None})
+        assert (await one.state())["remark"]["sentence"] == why
         status, answer = await one.ask({"capture": {}})
         assert status == 400 and "board" in answer["error"]
         camera.gives = "board"
         back = await newest_until(watch, lambda each: each.status["tracking"] > 0.5 and off_px(each, clip) < REGISTERED_PX)
-        assert (await one.state())["failure"] is None and back.sequence > lost.sequence
+        assert (await one.state())["failure"] is None and back.sequence > lost.sequence and back.status["remark"] is None
         camera.gives = "nothing"
         assert (await one.state())["failure"] == ClipCamera.AWAY
         # The last picture is shown again and again, for what lies over it may change.

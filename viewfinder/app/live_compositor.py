@@ -10,7 +10,7 @@ from mrbokeh.optics.camera import Camera, camera_of_lens
 from mrbokeh.optics.lens import Lens
 from viewfinder.app.opening import Parts
 from viewfinder.focus.sources import FocusSource
-from viewfinder.frames import Bgr, CameraFrame, FrameStatus, OutputFrame
+from viewfinder.frames import Bgr, CameraFrame, FrameStatus, OutputFrame, Remark
 from viewfinder.tracking.tracker import TrackedPose, Tracker
 
 
@@ -27,6 +27,12 @@ class Stopwatch:
         self.stages_ms[name] = 1000.0 * (time.perf_counter() - started_s)
 
 
+# A board is found a moment after the first picture, and a track that is lost for a picture is not worth a word.
+_LATE_S, _UNSEEN_S = 1.0, 0.5
+_HINTS = {"board": "show it the board, whole, lit and not too blurred", "map": "show it what the map was made of"}
+_NO_POSE = "Nothing tells where the camera is: start with --board, --pose, --map or a tracking system"
+
+
 class LiveCompositor:
     """Compositor of the compositing thread. view: which of the pictures of the overlay source is streamed.
 
@@ -38,6 +44,7 @@ class LiveCompositor:
         self.overlays, self.lenses, self.focus, self.tracker = parts.overlays, parts.lenses, focus, tracker
         self._source, self._known_intrinsics = parts.source, parts.intrinsics
         self.view = "final"
+        self._seen_s: float | None = None
         self.last: CompositedFrame | None = None
         self.last_tracked: CompositedFrame | None = None
 
@@ -59,6 +66,7 @@ class LiveCompositor:
             bgr = self._picture(frame.bgr, overlay)
         camera = replace(intrinsics, camera_from_world=pose.camera_from_world) if pose else intrinsics
         output = OutputFrame(bgr, frame.captured_s, frame.sequence, self._status(lens, pose, watch, dropped))
+        output = replace(output, status=replace(output.status, remark=self._remark(frame, pose, overlay)))
         self.last = CompositedFrame(frame=frame, output=output, overlay=overlay, camera=camera, lens=lens, pose=pose)
         self.last_tracked = self.last if pose is not None and pose.is_certain else self.last_tracked
         return output
@@ -98,6 +106,25 @@ class LiveCompositor:
             stages_ms=watch.stages_ms,
             dropped=dropped,
         )
+
+    def _remark(self, frame: CameraFrame, pose: TrackedPose | None, overlay: Overlay) -> Remark | None:
+        """Say why the picture is not what the user waits for: it is old, or nothing virtual is in it."""
+        age_s = time.monotonic() - frame.captured_s
+        if age_s > _LATE_S:
+            return Remark(self._source.status or f"{self._source.name} is late: its last picture is {age_s:.0f} s old")
+        if overlay.rgb.size or self._seen_s is None:
+            self._seen_s = time.monotonic()
+        if time.monotonic() - self._seen_s < _UNSEEN_S:
+            return None
+        if pose is None:
+            name = "" if self.tracker is None else self.tracker.name
+            return Remark(f"the camera is not tracked: {_HINTS.get(name, f'{name} does not tell where it is')}")
+        if not pose.is_certain:
+            return Remark("the tilt of the board is unsure: go nearer, or look at it from the side")
+        remark = self.overlays.remark
+        if remark is None or self.tracker is not None or frame.camera_from_world is not None or remark.arrow is None:
+            return remark
+        return Remark(f"{remark.sentence}. {_NO_POSE}", remark.arrow)
 
     def close(self) -> None:
         self.overlays.close()

@@ -1,8 +1,10 @@
-"""LiveControls: what the page may ask for, carried out on the running viewfinder; Captures: moments saved as bundles."""
+"""LiveControls: what the page may ask for, carried out on the running viewfinder; Captures: moments saved as bundles; Notices."""
 
+import itertools
 import math
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +14,14 @@ from jaxtyping import UInt8, UInt16
 from mrbokeh.compositing.overlay import code_tables
 from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.stacks.capture_bundle import write_bundle
+from mrbokeh.system.channel import say
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import turned, turned_back
 from viewfinder.app.live_compositor import CompositedFrame, LiveCompositor
 from viewfinder.app.opening import Parts
 from viewfinder.focus.sources import FirstKnown, ManualFocus
-from viewfinder.frames import Bgr, CameraFrame
-from viewfinder.server.controls import ObjectState, State
+from viewfinder.frames import Bgr, CameraFrame, Remark, remark_json, without_folders
+from viewfinder.server.controls import Notice, ObjectState, State
 from viewfinder.stage.shown_scene import ground_from_picture
 from viewfinder.stage.stage import Stage
 from viewfinder.streaming.recording import Recorder, recording_path
@@ -96,13 +99,37 @@ def _encoded(suffix: str, bgr: Bgr | UInt16[np.ndarray, "height width 3"]) -> by
     return bytes(cv2.imencode(suffix, bgr)[1].tobytes())
 
 
+_MOST_NOTICES = 8
+
+
+class Notices:
+    """Notices of what happened by itself, such as a full disk: each goes to the terminal, and the newest to the page."""
+
+    def __init__(self) -> None:
+        self.newest: tuple[Notice, ...] = ()
+        self._numbers = itertools.count(1)
+
+    def say(self, sentence: str) -> None:
+        """Tell everybody; from any thread."""
+        say(sentence)
+        self.newest = (*self.newest, Notice(number=next(self._numbers), sentence=without_folders(sentence)))[-_MOST_NOTICES:]
+
+
+@dataclass(frozen=True)
+class Takes:
+    """Recording of takes, and what is said of them."""
+
+    recorder: Recorder
+    notices: Notices
+
+
 class LiveControls:
     """Controls (viewfinder.server.controls) of a running viewfinder. trouble: a sentence about the camera, or None."""
 
     def __init__(
-        self, parts: Parts, compositor: LiveCompositor, manual: ManualFocus, recorder: Recorder, trouble: Callable[[], str | None]
+        self, parts: Parts, compositor: LiveCompositor, manual: ManualFocus, takes: Takes, trouble: Callable[[], str | None]
     ) -> None:
-        self._parts, self._compositor, self._manual, self._recorder, self._trouble = parts, compositor, manual, recorder, trouble
+        self._parts, self._compositor, self._manual, self._takes, self._trouble = parts, compositor, manual, takes, trouble
         self._captures = Captures(parts.options.captures, compositor, next(iter(parts.renderers)), parts.options.scene)
         # A finished layer has no objects.
         self._stage = parts.overlays if isinstance(parts.overlays, Stage) else None
@@ -150,9 +177,9 @@ class LiveControls:
 
     def record(self, on: bool) -> None:
         if on:
-            self._recorder.start(recording_path(self._parts.options.captures))
+            self._takes.recorder.start(recording_path(self._parts.options.captures))
         else:
-            self._recorder.stop()
+            self._takes.recorder.stop()
 
     def smooth(self, on: bool) -> None:
         if self._smoothed is None:
@@ -164,6 +191,7 @@ class LiveControls:
         lenses, status = compositor.lenses, compositor.overlays.status
         lens = moment.lens if moment else lenses.lens
         height, width = moment.frame.bgr.shape[:2] if moment else (0, 0)
+        take, failure = self._takes.recorder.take, self._trouble() or status.problem
         return State(
             source=self._parts.source.name,
             width_px=width,
@@ -183,9 +211,13 @@ class LiveControls:
             ground_from_picture=self._ground(moment),
             can_capture=True,
             can_record=True,
-            recording=self._recorder.wants_frame,
+            recording=self._takes.recorder.wants_frame,
+            recorded_s=None if take is None else take.duration_s,
+            room_s=None if take is None else take.room_s,
+            notices=list(self._takes.notices.newest),
             smoothing=None if self._smoothed is None else self._smoothed.smoothing,
-            failure=self._trouble() or status.problem,
+            failure=None if failure is None else without_folders(failure),
+            remark=remark_json(moment.output.status.remark if moment else Remark(f"{self._parts.source.name} has not given a picture yet")),
         )
 
     def _ground(self, moment: CompositedFrame | None) -> list[list[float]] | None:

@@ -22,7 +22,7 @@ from mrbokeh.system.channel import say
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import keep_few_arenas
 from viewfinder.app.live_compositor import CompositedFrame, LiveCompositor
-from viewfinder.app.live_controls import LiveControls
+from viewfinder.app.live_controls import LiveControls, Notices, Takes
 from viewfinder.app.opening import Parts, open_parts
 from viewfinder.focus.board_focus import BlurOfBoardFocus, FollowingOptics
 from viewfinder.focus.sources import FocusSource, ManualFocus, open_focus
@@ -30,12 +30,14 @@ from viewfinder.frames import CameraFrame, Newest, OutputFrame
 from viewfinder.options import ViewfinderOptions
 from viewfinder.server.access import Access
 from viewfinder.server.endpoint import Endpoint, on_stop, open_endpoint, serving_site
+from viewfinder.server.gallery import Gallery
 from viewfinder.server.jpeg_stream import JpegStream
 from viewfinder.server.site import Part, Site
 from viewfinder.sources.frame_source import FrameSource
 from viewfinder.streaming.encoded_stream import EncodedStream
 from viewfinder.streaming.other_programs import AlphaStream, ObsPart, VirtualWebcam
 from viewfinder.streaming.recording import Recorder
+from viewfinder.streaming.take_file import recover_takes
 from viewfinder.streaming.whep import Whep
 from viewfinder.tracking.smoothing import SmoothedTracker
 
@@ -220,7 +222,10 @@ def running(parts: Parts) -> Iterator[Viewfinder]:
         focus = open_focus(manual, parts.tracker, parts.options.focus_from, _blur_focus(parts, lambda: compositor.last))
         compositor = LiveCompositor(parts, focus, tracker)
         closing.callback(compositor.close)
-        jpeg, stream, alone, recorder = JpegStream(), EncodedStream(), EncodedStream(), Recorder(parts.source.transfer)
+        notices = Notices()
+        for sentence in recover_takes(parts.options.captures):
+            notices.say(sentence)
+        jpeg, stream, alone, recorder = JpegStream(), EncodedStream(), EncodedStream(), Recorder(lambda: parts.source.transfer, notices.say)
         alpha = AlphaStream(alone, parts.source.transfer)
         # The stream of the alpha ends after who feeds it.
         for each in (jpeg, stream, alone, alpha, recorder):
@@ -230,8 +235,14 @@ def running(parts: Parts) -> Iterator[Viewfinder]:
             sinks.append(parts.webcam)
             closing.callback(parts.webcam.close)
         pipeline = closing.enter_context(Pipeline(parts.source, compositor, sinks, Preparing(compositor)))
-        controls = LiveControls(parts, compositor, manual, recorder, trouble=lambda: pipeline.failure or pipeline.problem or _remark(parts))
-        of_site: dict[str, Part] = {"whep": Whep(stream), "obs": ObsPart(Whep(alone))}
+        controls = LiveControls(
+            parts,
+            compositor,
+            manual,
+            Takes(recorder, notices),
+            trouble=lambda: pipeline.failure or pipeline.problem or _remark(parts),
+        )
+        of_site: dict[str, Part] = {"whep": Whep(stream), "obs": ObsPart(Whep(alone)), "gallery": Gallery(parts.options.captures)}
         if isinstance(parts.source, Part):
             of_site["whip"] = parts.source
         of_site |= parts.cameras

@@ -1,7 +1,8 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 78dec699af0ee159284529b425d4af1e7eb9c4f8919bdc5bcdedf92f77a4e690
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 59bc23d7eb9a4c49972b783d393f89531f758afb296d6d802baf0c3f2d99159b
 "use strict";
 (() => {
   // src/model.ts
+  var NOTICE_S = 10;
   var Model = class extends EventTarget {
     state = null;
     shown = null;
@@ -9,9 +10,14 @@
     sentence = "";
     silence = 0;
     failing = false;
+    noticed = 0;
     setState(state) {
       this.state = state;
       this.dispatchEvent(new Event("state"));
+      const unseen = (state.notices ?? []).filter((each) => each.number > this.noticed);
+      if (unseen.length === 0) return;
+      this.noticed = Math.max(...unseen.map((each) => each.number));
+      this.say(unseen.map((each) => each.sentence).join(" · "), NOTICE_S);
     }
     show(frame) {
       this.shown = frame;
@@ -65,6 +71,7 @@
     await peer.setLocalDescription();
     await gathered(peer);
     const body = peer.localDescription.sdp;
+    if (!body.includes("a=candidate:")) throw new Error("this browser has no network address for video");
     const answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/sdp" }, body });
     if (!answer.ok) throw new Error(await sentenceOf(answer));
     await peer.setRemoteDescription({ type: "answer", sdp: await answer.text() });

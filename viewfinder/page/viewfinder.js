@@ -1,7 +1,8 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 78dec699af0ee159284529b425d4af1e7eb9c4f8919bdc5bcdedf92f77a4e690
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 59bc23d7eb9a4c49972b783d393f89531f758afb296d6d802baf0c3f2d99159b
 "use strict";
 (() => {
   // src/model.ts
+  var NOTICE_S = 10;
   var Model = class extends EventTarget {
     state = null;
     shown = null;
@@ -9,9 +10,14 @@
     sentence = "";
     silence = 0;
     failing = false;
+    noticed = 0;
     setState(state) {
       this.state = state;
       this.dispatchEvent(new Event("state"));
+      const unseen = (state.notices ?? []).filter((each) => each.number > this.noticed);
+      if (unseen.length === 0) return;
+      this.noticed = Math.max(...unseen.map((each) => each.number));
+      this.say(unseen.map((each) => each.sentence).join(" · "), NOTICE_S);
     }
     show(frame) {
       this.shown = frame;
@@ -108,11 +114,11 @@
       this.innerHTML = "<details><summary>Aids</summary><div></div></details>";
       for (const aid of Object.keys(AIDS)) {
         if (aid === "level" && !levelAllowed) continue;
-        const button = document.createElement("button");
-        button.id = `aid_${aid}`;
-        button.textContent = AIDS[aid];
-        button.addEventListener("click", () => aids.set(aid, !aids.has(aid)));
-        this.querySelector("div").append(button);
+        const button2 = document.createElement("button");
+        button2.id = `aid_${aid}`;
+        button2.textContent = AIDS[aid];
+        button2.addEventListener("click", () => aids.set(aid, !aids.has(aid)));
+        this.querySelector("div").append(button2);
       }
       aids.addEventListener("change", () => this.refresh());
       model.addEventListener("state", () => this.refresh());
@@ -185,11 +191,12 @@
     return { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(message) };
   }
   var GATHERING_MS = 1e3;
-  async function offerTo(path, peer) {
+  async function offerTo(path2, peer) {
     await peer.setLocalDescription();
     await gathered(peer);
     const body = peer.localDescription.sdp;
-    const answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/sdp" }, body });
+    if (!body.includes("a=candidate:")) throw new Error("this browser has no network address for video");
+    const answer = await fetch(path2, { method: "POST", headers: { "Content-Type": "application/sdp" }, body });
     if (!answer.ok) throw new Error(await sentenceOf(answer));
     await peer.setRemoteDescription({ type: "answer", sdp: await answer.text() });
     return answer.headers.get("Location");
@@ -203,6 +210,101 @@
       setTimeout(done, GATHERING_MS);
       peer.addEventListener("icegatheringstatechange", () => peer.iceGatheringState === "complete" && done());
     });
+  }
+
+  // src/gallery.ts
+  var ANSWER_S2 = 6;
+  var SURE_MS = 4e3;
+  var Gallery = class extends HTMLElement {
+    dialog;
+    list;
+    connectedCallback() {
+      this.innerHTML = `<button id="open_gallery" hidden>Saved</button>
+      <dialog id="gallery" aria-label="saved takes and captures">
+        <header><h2>Saved</h2><span id="room"></span><button id="close_gallery">Close</button></header>
+        <div id="playing"></div>
+        <ul id="saved"></ul>
+      </dialog>`;
+      this.dialog = this.querySelector("#gallery");
+      this.list = this.querySelector("#saved");
+      this.querySelector("#open_gallery").addEventListener("click", () => void this.open());
+      this.querySelector("#close_gallery").addEventListener("click", () => this.dialog.close());
+      this.dialog.addEventListener("close", () => this.querySelector("#playing").replaceChildren());
+      model.addEventListener("state", () => this.querySelector("#open_gallery").hidden = model.state?.gallery !== true);
+    }
+    async open() {
+      if (await this.refresh()) this.dialog.showModal();
+    }
+    /** Whether the server gave a list. */
+    async refresh() {
+      const answer = await fetch("/gallery").catch(() => null);
+      if (!answer?.ok) {
+        model.say(answer ? await sentenceOf(answer) : "the viewfinder does not answer", ANSWER_S2);
+        return false;
+      }
+      const { saved: all, free_bytes } = await answer.json();
+      this.querySelector("#room").textContent = `${(free_bytes / 1e9).toFixed(1)} GB free`;
+      this.list.replaceChildren(...all.map((each) => this.entry(each)));
+      if (all.length === 0) this.list.textContent = "Nothing was saved yet: the red button records, the white one captures.";
+      return true;
+    }
+    entry(listed) {
+      const entry = document.createElement("li");
+      const small = document.createElement("img");
+      small.loading = "lazy";
+      small.alt = "";
+      small.src = path(listed, "small");
+      const play = button(listed.kind === "take" ? "Play" : "Show", () => this.show(listed));
+      const keep = document.createElement("a");
+      keep.href = path(listed, "file");
+      keep.download = "";
+      keep.textContent = "Download";
+      const words = document.createElement("p");
+      words.textContent = [listed.name, length(listed.length_s), megabytes(listed.size_bytes)].filter(Boolean).join(" · ");
+      const remove = button("Delete", () => void this.erase(listed, remove));
+      for (const each of [play, keep, remove]) each.setAttribute("aria-label", `${each.textContent} ${listed.name}`);
+      entry.append(small, words, play, keep, remove);
+      return entry;
+    }
+    show(listed) {
+      const shown = document.createElement(listed.kind === "take" ? "video" : "img");
+      shown.src = path(listed, "shown");
+      if (shown instanceof HTMLVideoElement) Object.assign(shown, { controls: true, autoplay: true, playsInline: true, muted: true });
+      else shown.alt = `capture ${listed.name}`;
+      this.querySelector("#playing").replaceChildren(shown);
+      this.dialog.scrollTo(0, 0);
+    }
+    /** At the second press: what is deleted is gone. */
+    async erase(listed, pressed) {
+      if (pressed.dataset["sure"] === void 0) {
+        pressed.dataset["sure"] = "";
+        pressed.textContent = "Really?";
+        setTimeout(() => {
+          delete pressed.dataset["sure"];
+          pressed.textContent = "Delete";
+        }, SURE_MS);
+        return;
+      }
+      this.querySelector("#playing").replaceChildren();
+      const answer = await fetch(path(listed, ""), { method: "DELETE" }).catch(() => null);
+      if (!answer?.ok) model.say(answer ? await sentenceOf(answer) : "the viewfinder does not answer", ANSWER_S2);
+      await this.refresh();
+    }
+  };
+  function path(listed, what) {
+    return `/gallery/${encodeURIComponent(listed.name)}${what && "/"}${what}`;
+  }
+  function button(text, press) {
+    const made = document.createElement("button");
+    made.textContent = text;
+    made.addEventListener("click", press);
+    return made;
+  }
+  function length(length_s) {
+    return length_s === null ? "" : `${Math.floor(length_s / 60)}:${String(Math.round(length_s) % 60).padStart(2, "0")}`;
+  }
+  function megabytes(size_bytes) {
+    return `${(size_bytes / 1e6).toFixed(1)} MB`;
   }
 
   // src/timing.ts
@@ -289,12 +391,12 @@
     lastView = "plate";
     connectedCallback() {
       for (const choice of CHOICES) this.append(this.picker(choice));
-      const button = document.createElement("button");
-      button.id = "ab";
-      button.textContent = "A/B";
-      button.title = "back to the view before this one";
-      button.addEventListener("click", () => void this.choose(CHOICES[0], this.lastView));
-      this.querySelector("#view").after(button);
+      const button2 = document.createElement("button");
+      button2.id = "ab";
+      button2.textContent = "A/B";
+      button2.title = "back to the view before this one";
+      button2.addEventListener("click", () => void this.choose(CHOICES[0], this.lastView));
+      this.querySelector("#view").after(button2);
       model.addEventListener("state", () => this.onState());
     }
     picker(choice) {
@@ -326,8 +428,8 @@
         select.parentElement.hidden = choice.names(state).length === 0;
         select.disabled = !model.mayControl;
       }
-      const button = this.querySelector("#ab");
-      button.disabled = !model.mayControl || !state.views?.includes(this.lastView);
+      const button2 = this.querySelector("#ab");
+      button2.disabled = !model.mayControl || !state.views?.includes(this.lastView);
     }
   };
   var selection = { name: "" };
@@ -422,13 +524,17 @@
     if (name === void 0) return "";
     return name === null ? "from the file of the lens" : name.startsWith("by ") ? name : `from ${name}`;
   }
+  var SHORT_OF_ROOM_S = 300;
   var Shutter = class extends HTMLElement {
+    began_ms = 0;
     connectedCallback() {
-      this.innerHTML = `<button id="record" aria-label="record" aria-pressed="false"></button>
+      this.innerHTML = `<output id="timer" aria-live="off" hidden></output>
+      <button id="record" aria-label="record" aria-pressed="false"></button>
       <button id="capture" aria-label="capture"></button>`;
       this.button("capture").addEventListener("click", () => void this.capture());
       this.button("record").addEventListener("click", () => void this.record());
       model.addEventListener("state", () => this.onState());
+      setInterval(() => this.showTime(), 250);
     }
     button(id) {
       return this.querySelector(`#${id}`);
@@ -445,14 +551,30 @@
       await refreshState().catch(() => void 0);
     }
     onState() {
-      const { can_capture, can_record, recording } = model.state;
+      const { can_capture, can_record, recording, recorded_s } = model.state;
+      this.began_ms = performance.now() - 1e3 * (recorded_s ?? 0);
+      document.body.classList.toggle("recording", recording === true);
+      this.showTime();
       this.button("capture").hidden = !can_capture;
       this.button("record").hidden = !can_record;
       this.button("capture").disabled = this.button("record").disabled = !model.mayControl;
       this.button("record").setAttribute("aria-pressed", String(recording === true));
       this.hidden = !can_capture && !can_record;
     }
+    /** How long the take is, and how much longer the disk will do where that is not long. */
+    showTime() {
+      const { recording, room_s } = model.state ?? {};
+      const timer = this.querySelector("#timer");
+      timer.hidden = recording !== true;
+      const short = room_s !== void 0 && room_s !== null && room_s < SHORT_OF_ROOM_S;
+      timer.textContent = minutes(performance.now() - this.began_ms) + (short ? ` · disk full in ${minutes(1e3 * room_s)}` : "");
+      timer.classList.toggle("short", short);
+    }
   };
+  function minutes(time_ms) {
+    const seconds = Math.floor(time_ms / 1e3);
+    return `${Math.floor(seconds / 60)}:${String(seconds % 60).padStart(2, "0")}`;
+  }
   var WAYS = { whep: "video", jpeg: "pictures" };
   var Readout = class extends HTMLElement {
     connectedCallback() {
@@ -812,6 +934,8 @@ void main() {
     </div>
     <canvas id="histogram" width="128" height="48" hidden aria-label="histogram"></canvas>
     <span id="tracking" hidden></span>
+    <p id="remark" role="status" hidden></p>
+    <svg id="arrow" viewBox="-12 -12 24 24" hidden aria-hidden="true"><path d="M-9 -5H1V-10L11 0L1 10V5H-9Z"/></svg>
     <p id="message" role="status">connecting</p>`;
       this.stage = this.find("stage");
       this.zoom = new Zoom(this, this.stage);
@@ -820,6 +944,7 @@ void main() {
       showLevel(this.find("level"), () => aids.has("level"));
       listen(this, this.gestures());
       model.addEventListener("frame", () => this.onFrame());
+      model.addEventListener("state", () => this.showRemark(model.state?.remark ?? null));
       model.addEventListener("sentence", () => this.find("message").textContent = model.sentence);
       aids.addEventListener("change", () => this.onAids());
       this.onAids();
@@ -861,7 +986,23 @@ void main() {
         this.marks.draw(pixels, { peakReal: aids.has("peakReal"), peakVirtual: aids.has("peakVirtual"), zebra: aids.has("zebra") });
         if (aids.has("histogram")) this.histogram.draw(this.marks);
       }
-      if (header) this.showTracking(header.tracking ?? null, header.tracking_unsure === true);
+      if (!header) return;
+      this.showTracking(header.tracking ?? null, header.tracking_unsure === true);
+      this.showRemark(header.remark ?? null);
+    }
+    /** A sentence at the top, and an arrow near the edge where the object went out of the picture. */
+    showRemark(remark) {
+      const line = this.find("remark");
+      const arrow = this.find("arrow");
+      line.hidden = remark === null;
+      arrow.toggleAttribute("hidden", !remark?.arrow);
+      if (remark !== null && line.textContent !== remark.sentence) line.textContent = remark.sentence;
+      if (!remark?.arrow) return;
+      const [right, down] = remark.arrow;
+      line.classList.toggle("low", down < 0);
+      const reach = 42 / Math.max(Math.abs(right), Math.abs(down));
+      [arrow.style.left, arrow.style.top] = [`${50 + reach * right}%`, `${50 + reach * down}%`];
+      arrow.style.transform = `translate(-50%, -50%) rotate(${Math.atan2(down, right)}rad)`;
     }
     get marking() {
       return ["peakReal", "peakVirtual", "zebra", "histogram"].some((aid) => aids.has(aid));
@@ -964,9 +1105,9 @@ void main() {
       else if (message.error !== void 0) model.say(message.error, 6);
     }
     async draw(data) {
-      const length = new DataView(data).getUint32(0);
-      const header = JSON.parse(this.decoder.decode(new Uint8Array(data, 4, length)));
-      const jpeg = new Blob([new Uint8Array(data, 4 + length)], { type: "image/jpeg" });
+      const length2 = new DataView(data).getUint32(0);
+      const header = JSON.parse(this.decoder.decode(new Uint8Array(data, 4, length2)));
+      const jpeg = new Blob([new Uint8Array(data, 4 + length2)], { type: "image/jpeg" });
       const bitmap = await createImageBitmap(jpeg).catch(() => null);
       if (bitmap) {
         if (this.canvas.width !== bitmap.width || this.canvas.height !== bitmap.height) {
@@ -1111,6 +1252,7 @@ void main() {
   customElements.define("vf-objects", ObjectPicker);
   customElements.define("vf-aids", AidSwitches);
   customElements.define("vf-shutter", Shutter);
+  customElements.define("vf-gallery", Gallery);
   Object.assign(window, {
     viewfinder: {
       counts,

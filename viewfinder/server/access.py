@@ -4,6 +4,7 @@ The names in a request are checked against pages of other sites, and against nam
 is exchanged for a cookie. Bodies are read up to a limit, as JSON without the numbers that JSON does not have.
 """
 
+import asyncio
 import json
 import re
 from collections.abc import Awaitable, Callable, Mapping
@@ -66,17 +67,22 @@ def _netloc(origin: str) -> str | None:
 LARGEST_MESSAGE = 1024
 # Offers of WebRTC list codecs and addresses: Chromium's are 6 to 10 kB.
 LARGEST_BODY = 65536
+_BODY_S = 10.0
 
 
 async def message_body(request: web.Request, most: int = LARGEST_MESSAGE) -> bytes:
-    """Read the body of a request; one beyond so many bytes is refused (413) before it is read whole."""
+    """Read the body of a request; one beyond so many bytes is refused (413) before it is read whole, and one that does not come (408)."""
     if (request.content_length or 0) > most:
         raise web.HTTPRequestEntityTooLarge(max_size=most, actual_size=request.content_length or 0)
     body = bytearray()
-    async for chunk in request.content.iter_any():
-        body += chunk
-        if len(body) > most:
-            raise web.HTTPRequestEntityTooLarge(max_size=most, actual_size=len(body))
+    try:
+        async with asyncio.timeout(_BODY_S):
+            async for chunk in request.content.iter_any():
+                body += chunk
+                if len(body) > most:
+                    raise web.HTTPRequestEntityTooLarge(max_size=most, actual_size=len(body))
+    except TimeoutError:
+        raise web.HTTPRequestTimeout from None
     return bytes(body)
 
 
@@ -106,6 +112,10 @@ _SAFETY_HEADERS = {
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
+def _ignore(_protocol: Any, _is_let_in: bool) -> None:
+    """Ignore the news."""
+
+
 @dataclass
 class Access:
     """Rules of access.
@@ -113,6 +123,7 @@ class Access:
     names: what a Host header may say. sessions: None lets in everybody who reaches the server, with the role control.
 
     secure: the server speaks TLS, and the cookie never travels without it. Requests and attempts to enter are limited per address.
+    came: is told the connection of each request, and whether it was let in.
     """
 
     names: frozenset[str] = LOOPBACK_NAMES
@@ -120,12 +131,14 @@ class Access:
     secure: bool = False
     requests: RateLimit = field(default_factory=lambda: RateLimit(per_s=60.0, burst=240.0))
     entries: RateLimit = field(default_factory=lambda: RateLimit(per_s=0.1, burst=8.0))
+    came: Callable[[Any, bool], None] = _ignore
 
     @web.middleware
     async def middleware(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
         """Refuse with {"error": sentence}; nothing of a refused request has any effect."""
         path = _canonical(request)
         refusal = self._refusal(request, path)
+        self.came(request.protocol, refusal is None and self.role(request) is not None)
         if refusal is not None:
             refusal.headers.update(_SAFETY_HEADERS)
             return refusal

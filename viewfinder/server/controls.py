@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol, TypedDict, runtime_checkable
 
 from mrbokeh.system.errors import InputError
-from viewfinder.frames import finite
+from viewfinder.frames import RemarkJson, finite
 from viewfinder.server.access import LARGEST_MESSAGE, json_value
 from viewfinder.server.sessions import RateLimit, Role
 
@@ -169,6 +169,13 @@ class ObjectState(TypedDict):
     visible: bool
 
 
+class Notice(TypedDict):
+    """Notice of something that happened by itself; numbers grow, so that a page shows each once."""
+
+    number: int
+    sentence: str
+
+
 class State(TypedDict, total=False):
     """State that the page shows; what is missing is not offered. Distances in metres, None is infinity.
 
@@ -176,7 +183,8 @@ class State(TypedDict, total=False):
     file holds. f_numbers: what may be set, ascending. lens, renderer, view: which of
     lenses, renderers, views is on. ground_from_picture: (3, 3) homography from the picture (x right, y down, 0 to 1) to metres on the
     plane on which objects stand, (x, z) of `move_object`, as nested lists; None while nothing is tracked. can_record, can_capture: whether
-    the buttons are shown. failure: a sentence if the source died.
+    the buttons are shown. recorded_s: of the take under way; room_s: how much longer the disk will do. failure: a sentence if the source
+    died. remark: why nothing virtual is in the newest picture, or that it is old.
     """
 
     source: str
@@ -198,8 +206,12 @@ class State(TypedDict, total=False):
     can_capture: bool
     can_record: bool
     recording: bool
+    recorded_s: float | None
+    room_s: float | None
+    notices: list[Notice]
     smoothing: bool | None
     failure: str | None
+    remark: RemarkJson | None
 
 
 @runtime_checkable

@@ -19,6 +19,7 @@ from mrbokeh.system.channel import tell
 from mrbokeh.system.errors import InputError, MissingExtraError
 from viewfinder.options import ListeningOptions
 from viewfinder.server.access import LOOPBACK_NAMES, Access, is_loopback
+from viewfinder.server.door import PATIENCE_S, Door, quiet_log
 from viewfinder.server.sessions import Role, Sessions
 
 # Routers of mobile networks and Tailscale use 100.64.0.0/10, which is neither private nor public.
@@ -39,7 +40,9 @@ class Interface(NamedTuple):
 
 @runtime_checkable
 class Served(Protocol):
-    """Site whose routes are served."""
+    """Site whose routes are served, behind its rules of access."""
+
+    access: Access
 
     def application(self) -> web.Application: ...
 
@@ -128,13 +131,18 @@ async def serving_site(site: Served, host: str, port: int, tls: Tls | None = Non
 
     With TLS the address has a name that the certificate covers; that it leads to this machine is the user's care.
     """
-    runner = web.AppRunner(site.application(), shutdown_timeout=_SHUTDOWN_S, access_log=None)
-    await runner.setup()
-    try:
-        await _bind(runner, host, port, tls)
-        yield page_url(_spoken_name(host, tls), runner.addresses[0][1], secure=tls is not None)
-    finally:
-        await runner.cleanup()
+    runner = web.AppRunner(site.application(), shutdown_timeout=_SHUTDOWN_S, access_log=None, keepalive_timeout=PATIENCE_S)
+    with quiet_log():
+        await runner.setup()
+        assert runner.server is not None, "set up"
+        door = Door(runner.server, None if tls is None else tls.context, PATIENCE_S)
+        site.access.came = door.came
+        try:
+            yield page_url(_spoken_name(host, tls), _opened(door, host, port), secure=tls is not None)
+        finally:
+            await door.close()
+            await runner.cleanup()
+            await door.leave()
 
 
 def _spoken_name(host: str, tls: Tls | None) -> str:
@@ -142,9 +150,9 @@ def _spoken_name(host: str, tls: Tls | None) -> str:
     return host if tls is None or not tls.names or host.lower() in tls.names else tls.names[0]
 
 
-async def _bind(runner: web.AppRunner, host: str, port: int, tls: Tls | None) -> None:
+def _opened(door: Door, host: str, port: int) -> int:
     try:
-        await web.TCPSite(runner, host, port, ssl_context=None if tls is None else tls.context).start()
+        return door.open(host, port)
     except (OSError, OverflowError) as error:
         raise InputError(f"cannot listen on {host} port {port} ({error}): choose another one with --port, or stop what uses it") from None
 

@@ -19,7 +19,7 @@ from typing import Any
 
 from aiohttp import WSMsgType, web
 
-from viewfinder.frames import Newest, OutputFrame, frame_header
+from viewfinder.frames import Newest, OutputFrame, frame_header, without_folders
 from viewfinder.server.access import LARGEST_MESSAGE, Access, error, json_value
 from viewfinder.server.controls import Dispatcher
 from viewfinder.server.sessions import RateLimit, Role
@@ -119,7 +119,7 @@ class JpegStream:
     def fail(self, sentence: str) -> None:
         with self._telling:
             self._failures += 1
-            self.broadcaster.fail(sentence)
+            self.broadcaster.fail(without_folders(sentence))
 
     def __enter__(self) -> "JpegStream":
         return self

@@ -59,7 +59,8 @@ class Site:
 
     dispatcher: of the controls; the data channel of a WebRTC part calls the same one.
 
-    broadcaster: of the JPEG stream, None without it. parts: by name; "whep" tells the page to try it first, "whip" offers the camera page.
+    broadcaster: of the JPEG stream, None without it. parts: by name; "whep" tells the page to try it first, "whip" offers the camera page,
+    "gallery" what was saved.
     matte: the newest coverage of the virtual layer, small and 8-bit, for the peaking of real and virtual things apart.
     """
 
@@ -94,6 +95,7 @@ class Site:
         """Handle GET /state: the State, the role of the one who asks, and the ways to watch, best first."""
         ways = [name for name, present in (("whep", "whep" in self.parts), ("jpeg", self.broadcaster is not None)) if present]
         own = {"role": self._role(request).word, "transports": ways, "matte": self.matte() is not None, "can_send": "whip" in self.parts}
+        own["gallery"] = "gallery" in self.parts and own["role"] == Role.CONTROL.word
         return web.json_response(self.controls.state() | own)
 
     async def _control(self, request: web.Request) -> web.Response:

@@ -30,6 +30,7 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.video.color import UNSPECIFIED, color_of
 from viewfinder.frames import UNKNOWN_LENS, CameraFrame, LensState, Newest, Pose
 from viewfinder.sources.frame_source import UNLIMITED, SizeLimit, upright_bgr
+from viewfinder.streaming.local_sockets import listen_only_at, served_address
 from viewfinder.streaming.session_description import with_address
 
 LONGEST_MESSAGE = 4096
@@ -130,30 +131,41 @@ log = logging.getLogger(__name__)
 class WhipSession:
     """Connection of one browser camera, in one asyncio loop: a WebRTC peer that only receives.
 
-    on_frame: gets every decoded PyAV frame as it comes. on_message: every message of the data channel "camera"; what it returns is
-    the answer, None for none. on_end: called once the connection is over.
+    on_connected: called when the connection stands. on_frame: gets every decoded PyAV frame as it comes. on_message: every message of
+    the data channel "camera"; what it returns is the answer, None for none. on_end: called once the connection is over.
     """
 
-    def __init__(self, on_frame: Callable[[Any], None], on_message: Callable[[str], str | None], on_end: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        on_connected: Callable[[], None],
+        on_frame: Callable[[Any], None],
+        on_message: Callable[[str], str | None],
+        on_end: Callable[[], None],
+    ) -> None:
         from aiortc import RTCConfiguration, RTCPeerConnection
 
         # Without servers of its own aiortc would ask one on the internet and wait for it.
         self._peer = RTCPeerConnection(RTCConfiguration(iceServers=[]))
-        self._on_frame, self._on_message, self._on_end = on_frame, on_message, on_end
+        self._on_connected, self._on_frame, self._on_message, self._on_end = on_connected, on_frame, on_message, on_end
         self._tasks: set[asyncio.Task[None]] = set()
         self._closed = False
         self.is_vp8 = False
         self._peer.on("track", self._drain_track)
         self._peer.on("datachannel", self._listen)
-        self._peer.on("connectionstatechange", self._end_when_over)
+        self._peer.on("connectionstatechange", self._follow)
+        self.token = secrets.token_urlsafe(16)
 
-    async def answer(self, offer: str) -> str:
-        """Return the SDP that answers an offer, with all candidates in it. Raises InputError for an offer that cannot be answered."""
+    async def answer(self, offer: str, host: str | None = None) -> str:
+        """Return the SDP that answers an offer, with all candidates in it. Raises InputError for an offer that cannot be answered.
+
+        host: the one address at which sockets are opened, None opens them on all.
+        """
         from aiortc import RTCSessionDescription
         from aiortc.exceptions import InvalidAccessError, InvalidStateError
 
         try:
             await self._peer.setRemoteDescription(RTCSessionDescription(offer, "offer"))
+            listen_only_at(self._peer, host)
             receivers = [each.receiver for each in self._peer.getTransceivers() if each.kind == "video"]
             for receiver in receivers:
                 _release_on_marker(receiver)
@@ -217,7 +229,9 @@ class WhipSession:
                 if answer is not None:
                     channel.send(answer)
 
-    def _end_when_over(self) -> None:
+    def _follow(self) -> None:
+        if self._peer.connectionState == "connected" and not self._closed:
+            self._on_connected()
         if self._peer.connectionState in ("failed", "closed") and not self._closed:
             self._start(self.close())
 
@@ -250,22 +264,25 @@ _BT601 = 6
 class BrowserCameraSource:
     """FrameSource that a web server feeds: add `routes` to its application, and `close` to what runs when it ends.
 
-    One camera at a time; a new one takes the place of the old one, for a page that was loaded anew says no good-bye. Frames have the
-    size that came, which browsers change as they like, or are scaled down with their aspect to the largest size given here.
+    One camera at a time; a new one takes the place of the old one once its connection stands, for a page that was loaded anew says no
+    good-bye. An offer whose connection does not stand within connect_within_s is forgotten. Frames have the size that came, which browsers
+    change as they like, or are scaled down with their aspect to the largest size given here.
     Who may send is for the server's middleware to say (RFC 9725, 4.8: a bearer token).
     """
 
     name = "browser camera"
 
-    def __init__(self, limit: SizeLimit = UNLIMITED) -> None:
+    def __init__(self, limit: SizeLimit = UNLIMITED, connect_within_s: float = 15.0) -> None:
         self.transfer = "bt709"
         self.status: str | None = _WAITING
         self._limit = limit
         self._newest: Newest[tuple[int, Any, float, CameraKnowledge, bool]] = Newest()
         self._sequence = itertools.count()
         self._knowledge = CameraKnowledge()
+        self._connect_within_s = connect_within_s
         self._session: WhipSession | None = None
-        self._token: str | None = None
+        self._offering: WhipSession | None = None
+        self._tasks: set[asyncio.Task[None]] = set()
         self._changing = asyncio.Lock()
 
     def routes(self, path: str = "/whip") -> list[web.RouteDef]:
@@ -284,9 +301,10 @@ class BrowserCameraSource:
 
     async def close(self) -> None:
         """End the connection; to be called in the loop of the server."""
-        session, self._session, self._token = self._session, None, None
-        if session is not None:
-            self.status = _WAITING
+        sessions = self._session, self._offering
+        self._session = self._offering = None
+        self.status = _WAITING if sessions[0] is not None else self.status
+        for session in filter(None, sessions):
             await session.close()
 
     def _frame(self, sequence: int, frame: Any, captured_s: float, known: CameraKnowledge, is_vp8: bool) -> CameraFrame:
@@ -317,28 +335,57 @@ class BrowserCameraSource:
             return await self._answered(request, with_address(offer.decode("utf-8", "replace"), request.remote))
 
     async def _answered(self, request: web.Request, offer: str) -> web.Response:
-        session = WhipSession(lambda frame: self._came(session, frame), self._heard, lambda: self._ended(session))
+        session = WhipSession(
+            lambda: self._connected(session),
+            lambda frame: self._came(session, frame),
+            lambda message: self._heard(session, message),
+            lambda: self._ended(session),
+        )
         try:
-            answer = await session.answer(offer)
+            answer = await session.answer(offer, served_address(request))
         except InputError as error:
             await session.close()
             return web.Response(status=400, text=str(error))
-        await self.close()
-        self._session, self._token, self._knowledge = session, secrets.token_urlsafe(16), CameraKnowledge()
-        headers = {"Location": f"{request.path}/{self._token}"}
+        before, self._offering = self._offering, session
+        if before is not None:
+            await before.close()
+        asyncio.get_running_loop().call_later(self._connect_within_s, self._give_up, session)
+        headers = {"Location": f"{request.path}/{session.token}"}
         return web.Response(status=201, text=answer, content_type=_SDP, headers=headers)
+
+    def _connected(self, session: WhipSession) -> None:
+        """Let a camera take the place of the one before."""
+        if session is self._offering:
+            before, self._session, self._offering = self._session, session, None
+            self._knowledge = CameraKnowledge()
+            if before is not None:
+                self._close_soon(before)
+
+    def _give_up(self, session: WhipSession) -> None:
+        if session is self._offering:
+            self._offering = None
+            self._close_soon(session)
+
+    def _close_soon(self, session: WhipSession) -> None:
+        task = asyncio.ensure_future(session.close())
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
 
     async def _deleted(self, request: web.Request) -> web.Response:
         """End the camera; one that another has replaced, or whose connection was closed first, has gone already."""
-        if self._token is not None and secrets.compare_digest(request.match_info["token"], self._token):
-            await self.close()
+        token = request.match_info["token"]
+        for session in filter(None, (self._session, self._offering)):
+            if secrets.compare_digest(token.encode(), session.token.encode()):
+                await session.close()
         return web.Response()
 
     def _came(self, session: WhipSession, frame: Any) -> None:
         if session is self._session:
             self._newest.put((next(self._sequence), frame, time.monotonic(), self._knowledge, session.is_vp8))
 
-    def _heard(self, message: str) -> str | None:
+    def _heard(self, session: WhipSession, message: str) -> str | None:
+        if session is not self._session:
+            return None
         try:
             self._knowledge = self._knowledge.told(message)
         except InputError as error:
@@ -346,6 +393,8 @@ class BrowserCameraSource:
         return None
 
     def _ended(self, session: WhipSession) -> None:
+        if session is self._offering:
+            self._offering = None
         if session is self._session:
-            self._session, self._token = None, None
+            self._session = None
             self.status = "the browser camera is gone: waiting for it"

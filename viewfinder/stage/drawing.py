@@ -43,7 +43,8 @@ class Drawing:
 
     layer: blurred; its camera is upright, that of the request is not. sharp: object and shadow in focus, in the whole box.
     depth_m: of what is sharp; inf where nothing is. lens: of the box's part of the sensor.
-    depth_range_m: the nearest and the farthest point that was drawn.
+    depth_range_m: the nearest and the farthest point that was drawn. extent_m: the least and the largest x, y and z of the scene's points
+    in the upright world, seen or not; None where it has none.
     """
 
     request: DrawRequest
@@ -52,6 +53,7 @@ class Drawing:
     depth_m: Float32[np.ndarray, "height width"] | None = None
     lens: Lens | None = None
     depth_range_m: tuple[float, float] = (float("inf"), float("inf"))
+    extent_m: Float[np.ndarray, "2 3"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +74,10 @@ def draw(staged: StagedScene, request: DrawRequest, render_setup: RenderSetup) -
     """Draw the scene for one pose: the box around its projection and blur, at the resolution asked for."""
     frame = upright_camera(request.camera, staged.description.up)
     points_m = staged.drawn_points_m(request.time_s)
+    extent_m = np.stack([points_m.min(axis=0), points_m.max(axis=0)]) if len(points_m) else None
     box = box_around(points_m, frame, request.lens)
     if box is None:
-        return Drawing(request)
+        return Drawing(request, extent_m=extent_m)
     camera, lens = box.cut(frame, request.resolution), box.lens_of(request.lens, frame.width_px)
     layers = sharp_layers(staged, request.time_s, camera, replace(render_setup, backend=render_setup.live or render_setup.backend))
     if render_setup.occlusion is not None:
@@ -90,7 +93,13 @@ def draw(staged: StagedScene, request: DrawRequest, render_setup: RenderSetup) -
     )
     seen = _trimmed(replace(in_box, rgba=_rgba(blurred)))
     return Drawing(
-        request=request, layer=seen, sharp=in_box, depth_m=sharp.depth_m, lens=lens, depth_range_m=_depth_range_m(points_m, frame)
+        request=request,
+        layer=seen,
+        sharp=in_box,
+        depth_m=sharp.depth_m,
+        lens=lens,
+        depth_range_m=_depth_range_m(points_m, frame),
+        extent_m=extent_m,
     )
 
 

@@ -8,7 +8,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
-from viewfinder.frames import Bgr
+from viewfinder.frames import Bgr, Remark
 from viewfinder.tracking.tracker import TrackedPose
 
 
@@ -48,6 +48,11 @@ class OverlaySource(Protocol):
 
     def overlay(self, pose: TrackedPose | None, intrinsics: Camera, lens: Lens, time_s: float) -> Overlay:
         """Return what lies over the frame now; must be fast, the drawing of it happens elsewhere."""
+        ...
+
+    @property
+    def remark(self) -> Remark | None:
+        """Why the overlay that was asked for last, with a certain pose, shows nothing; None where it does, or soon will."""
         ...
 
     def picture(self, view: str, plate_bgr: Bgr, tables: CodeTables) -> Bgr:

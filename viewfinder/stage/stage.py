@@ -23,8 +23,9 @@ from mrbokeh.scene import SceneRenderer
 from mrbokeh.scene.staging.scene_description import PlacedObject, Triple
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import upright_camera
-from viewfinder.frames import Bgr, Newest
+from viewfinder.frames import Bgr, Newest, Remark
 from viewfinder.stage.drawing import Drawing, DrawRequest, blur_changed, draw, is_outdated, sharp_layers
+from viewfinder.stage.out_of_sight import preparing, reason_unseen
 from viewfinder.stage.overlay_source import StageStatus
 from viewfinder.stage.shown_scene import VIEWS, ShownScene, depth_at_m, view_picture
 from viewfinder.stage.stage_setup import SceneWatch, SetupLoader, StageSetup
@@ -97,8 +98,8 @@ class DrawingThread:
 
     @property
     def problem(self) -> str | None:
-        preparing = "preparing the scene; the first time on a machine that takes a minute" if self.newest is None and self.busy else ""
-        return self._of_file or self._of_drawing or preparing or None
+        waiting = preparing(busy=True) if self.newest is None and self.busy else ""
+        return self._of_file or self._of_drawing or waiting or None
 
     @property
     def draws_per_s(self) -> float:
@@ -275,6 +276,17 @@ class Stage:
     @property
     def status(self) -> StageStatus:
         return status_of(self._thread, self._wanted, self._fade.opacity)
+
+    @property
+    def remark(self) -> Remark | None:
+        wanted, drawn, setup = self._wanted, self._thread.newest, self._thread.setup
+        if drawn is None or wanted is None or self.seen is None:
+            return Remark(self._thread.problem or preparing(self._thread.busy))
+        if self.seen.overlay.rgb.size or drawn.setup is not setup:
+            return None
+        remark = reason_unseen(setup.staged.description.objects, drawn.drawing.extent_m, self.seen.camera)
+        soon_seen = remark.arrow is None and is_outdated(drawn.drawing, wanted, setup.staged.is_animated)
+        return None if soon_seen else remark
 
     def picture(self, view: str, plate_bgr: Bgr, tables: CodeTables) -> Bgr:
         """Return one of `views`, of the frame for which `overlay` was asked last."""

@@ -13,7 +13,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.system.errors import InputError
-from viewfinder.frames import Bgr, Newest
+from viewfinder.frames import Bgr, Newest, Remark
 from viewfinder.stage.overlay_source import StageStatus
 from viewfinder.tracking.tracker import TrackedPose
 
@@ -86,6 +86,10 @@ class StaticLayer:
             self._wanted.put(asked_for)
         self._given = self.shown
         return self._given.overlay
+
+    @property
+    def remark(self) -> Remark | None:
+        return None if self._given.overlay.rgb.size else Remark("the layer has nothing in it: every pixel of it is empty")
 
     def picture(self, view: str, plate_bgr: Bgr, tables: CodeTables) -> Bgr:
         if view == "plate":

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from viewfinder.frames import Newest, OutputFrame, frame_header
+from viewfinder.frames import Newest, OutputFrame, frame_header, without_folders
 from viewfinder.streaming.encoders import ENCODERS, RtpClock, StreamQuality, VideoEncoder, even_size, i420_frame
 
 
@@ -193,7 +193,7 @@ class EncodedStream:
         self._newest.put(frame)
 
     def fail(self, sentence: str) -> None:
-        self._audience.tell(sentence)
+        self._audience.tell(without_folders(sentence))
 
     def watch(self, codec: str, wake: Callable[[], None]) -> ViewerQueue:
         """Return a new viewer's queue, which begins with a keyframe. codec: of ENCODERS. wake: called in the encoder's thread."""

@@ -24,6 +24,7 @@ from aiortc.sdp import candidate_from_sdp
 
 from mrbokeh.system.errors import InputError
 from viewfinder.streaming.encoded_stream import EncodedFrame, EncodedStream, ViewerQueue
+from viewfinder.streaming.local_sockets import listen_only_at, served_address
 from viewfinder.streaming.session_description import codec_preferences, negotiated_codec, require_offer, with_address
 
 # Where aiortc keeps the RTP timestamp of what it sent last; it is a random number plus our ticks.
@@ -163,8 +164,11 @@ class ViewerConnection:
         self.peer.on("connectionstatechange", self._state_changed)
         self.peer.on("datachannel", self._channel_opened)
 
-    async def answer(self, offer_sdp: str, connect_within_s: float) -> str:
-        """Return the SDP answer to a viewer's offer; InputError where it is none that this side can serve."""
+    async def answer(self, offer_sdp: str, connect_within_s: float, host: str | None = None) -> str:
+        """Return the SDP answer to a viewer's offer; InputError where it is none that this side can serve.
+
+        host: the one address at which sockets are opened, None opens them on all.
+        """
         require_offer(offer_sdp)
         # Both before the offer is looked at: aiortc chooses the codec then, and without preferences it is VP8.
         transceiver = self.peer.addTransceiver(self.track, "sendonly")
@@ -172,6 +176,7 @@ class ViewerConnection:
         self._route_keyframe_requests(transceiver.sender)
         try:
             await self.peer.setRemoteDescription(RTCSessionDescription(offer_sdp, "offer"))
+            listen_only_at(self.peer, host)
             await self.peer.setLocalDescription()
         except Exception as error:
             # What aiortc raises at strangers' descriptions has no common class.
@@ -281,7 +286,7 @@ class Whep:
         try:
             async with asyncio.timeout(self._connect_within_s):
                 offer = with_address(await _text(request), request.remote)
-                answer = await viewer.answer(offer, self._connect_within_s)
+                answer = await viewer.answer(offer, self._connect_within_s, served_address(request))
         except (InputError, TimeoutError) as error:
             await viewer.close()
             return _refusal(400, str(error) or f"expected an SDP offer within {self._connect_within_s:g} s")

@@ -1,5 +1,6 @@
 // The viewfinder's page: lets itself in, then keeps showing the stream and the state.
 import { AidSwitches } from "./aids";
+import { Gallery } from "./gallery";
 import { model } from "./model";
 import { Choices, FocusControl, ObjectPicker, Readout, Shutter } from "./panel";
 import { PictureView } from "./picture";
@@ -41,6 +42,7 @@ customElements.define("vf-choices", Choices);
 customElements.define("vf-objects", ObjectPicker);
 customElements.define("vf-aids", AidSwitches);
 customElements.define("vf-shutter", Shutter);
+customElements.define("vf-gallery", Gallery);
 
 // What tests and the curious read in the console.
 Object.assign(window, {

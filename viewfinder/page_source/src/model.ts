@@ -8,6 +8,7 @@ export interface State {
   transports: string[];
   matte: boolean;
   can_send: boolean;
+  gallery?: boolean;
   source?: string;
   width_px?: number;
   height_px?: number;
@@ -28,8 +29,20 @@ export interface State {
   can_capture?: boolean;
   can_record?: boolean;
   recording?: boolean;
+  /** Of the take under way; how much longer the disk will do. */
+  recorded_s?: number | null;
+  room_s?: number | null;
+  /** What happened by itself, such as a full disk; numbers grow. */
+  notices?: { number: number; sentence: string }[];
   smoothing?: boolean | null;
   failure?: string | null;
+  remark?: Remark | null;
+}
+
+/** Why nothing virtual is seen, or that the picture is old; arrow: right and down, to where the object is. */
+export interface Remark {
+  sentence: string;
+  arrow: [number, number] | null;
 }
 
 /** What comes with each picture. captured_ms: in the server's time. */
@@ -44,6 +57,7 @@ export interface FrameHeader {
   layer_age_ms?: number;
   stages_ms?: Record<string, number>;
   dropped?: number;
+  remark?: Remark | null;
 }
 
 /** A picture on the page: where its pixels are, and what is known of it. */
@@ -52,6 +66,8 @@ export interface ShownFrame {
   header: FrameHeader | null;
 }
 
+const NOTICE_S = 10;
+
 class Model extends EventTarget {
   state: State | null = null;
   shown: ShownFrame | null = null;
@@ -59,10 +75,15 @@ class Model extends EventTarget {
   sentence = "";
   private silence = 0;
   private failing = false;
+  private noticed = 0;
 
   setState(state: State): void {
     this.state = state;
     this.dispatchEvent(new Event("state"));
+    const unseen = (state.notices ?? []).filter((each) => each.number > this.noticed);
+    if (unseen.length === 0) return;
+    this.noticed = Math.max(...unseen.map((each) => each.number));
+    this.say(unseen.map((each) => each.sentence).join(" · "), NOTICE_S);
   }
 
   show(frame: ShownFrame): void {

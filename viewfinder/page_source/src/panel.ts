@@ -188,13 +188,19 @@ function toldBy(name: string | null | undefined): string {
 }
 
 // <vf-shutter>: capture and record, where the thumb is.
+const SHORT_OF_ROOM_S = 300;
+
 export class Shutter extends HTMLElement {
+  private began_ms = 0;
+
   connectedCallback(): void {
-    this.innerHTML = `<button id="record" aria-label="record" aria-pressed="false"></button>
+    this.innerHTML = `<output id="timer" aria-live="off" hidden></output>
+      <button id="record" aria-label="record" aria-pressed="false"></button>
       <button id="capture" aria-label="capture"></button>`;
     this.button("capture").addEventListener("click", () => void this.capture());
     this.button("record").addEventListener("click", () => void this.record());
     model.addEventListener("state", () => this.onState());
+    setInterval(() => this.showTime(), 250);
   }
 
   private button(id: string): HTMLButtonElement {
@@ -215,13 +221,31 @@ export class Shutter extends HTMLElement {
   }
 
   private onState(): void {
-    const { can_capture, can_record, recording } = model.state!;
+    const { can_capture, can_record, recording, recorded_s } = model.state!;
+    this.began_ms = performance.now() - 1000 * (recorded_s ?? 0);
+    document.body.classList.toggle("recording", recording === true);
+    this.showTime();
     this.button("capture").hidden = !can_capture;
     this.button("record").hidden = !can_record;
     this.button("capture").disabled = this.button("record").disabled = !model.mayControl;
     this.button("record").setAttribute("aria-pressed", String(recording === true));
     this.hidden = !can_capture && !can_record;
   }
+
+  /** How long the take is, and how much longer the disk will do where that is not long. */
+  private showTime(): void {
+    const { recording, room_s } = model.state ?? {};
+    const timer = this.querySelector<HTMLOutputElement>("#timer")!;
+    timer.hidden = recording !== true;
+    const short = room_s !== undefined && room_s !== null && room_s < SHORT_OF_ROOM_S;
+    timer.textContent = minutes(performance.now() - this.began_ms) + (short ? ` · disk full in ${minutes(1000 * room_s)}` : "");
+    timer.classList.toggle("short", short);
+  }
+}
+
+function minutes(time_ms: number): string {
+  const seconds = Math.floor(time_ms / 1000);
+  return `${Math.floor(seconds / 60)}:${String(seconds % 60).padStart(2, "0")}`;
 }
 
 // <vf-readout>: how old the shown picture is, how many come, how many were never shown, which way they come, and where the time goes.

@@ -2,7 +2,7 @@
 import { aids, askForLevel, showLevel } from "./aids";
 import { listen, ObjectDrag, Zoom } from "./gestures";
 import { Histogram, Marks, MatteFeed, sizeOf } from "./marks";
-import { distanceText, model } from "./model";
+import { distanceText, model, type Remark } from "./model";
 import { selection } from "./panel";
 import { control } from "./server";
 
@@ -27,6 +27,8 @@ export class PictureView extends HTMLElement {
     </div>
     <canvas id="histogram" width="128" height="48" hidden aria-label="histogram"></canvas>
     <span id="tracking" hidden></span>
+    <p id="remark" role="status" hidden></p>
+    <svg id="arrow" viewBox="-12 -12 24 24" hidden aria-hidden="true"><path d="M-9 -5H1V-10L11 0L1 10V5H-9Z"/></svg>
     <p id="message" role="status">connecting</p>`;
     this.stage = this.find("stage");
     this.zoom = new Zoom(this, this.stage);
@@ -35,6 +37,7 @@ export class PictureView extends HTMLElement {
     showLevel(this.find("level"), () => aids.has("level"));
     listen(this, this.gestures());
     model.addEventListener("frame", () => this.onFrame());
+    model.addEventListener("state", () => this.showRemark(model.state?.remark ?? null));
     model.addEventListener("sentence", () => (this.find("message").textContent = model.sentence));
     aids.addEventListener("change", () => this.onAids());
     this.onAids();
@@ -81,7 +84,25 @@ export class PictureView extends HTMLElement {
       this.marks.draw(pixels, { peakReal: aids.has("peakReal"), peakVirtual: aids.has("peakVirtual"), zebra: aids.has("zebra") });
       if (aids.has("histogram")) this.histogram.draw(this.marks);
     }
-    if (header) this.showTracking(header.tracking ?? null, header.tracking_unsure === true);
+    if (!header) return;
+    this.showTracking(header.tracking ?? null, header.tracking_unsure === true);
+    this.showRemark(header.remark ?? null);
+  }
+
+  /** A sentence at the top, and an arrow near the edge where the object went out of the picture. */
+  private showRemark(remark: Remark | null): void {
+    const line = this.find("remark");
+    const arrow = this.find<SVGElement>("arrow");
+    line.hidden = remark === null;
+    arrow.toggleAttribute("hidden", !remark?.arrow);
+    if (remark !== null && line.textContent !== remark.sentence) line.textContent = remark.sentence;
+    if (!remark?.arrow) return;
+    const [right, down] = remark.arrow;
+    line.classList.toggle("low", down < 0);
+    // On the rim of a box of 84 % of the picture, where a ray from its middle meets it.
+    const reach = 42 / Math.max(Math.abs(right), Math.abs(down));
+    [arrow.style.left, arrow.style.top] = [`${50 + reach * right}%`, `${50 + reach * down}%`];
+    arrow.style.transform = `translate(-50%, -50%) rotate(${Math.atan2(down, right)}rad)`;
   }
 
   private get marking(): boolean {

@@ -83,6 +83,8 @@ export async function offerTo(path: string, peer: RTCPeerConnection): Promise<st
   await peer.setLocalDescription();
   await gathered(peer);
   const body = peer.localDescription!.sdp;
+  // Where there is no network browsers have no address for it, and the connection would be waited for in vain.
+  if (!body.includes("a=candidate:")) throw new Error("this browser has no network address for video");
   const answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/sdp" }, body });
   if (!answer.ok) throw new Error(await sentenceOf(answer));
   await peer.setRemoteDescription({ type: "answer", sdp: await answer.text() });
