@@ -1,7 +1,7 @@
 """The studio's page in a real headless Chromium: hands, keys, undo, focus, light, saving, on a desk and on a phone held both ways."""
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from datasets_scripts.gallery.pictures import CHROMIUM, Page, chromium_page
+from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
@@ -211,6 +212,135 @@ async def test_two_fingers_scale_and_turn_and_the_wheel_too(tmp_path: Path) -> N
         assert float(made.desk.state.height or 0) == pytest.approx(1.5 * high / np.e, rel=0.06)
 
 
+ZOOMED = "document.getElementById('scale').textContent"
+
+
+async def wheeled(page: Page, x: float, y: float, delta: float, ctrl: bool = False) -> None:
+    """Turn the wheel over a point of the window."""
+    await page.send("Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=0, deltaY=delta, modifiers=2 if ctrl else 0)
+
+
+async def two_fingers(page: Page, *places: tuple[tuple[float, float], tuple[float, float]]) -> None:
+    """Put two fingers down at the first places, move them along the others as slowly as a hand, rest, and lift them."""
+    for i, both in enumerate([*places, *places[-1:] * 3]):
+        points = [{"x": x, "y": y, "id": finger} for finger, (x, y) in enumerate(both)]
+        await page.send("Input.dispatchTouchEvent", type="touchMove" if i else "touchStart", touchPoints=points)
+        await asyncio.sleep(0.03)
+    await page.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
+
+async def pixel_under(page: Page, x: float, y: float) -> tuple[float, float]:
+    """Return the pixel of the floor that a point of the window shows."""
+    left, top, width, height = await page.box("#stage")
+    return (x - left) / width * WIDTH, (y - top) / height * HEIGHT
+
+
+async def comes_true_of(found: Callable[[], Awaitable[tuple[float, float]]], wanted: tuple[float, float]) -> None:
+    """Wait until a place of the page is the wanted one within 2 px, or 5 s."""
+    for _ in range(100):
+        if await found() == pytest.approx(wanted, abs=2.0):
+            return
+        await asyncio.sleep(0.05)
+    assert await found() == pytest.approx(wanted, abs=2.0)
+
+
+async def test_the_wheel_with_ctrl_and_drags_beside_the_object_zoom_and_move_the_picture(tmp_path: Path) -> None:
+    """What lies under the pointer stays there, taps and drags land where they are seen, and all of it is one Escape away."""
+    async with opened(tmp_path, DESK) as (page, made):
+        await placed(page, made)
+        fitted, room = await page.box("#stage"), await page.box("#room")
+        x, y = fitted[0] + 0.4 * fitted[2], fitted[1] + 0.6 * fitted[3]
+        seen = await pixel_under(page, x, y)
+        first = made.desk.state
+        await wheeled(page, x, y, -200, ctrl=True)
+        await page.comes_true("parts.picture.view.isEnlarged")
+        assert (await page.box("#stage"))[2] == pytest.approx(fitted[2] * np.sqrt(np.e), rel=0.01)
+        assert await pixel_under(page, x, y) == pytest.approx(seen, abs=0.5)
+        assert made.desk.state == first, "the object keeps its size"
+        await dragged(page, (room[0] + 100, room[1] + 90), (70.0, 40.0), mouse=True)
+        assert await pixel_under(page, x + 70, y + 40) == pytest.approx(seen, abs=0.5)
+        assert made.desk.state == first, "and its place"
+        foot = np.array(await page.box("#stage"))[:2] + np.array([0.5, 0.75]) * (await page.box("#stage"))[2:]
+        await dragged(page, tuple(foot), (-60.0, 0.0), mouse=True)
+        px = WIDTH / (await page.box("#stage"))[2]
+        await page.comes_true(f"!studio.isChanging && studio.told.state.at_px[0] < {0.5 * WIDTH - 0.8 * 60 * px}")
+        assert made.desk.state.at_px == pytest.approx((0.5 * WIDTH - 60 * px, 0.8 * HEIGHT), abs=1.5), "finer than at full view"
+        await pressed(page, "Escape")
+        assert await page.box("#stage") == pytest.approx(fitted, abs=0.5)
+        await wheeled(page, x, y, 400, ctrl=True)
+        assert await page.box("#stage") == pytest.approx(fitted, abs=0.5), "never smaller than the window"
+        assert page.errors == []
+
+
+@pytest.mark.parametrize(("size_px", "at"), [(UPRIGHT, (0.25, 0.5)), (LEVEL, (0.5, 0.25))], ids=["upright", "level"])
+async def test_two_fingers_beside_the_object_zoom_the_picture(tmp_path: Path, size_px: tuple[int, int], at: tuple[float, float]) -> None:
+    """Along the side that fills the window what lies between the fingers stays there; along the other it is centred until it fills it."""
+    async with opened(tmp_path, size_px) as (page, made):
+        await placed(page, made, 0.8)
+        fitted, first = await page.box("#stage"), made.desk.state
+        x, y = fitted[0] + at[0] * fitted[2], fitted[1] + at[1] * fitted[3]
+        # Fingers 40 px apart come to 100 px, then both move by 24 px to the left and 12 up.
+        await two_fingers(page, *(((x - 20 - 10 * i, y), (x + 20 + 10 * i, y)) for i in range(4)))
+        await page.comes_true("parts.picture.view.isEnlarged")
+        assert (await page.box("#stage"))[2] == pytest.approx(2.5 * fitted[2], rel=0.06)
+        seen = await pixel_under(page, x, y)
+        assert seen == pytest.approx((at[0] * WIDTH, at[1] * HEIGHT), abs=4.0)
+        await two_fingers(page, *(((x - 50 - 6 * i, y - 3 * i), (x + 50 - 6 * i, y - 3 * i)) for i in range(5)))
+        await comes_true_of(lambda: pixel_under(page, x - 24, y - 12), seen)
+        assert made.desk.state == first
+        await page.tap("#zoom")
+        assert await page.box("#stage") == pytest.approx(fitted, abs=0.5)
+        await page.tap("#zoom")
+        left, top, width, height = await page.box("#stage")
+        assert width == pytest.approx(2.0 * fitted[2], rel=0.01), "twice as large, where one by one is smaller"
+        room = await page.box("#room")
+        assert room[0] < left + 0.8 * width < room[0] + room[2] and room[1] < top + 0.8 * height < room[1] + room[3], "the foot is in sight"
+        # On the object too, once it is enlarged.
+        x, y = left + 0.8 * width, top + 0.7 * height
+        await two_fingers(page, *(((x - 20 - 5 * i, y), (x + 20 + 5 * i, y)) for i in range(3)))
+        await page.comes_true(f"parseFloat(document.getElementById('stage').style.width) > {1.2 * width}")
+        assert made.desk.state == first and page.errors == []
+
+
+async def darkest(page: Page, canvas: str, x_px: float, y_px: float) -> int:
+    """Return the least red of a canvas within a pixel of where it shows a pixel of the photograph on the screen."""
+    told = f"""(() => {{
+        const [canvas, stage] = [document.getElementById('{canvas}'), document.getElementById('stage')];
+        const [own, whole, photo] = [canvas.getBoundingClientRect(), stage.getBoundingClientRect(), studio.told.photo];
+        const x = (whole.left + {x_px} / photo.width_px * whole.width - own.left) / own.width * canvas.width;
+        const y = (whole.top + {y_px} / photo.height_px * whole.height - own.top) / own.height * canvas.height;
+        const {{ data }} = canvas.getContext('2d').getImageData(Math.floor(x) - 1, Math.floor(y), 3, 1);
+        return Math.min(data[0], data[4], data[8]);
+    }})()"""
+    return int(await page.value(told))
+
+
+async def test_an_enlarged_picture_shows_the_photographs_own_pixels(tmp_path: Path) -> None:
+    """A line of one dark pixel in 3 megapixels is lost in the preview, and there at full size, with and without an object."""
+    photo = write_floor(tmp_path / "floor.png", 2000, 1500)
+    light = read_image(photo).copy()
+    light[300:500, 999] = 0.0
+    write_image(photo, light)
+    async with opened(tmp_path, DESK, StudioState(photo=photo, pitch_deg=0.0)) as (page, made):
+        await page.tap("#zoom")
+        assert await page.value(ZOOMED) == "100 %"
+        await page.comes_true("!document.getElementById('sharp').hidden", 30.0)
+        assert await darkest(page, "sharp", 999.5, 400.0) < 60 < 100 < await darkest(page, "picture", 999.5, 400.0)
+        await page.tap("#zoom")
+        assert await page.value("document.getElementById('sharp').hidden")
+        await page.choose("#object", str(CAKE))
+        await page.tap("#stage", 0.5, 0.8)
+        await page.comes_true(RESTS, 60.0)
+        fitted = await page.box("#stage")
+        await wheeled(page, fitted[0] + 0.5 * fitted[2], fitted[1] + 0.3 * fitted[3], -400, ctrl=True)
+        await page.comes_true("!document.getElementById('sharp').hidden", 30.0)
+        assert await darkest(page, "sharp", 999.5, 400.0) < 60
+        await page.value("studio.change({exposure: 2}), 0")
+        assert await page.value("document.getElementById('sharp').hidden"), "an older picture is not shown over a newer one"
+        await page.comes_true("!document.getElementById('sharp').hidden", 60.0)
+        assert page.errors == []
+
+
 @pytest.mark.parametrize("size_px", [DESK, UPRIGHT], ids=["desk", "upright"])
 async def test_what_is_in_front_is_painted(tmp_path: Path, size_px: tuple[int, int]) -> None:
     """A dark tile of the floor is painted over the cake; then a smaller brush says that it is behind, and both are undone."""
@@ -254,8 +384,7 @@ async def test_lines_are_drawn_corrected_and_removed(tmp_path: Path, size_px: tu
             await dragged(page, (left + x1 * width, top + y1 * height), ((x2 - x1) * width, (y2 - y1) * height), mouse=size_px == DESK)
             await page.comes_true(f"studio.told.state.lines.length === {count} && studio.told.busy === '' && !studio.isChanging", 30.0)
         assert "drawn lines" in await page.value(MESSAGE)
-        await page.tap("#axis_z")
-        # The end of the second line was beside its edge: it is dragged there.
+        # The end of the second line was beside its edge: it is dragged there, though another direction is chosen.
         await dragged(page, (left + 0.1 * width, top + 0.944 * height), (0.067 * width, 0.0), mouse=size_px == DESK)
         await page.comes_true(f"studio.told.state.lines[1][2] > {0.15 * WIDTH} && studio.told.busy === '' && !studio.isChanging", 30.0)
         assert len(made.desk.state.lines) == 3 and made.desk.state.lines[1][2] == pytest.approx(40, abs=WIDTH / 100)

@@ -227,7 +227,9 @@ async def test_a_capture_composites_to_what_the_stream_showed(clip: LiveClip, tm
     camera = clip.camera(sequence)
     assert psnr_db(codes, streamed_bgr, ~away_from_card(camera)) > 29.0
     # In its middle it is the same light: the curve of sRGB in place of the clip's would be six codes off.
-    np.testing.assert_allclose(middle_of_card(codes, camera), middle_of_card(streamed_bgr, camera), atol=3.0, err_msg=str(shown_first.status))
+    np.testing.assert_allclose(
+        middle_of_card(codes, camera), middle_of_card(streamed_bgr, camera), atol=3.0, err_msg=str(shown_first.status)
+    )
 
 
 async def test_a_recording_plays_and_shows_the_object(clip: LiveClip, tmp_path: Path) -> None:

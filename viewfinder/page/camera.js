@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 78dec699af0ee159284529b425d4af1e7eb9c4f8919bdc5bcdedf92f77a4e690
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 60b2396d5f68564f0e4d1cc3304e9811307f7612ae223017d53811909499fd50
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 78dec699af0ee159284529b425d4af1e7eb9c4f8919bdc5bcdedf92f77a4e690
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 60b2396d5f68564f0e4d1cc3304e9811307f7612ae223017d53811909499fd50
 "use strict";
 (() => {
   // src/model.ts
@@ -784,6 +784,7 @@
   var TAP_PX = 10;
   var TWICE_MS = 300;
   function listen(element, gestures) {
+    const zoom = (factor, x, y, dx, dy) => gestures.zoom ? gestures.zoom(factor, x, y, dx, dy) : gestures.pinch(factor, x, y, dx, dy, 0);
     const fingers = /* @__PURE__ */ new Map();
     let start2 = { x: 0, y: 0 };
     let kind = "none";
@@ -793,7 +794,7 @@
       fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
       if (kind === "drag") gestures.dragEnd(true);
       start2 = { x: event.clientX, y: event.clientY };
-      kind = fingers.size === 1 ? "tap" : "pinch";
+      kind = fingers.size > 1 ? "pinch" : event.button === 1 ? "move" : "tap";
     });
     element.addEventListener("pointermove", (event) => {
       const finger = fingers.get(event.pointerId);
@@ -807,6 +808,8 @@
         gestures.drag(finger.x, finger.y, finger.x - start2.x, finger.y - start2.y);
       } else if (kind === "drag") {
         gestures.drag(finger.x, finger.y, dx, dy);
+      } else if (kind === "move") {
+        zoom(1, finger.x, finger.y, dx, dy);
       } else if (kind === "pinch" && fingers.size === 2) {
         const [a, b] = [...fingers.values()];
         const [c, d] = before;
@@ -829,7 +832,10 @@
     element.addEventListener("pointercancel", end);
     element.addEventListener("wheel", (event) => {
       event.preventDefault();
-      gestures.pinch(Math.exp(-event.deltaY / 400), event.clientX, event.clientY, 0, 0, event.deltaX / 8);
+      const factor = Math.exp(-event.deltaY / 400);
+      if (event.ctrlKey || event.metaKey) zoom(Math.abs(event.deltaY) < 50 ? factor ** 4 : factor, event.clientX, event.clientY, 0, 0);
+      else if (gestures.wheel) gestures.wheel(factor, event.deltaX / 8);
+      else gestures.pinch(factor, event.clientX, event.clientY, 0, 0, event.deltaX / 8);
     }, { passive: false });
   }
 
@@ -934,6 +940,7 @@
   // src/studio_lines.ts
   var AXES = ["y", "x", "z", "h"];
   var NEAR = 16;
+  var ON_IT = 10;
   var SHORTEST = 12;
   var Lines = class {
     drawn = byId("lines");
@@ -945,7 +952,7 @@
       const button = byId("draw_lines");
       button.addEventListener("click", () => {
         button.setAttribute("aria-pressed", String(!this.on));
-        studio.say(this.on ? "draw along the horizon where it is seen, or along edges: two of one direction, such as Upright, and one of another; drag an end of the chosen direction, tap the middle of a line to remove it" : "", this.on);
+        studio.say(this.on ? "draw along the horizon where it is seen, or along edges: two of one direction, such as Upright, and one of another; drag an end to move it, tap the middle of a line to remove it" : "", this.on);
         this.draw();
       });
       for (const axis of AXES) {
@@ -955,18 +962,19 @@
         });
       }
       byId("lines_clear").addEventListener("click", () => void studio.commit({ lines: [] }));
-      studio.addEventListener("state", () => this.draw());
+      for (const event of ["state", "view"]) studio.addEventListener(event, () => this.draw());
       studio.addEventListener("told", () => this.on && studio.state?.lines.length && studio.say(studio.told?.camera?.told ?? "", true));
     }
     get on() {
       return byId("draw_lines").getAttribute("aria-pressed") === "true";
     }
-    /** Take the near end of a line of the chosen direction, or begin a new line. px: pixels of the photograph in one of the window. */
+    /** Take the near end of a line, or begin a new one. px: pixels of the photograph in one of the window. */
     start(at_px, px) {
       this.lines = (studio.state?.lines ?? []).map((each) => [...each]);
-      const ends = this.lines.flatMap((each, line) => [0, 2].map((i) => ({ line, i, away: Math.hypot(each[i] - at_px[0], each[i + 1] - at_px[1]) })));
-      const nearest = ends.sort((one, other) => one.away - other.away).find((each) => this.lines[each.line][4] === this.axis);
-      if (nearest && nearest.away < NEAR * px) this.end = [nearest.line, nearest.i];
+      const reach = (axis) => (axis === this.axis ? NEAR : ON_IT) * px;
+      const ends = this.lines.flatMap((each, line) => [0, 2].map((i) => ({ line, i, away: Math.hypot(each[i] - at_px[0], each[i + 1] - at_px[1]) / reach(each[4]) })));
+      const nearest = ends.sort((one, other) => one.away - other.away)[0];
+      if (nearest && nearest.away < 1) this.end = [nearest.line, nearest.i];
       else this.end = [(this.lines = this.lines.filter((each) => this.axis !== "h" || each[4] !== "h")).push([at_px[0], at_px[1], at_px[0], at_px[1], this.axis]) - 1, 2];
     }
     move(at_px) {
@@ -1056,18 +1064,176 @@
     }
   };
 
+  // src/studio_view.ts
+  var MOST = 4;
+  var LOOKS_MS = 150;
+  var LOUPE_PX = 240;
+  var LARGEST_PX = 1600;
+  var COARSE = 1.15;
+  var View = class {
+    stage = byId("stage");
+    picture = byId("picture");
+    sharp = byId("sharp");
+    button = byId("zoom");
+    /** Times the fitted size, and what of the photograph lies in the middle of the window, in shares of it. */
+    times = 1;
+    middle = [0.5, 0.5];
+    looking;
+    constructor() {
+      this.button.addEventListener("click", () => this.isEnlarged ? this.reset() : this.enlarge());
+      studio.addEventListener("state", () => studio.isComplete && (this.sharp.hidden = true));
+      studio.addEventListener("picture", () => studio.shown?.draft || this.lookLater());
+    }
+    get isEnlarged() {
+      return this.times > 1;
+    }
+    get room() {
+      return byId("room").getBoundingClientRect();
+    }
+    /** Pixels of the window to one of the photograph where all of it is in sight. */
+    get fitted() {
+      const photo = studio.told.photo;
+      return Math.min(this.room.width / photo.width_px, this.room.height / photo.height_px);
+    }
+    /** How large pixels of the photograph are on the screen: 1 shows one by one. */
+    get scale() {
+      return this.fitted * this.times * devicePixelRatio;
+    }
+    /** Lay the picture out; nothing else does. */
+    fit() {
+      const photo = studio.told.photo;
+      const [room, size] = [this.room, this.fitted * this.times];
+      const [width, height] = [photo.width_px * size, photo.height_px * size];
+      const place = (share, most, length) => length <= most ? (most - length) / 2 : Math.min(0, Math.max(most - length, most / 2 - share * length));
+      const [left, top] = [place(this.middle[0], room.width, width), place(this.middle[1], room.height, height)];
+      this.middle = [(room.width / 2 - left) / width, (room.height / 2 - top) / height];
+      Object.assign(this.stage.style, { width: `${width}px`, height: `${height}px`, left: `${left}px`, top: `${top}px` });
+      studio.pixels = Math.max(4e4, photo.width_px * photo.height_px * (this.fitted * devicePixelRatio) ** 2);
+      this.button.setAttribute("aria-pressed", String(this.isEnlarged));
+      const told = byId("scale");
+      told.hidden = !this.isEnlarged;
+      told.textContent = `${Math.round(100 * this.scale)} %`;
+      studio.dispatchEvent(new Event("view"));
+      this.lookLater();
+    }
+    /** Enlarge about a point of the window, which moved by (dx, dy): what lies under it stays there. */
+    by(factor, x, y, dx = 0, dy = 0) {
+      if (!studio.told?.photo) return;
+      const [room, box] = [this.room, this.stage.getBoundingClientRect()];
+      const share = [(x - dx - box.left) / box.width, (y - dy - box.top) / box.height];
+      const most = Math.max(MOST, MOST / (this.fitted * devicePixelRatio));
+      const times = Math.min(most, Math.max(1, this.times * factor));
+      const grown = times / this.times;
+      this.times = times;
+      this.middle = [share[0] + (room.left + room.width / 2 - x) / (box.width * grown), share[1] + (room.top + room.height / 2 - y) / (box.height * grown)];
+      this.fit();
+    }
+    reset() {
+      [this.times, this.middle] = [1, [0.5, 0.5]];
+      this.sharp.hidden = true;
+      if (studio.told?.photo) this.fit();
+    }
+    /** One pixel of the photograph to one of the screen, about the object; twice the size where that is less. */
+    enlarge() {
+      const [photo, state] = [studio.told?.photo, studio.state];
+      if (!photo || !state) return;
+      this.times = Math.max(2, 1 / (this.fitted * devicePixelRatio));
+      const box = studio.isComplete ? studio.shown?.boxes[state.before.length] : null;
+      const high = this.room.height / (photo.height_px * this.fitted * this.times);
+      if (box) this.middle = [(box[0] + box[2]) / 2, box[3] - box[1] < high ? (box[1] + box[3]) / 2 : box[3] - 0.3 * high];
+      this.fit();
+      const hand = matchMedia("(pointer: coarse)").matches ? "two fingers zoom and move the picture" : "Ctrl and the wheel zoom, dragging beside the object moves the picture";
+      studio.say(`${hand}; Zoom again shows all of it`);
+    }
+    /** Left, top, right and bottom of what is in sight, in pixels of the photograph. */
+    get inSight() {
+      const photo = studio.told.photo;
+      const [room, box] = [this.room, this.stage.getBoundingClientRect()];
+      const share = (at, from, length) => Math.min(1, Math.max(0, (at - from) / length));
+      const [left, right2] = [share(room.left, box.left, box.width), share(room.right, box.left, box.width)];
+      const [top, bottom] = [share(room.top, box.top, box.height), share(room.bottom, box.top, box.height)];
+      return [left * photo.width_px, top * photo.height_px, right2 * photo.width_px, bottom * photo.height_px];
+    }
+    /** Bring a pixel of the photograph into sight. */
+    reveal([x_px, y_px]) {
+      const photo = studio.told.photo;
+      const [left, top, right2, bottom] = this.inSight;
+      if (x_px > left && x_px < right2 && y_px > top && y_px < bottom) return;
+      this.middle = [x_px / photo.width_px, y_px / photo.height_px];
+      this.fit();
+    }
+    lookLater() {
+      clearTimeout(this.looking);
+      if (this.isEnlarged) this.looking = setTimeout(() => void this.look(), LOOKS_MS);
+    }
+    /** Lay the finished picture's own pixels over the preview, where that is too coarse. */
+    async look() {
+      const [timer, photo] = [this.looking, studio.told.photo];
+      if (this.stage.clientWidth * devicePixelRatio < COARSE * this.picture.width || this.picture.width >= photo.width_px) return;
+      const [left, top, right2, bottom] = this.inSight;
+      const side = Math.min(LARGEST_PX, Math.ceil(Math.max(right2 - left, bottom - top)) + 2);
+      const [x, y] = [Math.round((left + right2) / 2), Math.round((top + bottom) / 2)];
+      const bitmap = await studio.region(x, y, side).catch(() => null);
+      if (!bitmap || timer !== this.looking) return;
+      [this.sharp.width, this.sharp.height] = [side, side];
+      this.sharp.getContext("2d").drawImage(bitmap, 0, 0);
+      const corner = [x - Math.floor(side / 2), y - Math.floor(side / 2)];
+      const percent = (value, most) => `${100 * value / most}%`;
+      Object.assign(this.sharp.style, { left: percent(corner[0], photo.width_px), top: percent(corner[1], photo.height_px), width: percent(side, photo.width_px), height: percent(side, photo.height_px) });
+      this.sharp.hidden = false;
+    }
+  };
+  var Loupe = class {
+    stage = byId("stage");
+    picture = byId("picture");
+    glass = byId("loupe");
+    looking;
+    constructor() {
+      const button = byId("magnify");
+      button.addEventListener("click", () => {
+        button.setAttribute("aria-pressed", String(!this.on));
+        this.glass.hidden = !this.on;
+        this.glass.style.left = "-9999px";
+      });
+      this.stage.addEventListener("pointermove", (event) => this.on && studio.told?.photo && this.magnify(event));
+    }
+    get on() {
+      return byId("magnify").getAttribute("aria-pressed") === "true";
+    }
+    magnify(event) {
+      const [box, room] = [this.stage.getBoundingClientRect(), byId("room").getBoundingClientRect()];
+      const [x, y] = [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
+      const photo = studio.told.photo;
+      const side = LOUPE_PX * devicePixelRatio;
+      this.glass.width = this.glass.height = side;
+      const cut = side * this.picture.width / photo.width_px;
+      this.glass.getContext("2d").drawImage(this.picture, x * this.picture.width - cut / 2, y * this.picture.height - cut / 2, cut, cut, 0, 0, side, side);
+      const within = (value, most) => Math.min(Math.max(0, most - LOUPE_PX), Math.max(0, value));
+      Object.assign(this.glass.style, { left: `${within(event.clientX - room.left + 20, room.width)}px`, top: `${within(event.clientY - room.top - LOUPE_PX - 20, room.height)}px` });
+      clearTimeout(this.looking);
+      this.looking = setTimeout(() => void this.look([x * photo.width_px, y * photo.height_px], side), LOOKS_MS);
+    }
+    async look([x_px, y_px], side) {
+      const timer = this.looking;
+      const bitmap = await studio.region(x_px, y_px, side).catch(() => null);
+      if (bitmap && timer === this.looking && this.on) this.glass.getContext("2d").drawImage(bitmap, 0, 0, side, side);
+      if (bitmap) this.glass.dataset.looked = String(Number(this.glass.dataset.looked ?? 0) + 1);
+    }
+  };
+
   // src/studio_picture.ts
   var NUDGES_REST_MS = 500;
-  var LOUPE_PX = 240;
   var DRAWN_AGAIN_MS = 900;
-  var LOOKS_MS = 150;
+  var BESIDE_PX = 12;
+  var FINGERS_BESIDE_PX = 48;
   var within180 = (turn_deg) => ((turn_deg + 180) % 360 + 360) % 360 - 180;
   var PictureStage = class {
     stage = byId("stage");
     picture = byId("picture");
     before = byId("before");
     ground = byId("ground");
-    loupe = byId("loupe");
+    view = new View();
+    loupe = new Loupe();
     brush = new Brush();
     lines = new Lines();
     shadow = new Shadow();
@@ -1075,37 +1241,36 @@
     hint = "";
     from = null;
     moved = [0, 0];
+    panning = false;
+    /** Whether the fingers that are down shape the object; null before they pinch. */
+    shaping = null;
     later;
-    looking;
     quiet;
     constructor() {
       new ResizeObserver(() => this.fit()).observe(byId("room"));
       studio.addEventListener("told", () => this.fit());
       studio.addEventListener("state", () => this.mark());
+      studio.addEventListener("view", () => this.mark());
       studio.addEventListener("picture", (event) => this.show(event.detail));
       this.gestures();
       this.keys();
       this.buttons();
     }
-    /** Make the picture as large as the window allows, and load the photograph when it is another one. */
+    /** Lay the picture out in the window, and load the photograph when it is another one. */
     fit() {
       const photo = studio.told?.photo ?? null;
       this.stage.hidden = !photo;
       byId("welcome").hidden = Boolean(photo);
       if (!photo) return;
-      const room = byId("room").getBoundingClientRect();
-      const scale = Math.min(room.width / photo.width_px, room.height / photo.height_px);
-      this.stage.style.width = `${photo.width_px * scale}px`;
-      this.stage.style.height = `${photo.height_px * scale}px`;
-      studio.pixels = Math.max(4e4, photo.width_px * photo.height_px * (scale * devicePixelRatio) ** 2);
       const name = `${photo.name} ${studio.told?.state.photo} ${photo.slice ?? ""} ${photo.width_px}`;
       if (name !== this.photoName) {
         this.photoName = name;
         this.hint = "";
+        this.view.reset();
         this.before.src = `/photo?of=${encodeURIComponent(name)}`;
         this.before.decode().then(() => studio.isComplete || this.showPhotograph()).catch(() => void 0);
       }
-      this.mark();
+      this.view.fit();
     }
     /** What is to be done next, or what the studio does. */
     next() {
@@ -1146,7 +1311,8 @@
           const radius_m = box2 ? ground.length_m(each.at_px, 0.5 * (box2[2] - box2[0]) * photo.width_px) : ground.cell_m / 2;
           this.path(number === state.before.length ? "foot" : "foot other", ground.circle(each.at_px, radius_m));
         });
-        this.words(`one square: ${ground.cell_m} m`, photo.width_px * 0.015, photo.height_px * 0.985, photo.width_px / this.stage.clientWidth);
+        const [left, , right2, bottom] = this.view.inSight;
+        this.words(`one square: ${ground.cell_m} m`, left + 0.015 * (right2 - left), bottom - 0.015 * (right2 - left), this.px);
       }
       if (photo && !studio.isComplete && this.before.complete && this.before.naturalWidth) this.showPhotograph();
       const box = byId("box");
@@ -1210,14 +1376,27 @@
       studio.change(studio.choosing(nearest.number));
       return true;
     }
+    /** The button of the tool that waits for a hand on the picture. */
+    get tool() {
+      return this.brush.on ? "brush" : this.lines.on ? "draw_lines" : this.shadow.on ? "sun_by" : this.stage.classList.contains("focusing") ? "focus_here" : null;
+    }
+    /** Whether a point of the window lies on the chosen object, or so near beside it. */
+    isBy(x, y, beside_px) {
+      const box = studio.isComplete ? this.boxOf(studio.state.before.length) : null;
+      const stage = this.stage.getBoundingClientRect();
+      const [u, v, across, down] = [(x - stage.left) / stage.width, (y - stage.top) / stage.height, beside_px / stage.width, beside_px / stage.height];
+      return box !== null && u >= box[0] - across && u <= box[2] + across && v >= box[1] - down && v <= box[3] + down;
+    }
     gestures() {
+      this.stage.addEventListener("pointerdown", (event) => event.isPrimary && (this.shaping = null), true);
       listen(this.stage, {
         tap: (x, y) => this.tapped(x, y),
         twice: (x, y) => this.tapped(x, y),
         dragStart: (x, y) => {
           if (this.brush.on) return this.brush.start(this.pixel(x, y));
           if (this.lines.on) return this.lines.start(this.pixel(x, y), this.px);
-          if (this.loupe.hidden) this.chose(x, y);
+          if (!this.loupe.on) this.chose(x, y);
+          this.panning = this.view.isEnlarged && !this.loupe.on && (this.shadow.on || !this.isBy(x, y, BESIDE_PX));
           this.from = studio.state?.at_px ?? this.inside(this.pixel(x, y));
           this.moved = [0, 0];
           this.stage.classList.add("dragging");
@@ -1225,7 +1404,8 @@
         drag: (x, y, dx, dy) => {
           if (this.brush.on) return this.brush.move(this.pixel(x, y));
           if (this.lines.on) return this.lines.move(this.pixel(x, y));
-          if (!this.from || !studio.state?.object || !this.loupe.hidden || this.shadow.on) return;
+          if (this.panning) return this.view.by(1, x, y, dx, dy);
+          if (!this.from || !studio.state?.object || this.loupe.on || this.shadow.on) return;
           this.moved = [this.moved[0] + dx * this.px, this.moved[1] + dy * this.px];
           studio.change({ at_px: this.inside([this.from[0] + this.moved[0], this.from[1] + this.moved[1]]) });
         },
@@ -1233,10 +1413,17 @@
           if (this.brush.on) return pinched ? this.brush.drop() : void this.brush.end();
           if (this.lines.on) return this.lines.stop(this.px, pinched);
           this.from = null;
+          this.panning = false;
           this.stage.classList.remove("dragging");
           void studio.commit();
         },
-        pinch: (factor, _x, _y, _dx, _dy, turn_deg) => this.brush.on ? this.brush.scale(factor) : this.lines.on || this.shadow.on || this.shape(factor, turn_deg)
+        // Two fingers on the object scale and turn it; elsewhere, while a tool waits, and in the enlarged picture they zoom that.
+        pinch: (factor, x, y, dx, dy, turn_deg) => {
+          this.shaping ??= this.tool === null && !this.view.isEnlarged && this.isBy(x, y, FINGERS_BESIDE_PX);
+          return this.shaping ? this.shape(factor, turn_deg) : this.view.by(factor, x, y, dx, dy);
+        },
+        wheel: (factor, turn_deg) => this.brush.on ? this.brush.scale(factor) : this.lines.on || this.shadow.on || this.shape(factor, turn_deg),
+        zoom: (factor, x, y, dx, dy) => this.view.by(factor, x, y, dx, dy)
       });
     }
     tapped(x, y) {
@@ -1295,7 +1482,9 @@
         const shapes = { "+": [1.05, 0], "=": [1.05, 0], "-": [1 / 1.05, 0], "[": [1, -step], "]": [1, step], "{": [1, -10], "}": [1, 10] };
         const [move, shape] = [moves[event.key], shapes[event.key]];
         if (move) {
-          studio.change({ at_px: this.inside([x + step * move[0], y + step * move[1]]) });
+          const at_px = this.inside([x + step * move[0], y + step * move[1]]);
+          studio.change({ at_px });
+          this.view.reveal(at_px);
           this.commitLater();
         } else if (shape) this.shape(...shape);
         else if (event.key === "Delete" || event.key === "Backspace") studio.remove();
@@ -1303,8 +1492,8 @@
         event.preventDefault();
       });
       document.addEventListener("keydown", (event) => {
-        const tool = this.brush.on ? "brush" : this.lines.on ? "draw_lines" : this.shadow.on ? "sun_by" : this.stage.classList.contains("focusing") ? "focus_here" : null;
-        if (event.key === "Escape" && tool) byId(tool).click();
+        const left = this.tool ?? (this.loupe.on ? "magnify" : this.view.isEnlarged ? "zoom" : null);
+        if (event.key === "Escape" && left) byId(left).click();
         if (!(event.ctrlKey || event.metaKey) || event.target.matches?.("input[type=text], input[type=number]")) return;
         const key = event.key.toLowerCase();
         if (key !== "z" && key !== "y") return;
@@ -1331,12 +1520,7 @@
         this.stage.classList.toggle("focusing", on);
         studio.say(on ? "click what is to be in focus: the object, or a place on the ground" : "", on);
       });
-      pressed("magnify", (on) => {
-        this.loupe.hidden = !on;
-        this.loupe.style.left = "-9999px";
-      });
       this.stage.addEventListener("pointermove", (event) => {
-        if (!this.loupe.hidden) this.magnify(event);
         if (this.brush.on && studio.told?.photo) this.brush.hover(this.pixel(event.clientX, event.clientY));
       });
       const hold = byId("hold_before");
@@ -1347,27 +1531,6 @@
       for (const end of ["pointerup", "pointercancel", "pointerleave", "blur"]) hold.addEventListener(end, () => show(false));
       hold.addEventListener("keydown", (event) => (event.key === " " || event.key === "Enter") && show(true));
       hold.addEventListener("keyup", () => show(false));
-    }
-    /** Show what lies under the pointer with one pixel of the photograph to one of the screen: the preview, then the finished picture. */
-    magnify(event) {
-      const box = this.stage.getBoundingClientRect();
-      const [x, y] = [event.clientX - box.left, event.clientY - box.top];
-      const photo = studio.told.photo;
-      const side = LOUPE_PX * devicePixelRatio;
-      this.loupe.width = this.loupe.height = side;
-      const cut = side * this.picture.width / photo.width_px;
-      const [left, top] = [x / box.width * this.picture.width - cut / 2, y / box.height * this.picture.height - cut / 2];
-      this.loupe.getContext("2d").drawImage(this.picture, left, top, cut, cut, 0, 0, side, side);
-      const within = (value, most) => Math.min(Math.max(0, most - LOUPE_PX), Math.max(0, value));
-      Object.assign(this.loupe.style, { left: `${within(x + 20, box.width)}px`, top: `${within(y - LOUPE_PX - 20, box.height)}px` });
-      clearTimeout(this.looking);
-      this.looking = setTimeout(() => void this.look(this.pixel(event.clientX, event.clientY), side), LOOKS_MS);
-    }
-    async look([x_px, y_px], side) {
-      const timer = this.looking;
-      const bitmap = studio.isComplete ? await studio.region(x_px, y_px, side).catch(() => null) : null;
-      if (bitmap && timer === this.looking && !this.loupe.hidden) this.loupe.getContext("2d").drawImage(bitmap, 0, 0, side, side);
-      if (bitmap) this.loupe.dataset.looked = String(Number(this.loupe.dataset.looked ?? 0) + 1);
     }
   };
 

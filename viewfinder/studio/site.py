@@ -34,7 +34,7 @@ _LARGEST_MESSAGE = 65536
 _NEWS_WAIT_S = 20.0
 _LARGEST_SCREEN_PX = 1e6
 _FEW_PX = 1e4
-_LARGEST_LOUPE_PX = 800
+_LARGEST_REGION_PX = 1600
 _PAGE_NAME = re.compile(r"\w{1,40}", re.ASCII)
 _TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".tif": "image/tiff", ".exr": "image/x-exr"}
 
@@ -184,10 +184,10 @@ class StudioSite:
         if isinstance(pixels, bool) or not isinstance(pixels, int | float) or not 1e3 <= pixels <= 1e9:
             raise InputError(f"expected how many pixels the screen shows, got {str(pixels)[:20]!r}: load the page again")
         state, opened = self.desk.changed_state(message.get("changes") or {}), self._opened()
-        options = options_of(placed_state(state, opened))
+        region = _region_of(message.get("region"))
+        options = None if region is not None and not state.is_complete else options_of(placed_state(state, opened))
         if draft not in self._previewers:
             self._previewers[draft] = Previewer("studio drafts" if draft else "studio previews")
-        region = _region_of(message.get("region"))
         wish = Wish(photograph=opened, options=options, most_px=min(float(pixels), _LARGEST_SCREEN_PX), draft=draft, region=region)
         made = await asyncio.wrap_future(self._previewers[draft].ask(f"{page} loupe" if region else page, wish))
         if made is None:
@@ -278,7 +278,7 @@ def _region_of(value: Any) -> "Region | None":
     if not sound or not all(isinstance(each, int | float) and not isinstance(each, bool) and -1e6 < each < 1e6 for each in value):
         raise InputError(f"expected the region of a loupe as x, y, side and blur in pixels, got {str(value)[:60]!r}")
     x_px, y_px, side_px, blur_px = value
-    return Region(float(x_px), float(y_px), max(16, min(_LARGEST_LOUPE_PX, int(side_px))), max(0.0, float(blur_px)))
+    return Region(float(x_px), float(y_px), max(16, min(_LARGEST_REGION_PX, int(side_px))), max(0.0, float(blur_px)))
 
 
 async def _message(request: web.Request) -> dict[str, Any]:

@@ -2,7 +2,9 @@
 import { byId, type DrawnLine, type Pair, type Told, inPhoto, studio } from "./studio_model";
 
 const AXES = ["y", "x", "z", "h"] as const;
+/** How near an end is taken: of the chosen direction, and of others, as edges of several directions meet in corners. */
 const NEAR = 16;
+const ON_IT = 10;
 const SHORTEST = 12;
 
 export class Lines {
@@ -16,7 +18,7 @@ export class Lines {
     const button = byId<HTMLElement>("draw_lines");
     button.addEventListener("click", () => {
       button.setAttribute("aria-pressed", String(!this.on));
-      studio.say(this.on ? "draw along the horizon where it is seen, or along edges: two of one direction, such as Upright, and one of another; drag an end of the chosen direction, tap the middle of a line to remove it" : "", this.on);
+      studio.say(this.on ? "draw along the horizon where it is seen, or along edges: two of one direction, such as Upright, and one of another; drag an end to move it, tap the middle of a line to remove it" : "", this.on);
       this.draw();
     });
     for (const axis of AXES) {
@@ -26,7 +28,7 @@ export class Lines {
       });
     }
     byId("lines_clear").addEventListener("click", () => void studio.commit({ lines: [] }));
-    studio.addEventListener("state", () => this.draw());
+    for (const event of ["state", "view"]) studio.addEventListener(event, () => this.draw());
     studio.addEventListener("told", () => this.on && studio.state?.lines.length && studio.say(studio.told?.camera?.told ?? "", true));
   }
 
@@ -34,12 +36,13 @@ export class Lines {
     return byId<HTMLElement>("draw_lines").getAttribute("aria-pressed") === "true";
   }
 
-  /** Take the near end of a line of the chosen direction, or begin a new line. px: pixels of the photograph in one of the window. */
+  /** Take the near end of a line, or begin a new one. px: pixels of the photograph in one of the window. */
   start(at_px: Pair, px: number): void {
     this.lines = (studio.state?.lines ?? []).map((each): DrawnLine => [...each]);
-    const ends = this.lines.flatMap((each, line) => ([0, 2] as const).map((i) => ({ line, i, away: Math.hypot(each[i] - at_px[0], each[i + 1 as 1 | 3] - at_px[1]) })));
-    const nearest = ends.sort((one, other) => one.away - other.away).find((each) => this.lines![each.line]![4] === this.axis);
-    if (nearest && nearest.away < NEAR * px) this.end = [nearest.line, nearest.i];
+    const reach = (axis: DrawnLine[4]): number => (axis === this.axis ? NEAR : ON_IT) * px;
+    const ends = this.lines.flatMap((each, line) => ([0, 2] as const).map((i) => ({ line, i, away: Math.hypot(each[i] - at_px[0], each[i + 1 as 1 | 3] - at_px[1]) / reach(each[4]) })));
+    const nearest = ends.sort((one, other) => one.away - other.away)[0];
+    if (nearest && nearest.away < 1) this.end = [nearest.line, nearest.i];
     else this.end = [(this.lines = this.lines.filter((each) => this.axis !== "h" || each[4] !== "h")).push([at_px[0], at_px[1], at_px[0], at_px[1], this.axis]) - 1, 2];
   }
 
