@@ -321,7 +321,7 @@ async def test_an_enlarged_picture_shows_the_photographs_own_pixels(tmp_path: Pa
     light = read_image(photo).copy()
     light[300:500, 999] = 0.0
     write_image(photo, light)
-    async with opened(tmp_path, DESK, StudioState(photo=photo, pitch_deg=0.0)) as (page, made):
+    async with opened(tmp_path, DESK, StudioState(photo=photo, pitch_deg=0.0)) as (page, _made):
         await page.tap("#zoom")
         assert await page.value(ZOOMED) == "100 %"
         await page.comes_true("!document.getElementById('sharp').hidden", 30.0)
@@ -444,6 +444,31 @@ async def test_objects_keep_their_size_in_the_picture_when_the_ground_moves(tmp_
         assert made.desk.state.height == "0.5" and page.errors == []
 
 
+@pytest.mark.parametrize("size_px", [DESK, UPRIGHT, LEVEL], ids=["desk", "upright", "level"])
+async def test_a_turned_camera_is_levelled(tmp_path: Path, size_px: tuple[int, int]) -> None:
+    """The horizon rises to the right by the angle that the camera is turned clockwise; the tilt by the slider leaves that as it is."""
+    async with opened(tmp_path, size_px) as (page, made):
+        await placed(page, made)
+        await page.value("document.querySelectorAll('details').forEach((each) => (each.open = true))")
+        await page.value("document.getElementById('roll').scrollIntoView({block: 'center'})")
+        slider = "(() => {{ const s = document.getElementById('{}'); s.value = '{}'; s.dispatchEvent(new Event('{}')); }})()"
+        await page.value(slider.format("roll", 8, "input"))
+        line = "document.querySelector('#ground .horizon').getAttribute('d').match(/-?[0-9.]+/g).map(Number)"
+        x1, y1, x2, y2 = await page.value(line)
+        assert np.degrees(np.arctan2(y1 - y2, x2 - x1)) == pytest.approx(8.0, abs=0.01), "at once"
+        await page.value(slider.format("roll", 8, "change"))
+        await page.comes_true("!studio.isChanging && studio.told.state.roll_deg === 8")
+        await page.comes_true("Math.abs(studio.told.photo.roll_deg - 8) < 0.01")
+        await page.value(slider.format("pitch", 5, "change"))
+        await page.comes_true("!studio.isChanging && studio.told.state.pitch_deg === 5")
+        x1, y1, x2, y2 = await page.value(line)
+        assert np.degrees(np.arctan2(y1 - y2, x2 - x1)) == pytest.approx(8.0, abs=0.01)
+        words = await page.value("document.getElementById('command').textContent")
+        assert "--pitch 5 --roll 8 " in words
+        await page.comes_true(RESTS, 60.0)
+        assert made.desk.state.roll_deg == 8.0 and page.errors == []
+
+
 async def test_light_lens_and_before_are_shown(tmp_path: Path) -> None:
     photo = write_floor(tmp_path / "floor.png")
     async with opened(tmp_path, DESK, StudioState(photo=photo, pitch_deg=0.0)) as (page, made):
@@ -543,6 +568,8 @@ async def test_the_page_is_accessible(tmp_path: Path, size_px: tuple[int, int]) 
             "shadow",
             "matched",
             "pitch",
+            "roll",
+            "zoom",
             "camera_height",
             "png",
             "copy",

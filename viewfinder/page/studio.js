@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 60b2396d5f68564f0e4d1cc3304e9811307f7612ae223017d53811909499fd50
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: a449767a8ae9052ea60b99980a0da80c662c9acdb6f0ed0b1f357e3fbb3da98c
 "use strict";
 (() => {
   // src/model.ts
@@ -321,15 +321,17 @@
   var LEAST_APART = 8e-3;
   var EYES_M = 1.5;
   var BELOW_DEG = 10;
-  function lookingDown(pitch_deg) {
+  function lookingDown(pitch_deg, roll_deg) {
     const [cos, sin] = [Math.cos(pitch_deg * Math.PI / 180), Math.sin(pitch_deg * Math.PI / 180)];
-    return [[1, 0, 0], [0, cos, sin], [0, -sin, cos]];
+    const [level, turned] = [Math.cos(roll_deg * Math.PI / 180), Math.sin(roll_deg * Math.PI / 180)];
+    return [[level, -turned, 0], [cos * turned, cos * level, sin], [-sin * turned, -sin * level, cos]];
   }
   var Ground = class {
     constructor(photo, focal_px, state) {
       this.photo = photo;
       this.focal_px = focal_px;
-      this.turn = state.pitch_deg === null ? photo.world_from_camera ?? lookingDown(0) : lookingDown(state.pitch_deg);
+      const isTold = state.pitch_deg !== null || state.roll_deg !== null || !photo.world_from_camera;
+      this.turn = isTold ? lookingDown(state.pitch_deg ?? photo.pitch_deg ?? 0, state.roll_deg ?? photo.roll_deg ?? 0) : photo.world_from_camera;
       this.high_m = state.camera_height_m ?? photo.camera_height_m ?? EYES_M;
     }
     photo;
@@ -472,7 +474,8 @@
       shown: (v) => `${v > 0 ? "+" : ""}${v.toFixed(1)} stops`
     },
     { id: "shadow", read: (s) => s.shadow ?? 1, write: (v) => ({ shadow: v === 1 ? null : v }), shown: (v) => `${Math.round(100 * v)} %` },
-    { id: "pitch", read: (s) => s.pitch_deg ?? studio.told?.photo?.pitch_deg ?? 0, write: (pitch_deg) => keepingSizes({ pitch_deg }), shown: (v) => degrees(v) }
+    { id: "pitch", read: (s) => s.pitch_deg ?? studio.told?.photo?.pitch_deg ?? 0, write: (pitch_deg) => keepingSizes({ pitch_deg }), shown: (v) => degrees(v) },
+    { id: "roll", read: (s) => s.roll_deg ?? studio.told?.photo?.roll_deg ?? 0, write: (roll_deg) => keepingSizes({ roll_deg }), shown: (v) => degrees(v) }
   ];
   var sunOf = (state) => state?.sun_deg ?? studio.told?.photo?.sun_deg ?? DEFAULT_SUN;
   var right = () => sunOf(studio.state)[0];
@@ -498,7 +501,7 @@
       const react = (id, changes) => byId(id).addEventListener("click", () => void studio.commit(changes()));
       react("focus_auto", () => ({ focus_m: null, focus_at_px: null }));
       react("f_number_auto", () => ({ f_number: null }));
-      react("camera_found", () => ({ camera: studio.told?.camera?.file ?? null, pitch_deg: null }));
+      react("camera_found", () => ({ camera: studio.told?.camera?.file ?? null, pitch_deg: null, roll_deg: null }));
       byId("object").addEventListener("change", (event) => {
         const object = event.target.value;
         if (object) void studio.commit({ object, height: null });

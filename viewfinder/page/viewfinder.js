@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 60b2396d5f68564f0e4d1cc3304e9811307f7612ae223017d53811909499fd50
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: a449767a8ae9052ea60b99980a0da80c662c9acdb6f0ed0b1f357e3fbb3da98c
 "use strict";
 (() => {
   // src/model.ts

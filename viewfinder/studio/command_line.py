@@ -33,6 +33,7 @@ def options_of(state: StudioState) -> CompositeOptions:
         height=[each.height or known[0] for each in objects] if known else None,
         turn=turns if any(turns) else None,
         pitch=state.pitch_deg,
+        roll=state.roll_deg,
         camera_height=None if state.plain or state.depth is not None else state.camera_height_m,
         sun=None if state.sun_deg is None else _numbers(state.sun_deg),
         exposure=state.exposure,

@@ -147,7 +147,7 @@ class Desk:
             # Lines that tell no camera yet leave the one that is there.
             if (self.state.photo, self.state.lines) == (state.photo, state.lines) and (found.get("file") or not state.lines):
                 camera = Path(found["file"]) if state.lines or found.get("is_sure") else None
-                self.project.amend(lambda state: replace(state, camera=camera, pitch_deg=None))
+                self.project.amend(lambda state: replace(state, camera=camera, pitch_deg=None, roll_deg=None))
             self._keep()
 
     async def add_object(self, path: Any) -> None:
@@ -287,6 +287,7 @@ class Desk:
         is_free = (
             state.camera is None
             and state.pitch_deg is None
+            and state.roll_deg is None
             and opened is not None
             and not opened.has_depth
             and opened.plate.world_from_camera is None

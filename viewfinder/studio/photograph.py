@@ -11,7 +11,7 @@ from jaxtyping import Float32
 from mrbokeh.commands._composite_layers import held_upright
 from mrbokeh.commands._composite_options import CompositeOptions, typed_sun
 from mrbokeh.commands._insertion_options import focused_at_pixel, require_one_focus
-from mrbokeh.commands._level_ground import HIGH_SHARE, on_level_ground, sun_by_shadow, usual_tilt_rad, with_camera_of_file
+from mrbokeh.commands._level_ground import HIGH_SHARE, held_as_told, on_level_ground, sun_by_shadow, usual_tilt_rad, with_camera_of_file
 from mrbokeh.compositing.plate import (
     HeldLens,
     LensWishes,
@@ -140,12 +140,11 @@ class OpenedPhotograph:
             plate, known_height_m = with_camera_of_file(plate, options.virtual.camera)
         if plate.depth_m is not None or standing.plain:
             return held_upright(plate, self.small(options, most_px).standing), renderer, known_height_m
-        if standing.pitch is not None:
-            plate = replace(plate, world_from_camera=looking_down(np.radians(standing.pitch)))
-        elif plate.world_from_camera is None:
+        if standing.pitch is None and plate.world_from_camera is None:
             foot_px = self.small(options, most_px).standing.first_px
             down_rad = usual_tilt_rad(plate, plate.camera.unproject(np.array(foot_px), np.array(1.0)))
             plate = replace(plate, world_from_camera=looking_down(down_rad if abs(down_rad) >= np.radians(_LEAST_TILT_DEG) else 0.0))
+        plate = held_as_told(plate, standing)
         return plate, renderer, known_height_m
 
     def _small_px(self, most_px: float) -> tuple[int, int]:

@@ -232,6 +232,7 @@ class StudioSite:
 
 def _photo_told(opened: "OpenedPhotograph", state: StudioState) -> dict[str, Any]:
     """Return what the page needs of the photograph: its size, and the pinhole by which it draws the ground."""
+    from mrbokeh.commands._level_ground import rolled_deg
     from viewfinder.studio.photograph import anywhere, looks_down_deg
 
     width_px, height_px = opened.size_px
@@ -261,8 +262,9 @@ def _photo_told(opened: "OpenedPhotograph", state: StudioState) -> dict[str, Any
         shown |= {"widest_f_number": plate.lens.widest_f_number}
         shown |= {"camera_height_m": eyes_m, "world_from_camera": None if held is None else held.tolist()}
         shown |= {"pitch_deg": None if held is None else round(looks_down_deg(plate), 2)}
+        shown |= {"roll_deg": None if held is None else round(rolled_deg(held), 2)}
     except InputError as problem:
-        shown |= dict.fromkeys(("focal_px", "lens_f_number", "camera_height_m", "world_from_camera", "pitch_deg")) | {
+        shown |= dict.fromkeys(("focal_px", "lens_f_number", "camera_height_m", "world_from_camera", "pitch_deg", "roll_deg")) | {
             "problem": str(problem)
         }
     return shown

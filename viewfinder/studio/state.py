@@ -38,9 +38,9 @@ class StudioState:
     says is in front. object, at_px, height, turn_deg: of the chosen object; before, after: those that come before and after it in the
     command line. at_px: where it stands, in pixels of the whole photograph. height: metres such as "0.3", or pixels such as "120px".
     focus_at_px: the pixel that is in focus, where the photograph has depth; focus_m otherwise. sun_deg: where the main light comes from,
-    degrees to the right of the view and above the horizon. camera: file of `mrbokeh capture solve`; pitch_deg comes before it. lines:
-    drawn ones, by which it was solved. matched: black and grain of the objects are those of the photograph. plain: guess neither light
-    nor ground.
+    degrees to the right of the view and above the horizon. camera: file of `mrbokeh capture solve`; pitch_deg and
+    roll_deg (clockwise) come before it. lines: drawn ones, by which it was solved. matched: black and grain of the objects are those of
+    the photograph. plain: guess neither light nor ground.
     """
 
     photo: Path | None = None
@@ -57,6 +57,7 @@ class StudioState:
     before: tuple[Placed, ...] = ()
     after: tuple[Placed, ...] = ()
     pitch_deg: float | None = None
+    roll_deg: float | None = None
     camera_height_m: float | None = None
     focal_length_mm: float | None = None
     sensor_width_mm: float | None = None
@@ -260,6 +261,7 @@ _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "before": _placed,
     "after": _placed,
     "pitch_deg": _number(-89.0, 89.0),
+    "roll_deg": _number(-89.0, 89.0),
     "camera_height_m": _number(0.001, 10_000.0),
     "focal_length_mm": _number(0.1, 10_000.0),
     "sensor_width_mm": _number(0.1, 500.0),

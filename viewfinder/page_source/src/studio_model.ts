@@ -32,6 +32,7 @@ export interface State {
   before: Placed[];
   after: Placed[];
   pitch_deg: number | null;
+  roll_deg: number | null;
   camera_height_m: number | null;
   focal_length_mm: number | null;
   sensor_width_mm: number | null;
@@ -57,6 +58,7 @@ export interface Photo {
   camera_height_m: number | null;
   world_from_camera: Matrix3 | null;
   pitch_deg: number | null;
+  roll_deg: number | null;
   lens_f_number: number | null;
   /** How far the lens opens; null: as far as one likes. */
   widest_f_number?: number | null;

@@ -38,6 +38,7 @@ const SLIDERS: Slider[] = [
   },
   { id: "shadow", read: (s) => s.shadow ?? 1, write: (v) => ({ shadow: v === 1 ? null : v }), shown: (v) => `${Math.round(100 * v)} %` },
   { id: "pitch", read: (s) => s.pitch_deg ?? studio.told?.photo?.pitch_deg ?? 0, write: (pitch_deg) => keepingSizes({ pitch_deg }), shown: (v) => degrees(v) },
+  { id: "roll", read: (s) => s.roll_deg ?? studio.told?.photo?.roll_deg ?? 0, write: (roll_deg) => keepingSizes({ roll_deg }), shown: (v) => degrees(v) },
 ];
 
 /** Where the sun is, or would be: as told, as the file tells, or somewhere. */
@@ -68,7 +69,7 @@ export class Panel {
     const react = (id: string, changes: () => Partial<State>): void => byId(id).addEventListener("click", () => void studio.commit(changes()));
     react("focus_auto", () => ({ focus_m: null, focus_at_px: null }));
     react("f_number_auto", () => ({ f_number: null }));
-    react("camera_found", () => ({ camera: studio.told?.camera?.file ?? null, pitch_deg: null }));
+    react("camera_found", () => ({ camera: studio.told?.camera?.file ?? null, pitch_deg: null, roll_deg: null }));
     byId("object").addEventListener("change", (event) => {
       const object = (event.target as HTMLSelectElement).value;
       if (object) void studio.commit({ object, height: null });
