@@ -80,7 +80,9 @@ def composited(
     of a picture. Raises InputError if nothing is seen.
     """
     mode, insertion = insertion_by(options, plate)
-    drawn = layers_by(options, plate, bundle, kept)(plate)
+    # What the ground catches is made of the photograph, whose light has its colour already.
+    given_back = finishing.light_before(plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb)
+    drawn = layers_by(options, plate, bundle, kept)(replace(plate, sharp_rgb=given_back))
     sharp = [without_what_touches_the_lens(layer, plate) for layer in drawn]
     if asked is not None and not any((layer.alpha > 0).any() for layer in drawn):
         _nothing_seen(asked, options.virtual)

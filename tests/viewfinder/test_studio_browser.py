@@ -469,6 +469,40 @@ async def test_a_turned_camera_is_levelled(tmp_path: Path, size_px: tuple[int, i
         assert made.desk.state.roll_deg == 8.0 and page.errors == []
 
 
+@pytest.mark.parametrize("size_px", [DESK, UPRIGHT, LEVEL], ids=["desk", "upright", "level"])
+async def test_the_objects_light_gets_warmer_at_once_and_the_ground_keeps_its_colour(tmp_path: Path, size_px: tuple[int, int]) -> None:
+    """By 75 millionths of 1 / K warmer: white then has 1.32 times as much red and 0.64 times as much blue."""
+    seen = """(() => {{
+        const canvas = document.getElementById('picture'), [left, top, right, bottom] = studio.shown.boxes[0];
+        const [from, to] = [{low}, {high}].map((share) => Math.floor((top + share * (bottom - top)) * canvas.height));
+        const [first, last] = [0.3, 0.7].map((share) => Math.floor((left + share * (right - left)) * canvas.width));
+        const data = canvas.getContext('2d').getImageData(first, from, last - first, to - from).data;
+        const light = (channel) => data.filter((_, i) => i % 4 === channel);
+        return [0, 2].map((channel) => [...light(channel)].reduce((sum, code) => sum + ((code / 255 + 0.055) / 1.055) ** 2.4, 0));
+    }})()"""
+    on_cake, in_shadow = seen.format(low=0.4, high=0.8), seen.format(low=1.02, high=1.08)
+    async with opened(tmp_path, size_px) as (page, made):
+        await placed(page, made)
+        before, ground = np.array(await page.value(on_cake)), np.array(await page.value(in_shadow))
+        await page.value("document.getElementById('warmth').scrollIntoView({block: 'center'})")
+        slider = "(() => {{ const s = document.getElementById('warmth'); s.value = '75'; s.dispatchEvent(new Event('{}')); }})()"
+        drafts = await page.value("studio.counts.drafts")
+        await page.value(slider.format("input"))
+        await page.comes_true(f"studio.counts.drafts > {drafts} && studio.shown.draft || studio.counts.drafts > {drafts + 1}")
+        ratio = np.array(await page.value(on_cake)) / before
+        assert ratio[0] == pytest.approx(1.32, rel=0.12) and ratio[1] == pytest.approx(0.64, rel=0.12)
+        await page.value(slider.format("change"))
+        await page.comes_true(f"{RESTS} && studio.told.state.warmth_k === {round(1e6 / (1e6 / 6504 - 75))}", 60.0)
+        ratio = np.array(await page.value(on_cake)) / before
+        assert ratio[0] == pytest.approx(1.32, rel=0.08) and ratio[1] == pytest.approx(0.64, rel=0.08)
+        np.testing.assert_allclose(np.array(await page.value(in_shadow)), ground, rtol=0.06)
+        assert "--match-white 12698" in await page.value("document.getElementById('command').textContent")
+        assert "warmer by 75" in await page.value("document.getElementById('warmth').parentElement.textContent")
+        await page.tap("#undo")
+        await page.comes_true("studio.state.warmth_k === null")
+        assert page.errors == []
+
+
 async def test_light_lens_and_before_are_shown(tmp_path: Path) -> None:
     photo = write_floor(tmp_path / "floor.png")
     async with opened(tmp_path, DESK, StudioState(photo=photo, pitch_deg=0.0)) as (page, made):

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: a449767a8ae9052ea60b99980a0da80c662c9acdb6f0ed0b1f357e3fbb3da98c
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 176796143856544f7376457d368246b24663d308c6406ab259952acec7ac207c
 "use strict";
 (() => {
   // src/model.ts
@@ -452,6 +452,7 @@
   var F_NUMBERS = [1, 1.2, 1.4, 1.8, 2, 2.2, 2.4, 2.8, 3.2, 3.5, 4, 4.5, 5, 5.6, 6.3, 7.1, 8, 9, 10, 11, 13, 14, 16, 18, 20, 22, 25, 29, 32];
   var LONG_FORMATS = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers" };
   var DEFAULT_SUN = [-125, 50];
+  var DAYLIGHT_MIRED = 1e6 / 6504;
   var nearestF = (f_number) => {
     const apart = F_NUMBERS.map((each) => Math.abs(Math.log(each / f_number)));
     return apart.indexOf(Math.min(...apart));
@@ -472,6 +473,12 @@
       read: (s) => Math.log2(Math.max(s.exposure, 1e-3)),
       write: (v) => ({ exposure: Number((2 ** v).toPrecision(4)) }),
       shown: (v) => `${v > 0 ? "+" : ""}${v.toFixed(1)} stops`
+    },
+    {
+      id: "warmth",
+      read: (s) => s.warmth_k ? Math.round(DAYLIGHT_MIRED - 1e6 / s.warmth_k) : 0,
+      write: (v) => ({ warmth_k: v === 0 ? null : Math.round(1e6 / (DAYLIGHT_MIRED - v)) }),
+      shown: (v) => v === 0 ? "as guessed" : `${v > 0 ? "warmer" : "cooler"} by ${Math.abs(v)}`
     },
     { id: "shadow", read: (s) => s.shadow ?? 1, write: (v) => ({ shadow: v === 1 ? null : v }), shown: (v) => `${Math.round(100 * v)} %` },
     { id: "pitch", read: (s) => s.pitch_deg ?? studio.told?.photo?.pitch_deg ?? 0, write: (pitch_deg) => keepingSizes({ pitch_deg }), shown: (v) => degrees(v) },

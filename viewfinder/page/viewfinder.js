@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: a449767a8ae9052ea60b99980a0da80c662c9acdb6f0ed0b1f357e3fbb3da98c
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 176796143856544f7376457d368246b24663d308c6406ab259952acec7ac207c
 "use strict";
 (() => {
   // src/model.ts

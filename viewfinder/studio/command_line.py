@@ -46,7 +46,9 @@ def options_of(state: StudioState) -> CompositeOptions:
         taken=PlateOptions(slice_=state.slice, depth=state.depth, matte=state.matte),
         standing=standing,
         virtual=VirtualOptions(camera=state.camera),
-        look=LookGroup() if state.matched else LookGroup(grain="off", match_black="off"),
+        look=LookGroup(match_white=state.warmth_k)
+        if state.matched
+        else LookGroup(match_white=state.warmth_k, grain="off", match_black="off"),
         optics=LensOptions(lens=state.lens, focus=state.focus_m, focus_at=focus_at),
         facts=LensFacts(focal_length_mm=state.focal_length_mm, f_number=state.f_number, sensor_width_mm=state.sensor_width_mm),
     )

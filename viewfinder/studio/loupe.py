@@ -12,7 +12,7 @@ from mrbokeh.commands._composite_options import CompositeOptions
 from mrbokeh.commands._composited import composited, placed
 from mrbokeh.compositing.between import COLOURS_REACH_PX
 from mrbokeh.compositing.plate import Plate
-from mrbokeh.compositing.plate_look.finishing import Finishing
+from mrbokeh.compositing.plate_look.finishing import white_balanced
 from mrbokeh.layering.pixel_box import Box, is_same_everywhere
 from mrbokeh.optics.camera import camera_of_lens
 from mrbokeh.renderers.base import Renderer
@@ -100,7 +100,7 @@ def region_of(whole: WholePhotograph, options: CompositeOptions, kept: KeptParts
         camera=box.camera_of(plate.camera),
     )
     with apart():
-        light = composited(part, options, renderer, Finishing(), kept=kept).inserted.rgb
+        light = composited(part, options, renderer, white_balanced(options.look.wanted), kept=kept).inserted.rgb
     wanted = seen.within((height_px, width_px))
     inner = light[wanted.top - box.top : wanted.bottom - box.top, wanted.left - box.left : wanted.right - box.left]
     shown[wanted.top - seen.top : wanted.bottom - seen.top, wanted.left - seen.left : wanted.right - seen.left] = inner

@@ -17,7 +17,7 @@ from mrbokeh.commands._composite_options import CompositeOptions
 from mrbokeh.commands._composite_parts import blur_told
 from mrbokeh.commands._composited import composited, placed
 from mrbokeh.compositing.plate import Plate
-from mrbokeh.compositing.plate_look.finishing import Finishing, finishing_of, matched_finishing
+from mrbokeh.compositing.plate_look.finishing import Finishing, finishing_of, matched_finishing, white_balanced
 from mrbokeh.images.color import srgb_codes
 from mrbokeh.images.layer import Layer
 from mrbokeh.scene.staging.staged_scene import StagedObject
@@ -55,7 +55,7 @@ def preview_of(photograph: OpenedPhotograph, options: CompositeOptions, kept: Ke
         plate, small = placed(plate, small, known_height_m)
         if kept.draft and plate.depth_m is not None:
             small = replace(small, virtual=replace(small.virtual, mode="over"))
-        finishing = Finishing() if kept.draft else _finishing(photograph, plate, small)
+        finishing = white_balanced(small.look.wanted) if kept.draft else _finishing(photograph, plate, small)
         made = composited(plate, small, renderer, finishing, kept=kept, asked=options.standing)
         plate, sharp = made.plate, made.sharp
         blur, _known, figures = blur_told(plate, sharp)

@@ -39,8 +39,9 @@ class StudioState:
     command line. at_px: where it stands, in pixels of the whole photograph. height: metres such as "0.3", or pixels such as "120px".
     focus_at_px: the pixel that is in focus, where the photograph has depth; focus_m otherwise. sun_deg: where the main light comes from,
     degrees to the right of the view and above the horizon. camera: file of `mrbokeh capture solve`; pitch_deg and
-    roll_deg (clockwise) come before it. lines: drawn ones, by which it was solved. matched: black and grain of the objects are those of
-    the photograph. plain: guess neither light nor ground.
+    roll_deg (clockwise) come before it. lines: drawn ones, by which it was solved. warmth_k: of --match-white, by
+    which objects are as warm as under a light of daylight's colour in a photograph balanced for so many kelvin. matched: black and grain
+    of the objects are those of the photograph. plain: guess neither light nor ground.
     """
 
     photo: Path | None = None
@@ -67,6 +68,7 @@ class StudioState:
     sun_deg: Pair | None = None
     shadow: float | None = None
     exposure: float = 1.0
+    warmth_k: float | None = None
     matched: bool = True
     plain: bool = False
 
@@ -271,6 +273,7 @@ _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "sun_deg": _pair((-360.0, 360.0), (0.1, 90.0)),
     "shadow": _number(0.0, 1.0),
     "exposure": _number(0.0, 1000.0),
+    "warmth_k": _number(2000.0, 25_000.0),
     "matched": _flag,
     "plain": _flag,
 }

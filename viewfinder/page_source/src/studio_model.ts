@@ -42,6 +42,7 @@ export interface State {
   sun_deg: Pair | null;
   shadow: number | null;
   exposure: number;
+  warmth_k: number | null;
   matched: boolean;
   plain: boolean;
 }

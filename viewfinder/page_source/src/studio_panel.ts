@@ -7,6 +7,9 @@ const LONG_FORMATS: Record<string, string> = { png: "PNG, 16 bit", jpeg: "JPEG",
 /** As the server guesses where only the exposure tells of the sun. */
 const DEFAULT_SUN: Pair = [-125, 50];
 
+/** Daylight of 6504 K in millionths of 1 / K, by which equal steps look alike. */
+const DAYLIGHT_MIRED = 1e6 / 6504;
+
 interface Slider {
   id: string;
   read: (state: State) => number;
@@ -35,6 +38,12 @@ const SLIDERS: Slider[] = [
     read: (s) => Math.log2(Math.max(s.exposure, 1e-3)),
     write: (v) => ({ exposure: Number((2 ** v).toPrecision(4)) }),
     shown: (v) => `${v > 0 ? "+" : ""}${v.toFixed(1)} stops`,
+  },
+  {
+    id: "warmth",
+    read: (s) => (s.warmth_k ? Math.round(DAYLIGHT_MIRED - 1e6 / s.warmth_k) : 0),
+    write: (v) => ({ warmth_k: v === 0 ? null : Math.round(1e6 / (DAYLIGHT_MIRED - v)) }),
+    shown: (v) => (v === 0 ? "as guessed" : `${v > 0 ? "warmer" : "cooler"} by ${Math.abs(v)}`),
   },
   { id: "shadow", read: (s) => s.shadow ?? 1, write: (v) => ({ shadow: v === 1 ? null : v }), shown: (v) => `${Math.round(100 * v)} %` },
   { id: "pitch", read: (s) => s.pitch_deg ?? studio.told?.photo?.pitch_deg ?? 0, write: (pitch_deg) => keepingSizes({ pitch_deg }), shown: (v) => degrees(v) },
