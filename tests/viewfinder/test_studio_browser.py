@@ -405,6 +405,37 @@ async def test_lines_are_drawn_corrected_and_removed(tmp_path: Path, size_px: tu
         assert page.errors == []
 
 
+@pytest.mark.parametrize("size_px", [DESK, UPRIGHT, LEVEL], ids=["desk", "upright", "level"])
+async def test_somebody_of_known_height_gives_the_ground_its_metres(tmp_path: Path, size_px: tuple[int, int]) -> None:
+    """A foot a third of the picture below the level horizon and a head a ninth below it: the camera is 1.5 times as high as that."""
+    async with opened(tmp_path, size_px) as (page, made):
+        await placed(page, made, 0.8, 0.9)
+        box = await page.value("studio.shown.boxes[0]")
+        await page.tap("#draw_lines")
+        await page.tap("#axis_m")
+        assert "foot to the head" in await page.value(MESSAGE)
+        left, top, width, height = await page.box("#stage")
+        await dragged(page, (left + 0.3 * width, top + 5 / 6 * height), (0.0, -2 / 9 * height), mouse=size_px == DESK)
+        await page.comes_true("studio.told.state.measured !== null && !studio.isChanging && studio.told.state.camera_height_m !== 1.5")
+        assert made.desk.state.camera_height_m == pytest.approx(1.5 * 1.7, rel=0.05)
+        await page.comes_true(f"{MESSAGE}.includes('By the known height the camera stands')")
+        await page.comes_true(RESTS, 60.0)
+        np.testing.assert_allclose(await page.value("studio.shown.boxes[0]"), box, atol=0.01)
+        await page.value(
+            "(() => { const m = document.getElementById('metres'); m.value = '0.85'; m.dispatchEvent(new Event('change')); })()"
+        )
+        await page.comes_true("studio.told.state.measured?.[4] === 0.85 && studio.told.state.camera_height_m < 2 && !studio.isChanging")
+        assert made.desk.state.camera_height_m == pytest.approx(1.5 * 0.85, rel=0.05)
+        # Its end is dragged like any other: half as long, it is taken nearly twice as high above the ground.
+        await dragged(page, (left + 0.3 * width, top + 11 / 18 * height), (0.0, 1 / 9 * height), mouse=size_px == DESK)
+        await page.comes_true("studio.told.state.camera_height_m > 2 && !studio.isChanging")
+        assert made.desk.state.camera_height_m == pytest.approx(3.0 * 0.85, rel=0.1) and made.desk.state.lines == ()
+        assert f"--camera-height {made.desk.state.camera_height_m:g}" in await page.value("document.getElementById('command').textContent")
+        await page.tap("#lines_clear")
+        await page.comes_true("studio.told.state.measured === null")
+        assert page.errors == []
+
+
 @pytest.mark.parametrize("size_px", [DESK, UPRIGHT], ids=["desk", "upright"])
 async def test_the_sun_is_found_by_a_shadow_that_is_pointed_at(tmp_path: Path, size_px: tuple[int, int]) -> None:
     """The shadow of a post lies to the right and is twice as long as that is high: the sun is at the left, atan(1 / 2) high."""

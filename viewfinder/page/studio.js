@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 176796143856544f7376457d368246b24663d308c6406ab259952acec7ac207c
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 7b30ddf4a36be82b28836de4dd96a44b613f3d44995ce63061a2e9295164ca00
 "use strict";
 (() => {
   // src/model.ts
@@ -140,7 +140,7 @@
         if (!Object.keys(this.local).length) return;
         this.sending = this.local;
         this.local = {};
-        const told = await this.post("/state", { changes: this.sending });
+        const told = await this.post("/state", { changes: this.sending, metres_typed: this.metresTyped });
         this.sending = {};
         if (told) this.take(told);
         else this.dispatchEvent(new Event("state"));
@@ -490,7 +490,7 @@
   var sun = (sun_deg) => ({ sun_deg, plain: false });
   var NUMBERS = [
     { id: "focus", name: "focus_m", also: { focus_at_px: null } },
-    { id: "camera_height", name: "camera_height_m" },
+    { id: "camera_height", name: "camera_height_m", also: { measured: null } },
     { id: "focal_length", name: "focal_length_mm" },
     { id: "sensor_width", name: "sensor_width_mm" }
   ];
@@ -733,13 +733,15 @@
     return { ...changes, height: state.at_px && scaled({ at_px: state.at_px, height: state.height }), before: all(state.before), after: all(state.after) };
   }
   function heightNote(state) {
-    const guessed = state.camera_height_m && !studio.told?.photo?.has_depth ? ` for a camera ${state.camera_height_m} m above the ground (see below)` : "";
+    const by = state.measured ? ", by the known height" : " (see below)";
+    const guessed = state.camera_height_m && !studio.told?.photo?.has_depth ? ` for a camera ${state.camera_height_m} m above the ground${by}` : "";
     return `Metres${guessed}, or pixels such as 120px. Wheel, pinch, + and - scale it.`;
   }
   function groundTold() {
     const [told, state] = [studio.told, studio.state];
     if (!told?.photo || told.photo.has_depth || !state?.camera_height_m) return [];
     const tilt = state.camera === null && state.pitch_deg !== null ? [`The camera looks down by ${state.pitch_deg}°, which little in the picture tells: see Camera and ground, or draw Lines.`] : [];
+    if (state.measured) return tilt;
     return [...tilt, `The camera is ${state.camera_height_m} m above the ground, or the table that it stands on; all metres hang on that.`];
   }
   async function save(format) {
@@ -948,12 +950,14 @@
   };
 
   // src/studio_lines.ts
-  var AXES = ["y", "x", "z", "h"];
+  var AXES = ["y", "x", "z", "h", "m"];
+  var isOnly = (axis) => axis === "h" || axis === "m";
   var NEAR = 16;
   var ON_IT = 10;
   var SHORTEST = 12;
   var Lines = class {
     drawn = byId("lines");
+    metres = byId("metres");
     axis = "y";
     lines = null;
     /** The end that is dragged: line, and 0 or 2 for its first coordinate. */
@@ -969,23 +973,48 @@
         byId(`axis_${axis}`).addEventListener("click", () => {
           this.axis = axis;
           for (const each of AXES) byId(`axis_${each}`).setAttribute("aria-pressed", String(each === axis));
+          if (axis === "m") studio.say("draw from the foot to the head of somebody, or of something upright, and type how high that is", true);
+          this.draw();
         });
       }
-      byId("lines_clear").addEventListener("click", () => void studio.commit({ lines: [] }));
+      byId("lines_clear").addEventListener("click", () => void studio.commit({ lines: [], measured: null }));
+      this.metres.addEventListener("change", () => this.keep(this.known));
       for (const event of ["state", "view"]) studio.addEventListener(event, () => this.draw());
-      studio.addEventListener("told", () => this.on && studio.state?.lines.length && studio.say(studio.told?.camera?.told ?? "", true));
+      studio.addEventListener("told", () => this.on && this.known.length && studio.say(this.said(), true));
+    }
+    /** All lines of the state. */
+    get known() {
+      const [lines, measured] = [studio.state?.lines ?? [], studio.state?.measured];
+      return [...lines.map((each) => [...each]), ...measured ? [[...measured.slice(0, 4), "m"]] : []];
+    }
+    /** What the lines tell. */
+    said() {
+      const { lines, measured, camera_height_m } = studio.state;
+      const scale = measured && camera_height_m ? [`By the known height the camera stands ${Number(camera_height_m.toPrecision(3))} m above the ground.`] : [];
+      return [...lines.length ? [studio.told?.camera?.told ?? ""] : [], ...scale].join(" ");
+    }
+    /** Keep lines, of which one may be of known height. */
+    keep(lines) {
+      const metres = this.metres.valueAsNumber;
+      const known = lines.find((each) => each[4] === "m");
+      if (known && !(metres > 0)) return studio.say("give how many metres high it is, above 0");
+      const changes = { lines: lines.filter((each) => each[4] !== "m"), measured: known ? [...known.slice(0, 4), metres] : null };
+      const same = (name) => JSON.stringify(changes[name]) === JSON.stringify(studio.state?.[name]);
+      for (const name of ["lines", "measured"]) if (same(name)) delete changes[name];
+      if (Object.keys(changes).length) void studio.commit(changes);
+      else this.draw();
     }
     get on() {
       return byId("draw_lines").getAttribute("aria-pressed") === "true";
     }
     /** Take the near end of a line, or begin a new one. px: pixels of the photograph in one of the window. */
     start(at_px, px) {
-      this.lines = (studio.state?.lines ?? []).map((each) => [...each]);
+      this.lines = this.known;
       const reach = (axis) => (axis === this.axis ? NEAR : ON_IT) * px;
       const ends = this.lines.flatMap((each, line) => [0, 2].map((i) => ({ line, i, away: Math.hypot(each[i] - at_px[0], each[i + 1] - at_px[1]) / reach(each[4]) })));
       const nearest = ends.sort((one, other) => one.away - other.away)[0];
       if (nearest && nearest.away < 1) this.end = [nearest.line, nearest.i];
-      else this.end = [(this.lines = this.lines.filter((each) => this.axis !== "h" || each[4] !== "h")).push([at_px[0], at_px[1], at_px[0], at_px[1], this.axis]) - 1, 2];
+      else this.end = [(this.lines = this.lines.filter((each) => each[4] !== this.axis || !isOnly(this.axis))).push([at_px[0], at_px[1], at_px[0], at_px[1], this.axis]) - 1, 2];
     }
     move(at_px) {
       const line = this.lines?.[this.end[0]];
@@ -998,23 +1027,25 @@
       const lines = pinched ? void 0 : this.lines?.filter((each) => Math.hypot(each[2] - each[0], each[3] - each[1]) > SHORTEST * px);
       this.lines = null;
       if (pinched) this.draw();
-      if (lines) void studio.commit({ lines });
+      if (lines) this.keep(lines);
     }
     /** Remove the line under a finger. */
     tap([x, y], px) {
-      const lines = studio.state?.lines ?? [];
+      const lines = this.known;
       const away = ([x1, y1, x2, y2]) => {
         const along = Math.min(1, Math.max(0, ((x - x1) * (x2 - x1) + (y - y1) * (y2 - y1)) / Math.hypot(x2 - x1, y2 - y1) ** 2));
         return Math.hypot(x1 + along * (x2 - x1) - x, y1 + along * (y2 - y1) - y);
       };
       const nearest = [...lines].sort((one, other) => away(one) - away(other))[0];
       const isAtEnd = nearest && Math.min(Math.hypot(x - nearest[0], y - nearest[1]), Math.hypot(x - nearest[2], y - nearest[3])) < NEAR * px;
-      if (nearest && !isAtEnd && away(nearest) < NEAR * px) void studio.commit({ lines: lines.filter((each) => each !== nearest) });
+      if (nearest && !isAtEnd && away(nearest) < NEAR * px) this.keep(lines.filter((each) => each !== nearest));
     }
     draw() {
       const photo = studio.told?.photo;
-      const lines = this.lines ?? studio.state?.lines ?? [];
+      const lines = this.lines ?? this.known;
       byId("lines_row").hidden = !this.on;
+      byId("metres_row").hidden = this.axis !== "m";
+      if (studio.state?.measured && document.activeElement !== this.metres) this.metres.value = String(studio.state.measured[4]);
       byId("lines_clear").disabled = !lines.length;
       this.drawn.replaceChildren();
       if (!photo || !this.on) return;

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 176796143856544f7376457d368246b24663d308c6406ab259952acec7ac207c
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 7b30ddf4a36be82b28836de4dd96a44b613f3d44995ce63061a2e9295164ca00
 "use strict";
 (() => {
   // src/model.ts

@@ -41,14 +41,13 @@ def options_of(state: StudioState) -> CompositeOptions:
         plain=state.plain,
     )
     focus_at = None if state.focus_at_px is None else ",".join(str(int(each)) for each in state.focus_at_px)
+    unmatched = None if state.matched else "off"
     return CompositeOptions(
         photo=state.photo,
         taken=PlateOptions(slice_=state.slice, depth=state.depth, matte=state.matte),
         standing=standing,
         virtual=VirtualOptions(camera=state.camera),
-        look=LookGroup(match_white=state.warmth_k)
-        if state.matched
-        else LookGroup(match_white=state.warmth_k, grain="off", match_black="off"),
+        look=LookGroup(match_white=state.warmth_k, grain=unmatched, match_black=unmatched),
         optics=LensOptions(lens=state.lens, focus=state.focus_m, focus_at=focus_at),
         facts=LensFacts(focal_length_mm=state.focal_length_mm, f_number=state.f_number, sensor_width_mm=state.sensor_width_mm),
     )

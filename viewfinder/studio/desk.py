@@ -4,6 +4,7 @@ import asyncio
 import logging
 import re
 from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,6 +46,7 @@ class Desk:
         self._drawn: tuple[object, dict[str, Any]] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._tools = asyncio.Lock()
+        self._metres_typed = False
         self._brush: tuple[Path, Brush] | None = None
 
     @property
@@ -114,9 +116,16 @@ class Desk:
             "camera": [self.state.camera, Path(found) if found else None],
         }
 
-    async def change(self, changes: Any) -> None:
-        """Take changes of a page over, complete what follows from them, and keep the project."""
+    async def change(self, changes: Any, *, metres_typed: bool = False) -> None:
+        """Take changes of a page over, complete what follows from them, and keep the project.
+
+        metres_typed: heights are known in metres, which stay when the scale of the ground is found; else objects keep their size in the
+        picture. Raises InputError.
+        """
         before, state, opened = self.state, self.changed_state(changes), self.photograph
+        self._metres_typed = metres_typed
+        if state.measured not in (None, before.measured):
+            await asyncio.to_thread(_require_measured, state, opened)
         if opened is not None and opened.stack is not None and state.focus_at_px is not None:
             state = replace(state, slice=opened.slice_in_focus(*state.focus_at_px), focus_at_px=None)
         self.project.add(state)
@@ -299,9 +308,9 @@ class Desk:
     async def _complete(self) -> None:
         """Give a complete state the metres that follow from it, once its camera was looked for."""
         opened, before = self.photograph, self.state
-        if opened is None or not before.is_complete or before.photo not in self._cameras:
+        if opened is None or before.photo not in self._cameras or not (before.is_complete or before.measured):
             return
-        completed = await asyncio.to_thread(placed_state, before, opened)
+        completed = await asyncio.to_thread(_completed, before, opened, self._metres_typed)
         if completed != before and self.state == before:
             self.project.amend(lambda _state: completed)
             self._keep()
@@ -334,6 +343,27 @@ def _opened_photograph(
             return str(error)
 
     return opened, camera
+
+
+def _require_measured(state: StudioState, opened: "OpenedPhotograph | None") -> None:
+    """Raise InputError if something of known height cannot tell how high the camera stands."""
+    from viewfinder.studio.photograph import measured_height_m
+
+    if opened is None or opened.has_depth or state.plain:
+        raise InputError("a known height tells how far level ground is, but depth tells that here already, or Plain is on: leave it out")
+    measured_height_m(state, opened)
+
+
+def _completed(state: StudioState, opened: "OpenedPhotograph", metres_typed: bool) -> StudioState:
+    """Return the state with the camera's height by something measured, and with its tilt and metres."""
+    from viewfinder.studio.photograph import measured_height_m
+
+    if state.measured is not None and not opened.has_depth and not state.plain:
+        with suppress(InputError):
+            height_m, before_m = measured_height_m(state, opened), state.camera_height_m
+            kept = state.scaled(height_m / before_m) if before_m not in (None, height_m) and not metres_typed else state
+            state = replace(kept, camera_height_m=height_m)
+    return placed_state(state, opened)
 
 
 def placed_state(state: StudioState, opened: "OpenedPhotograph") -> StudioState:

@@ -53,7 +53,9 @@ def project_of(options: StudioOptions) -> Project:
     if photo is not None and project.state.photo != photo:
         project.add(StudioState(photo=photo, object=project.state.object, lens=project.state.lens))
     if options.depth is not None and project.state.depth != _there(options.depth, "the depth of the photograph"):
-        project.add(replace(project.state, depth=options.depth, camera=None, pitch_deg=None, roll_deg=None, camera_height_m=None))
+        project.add(
+            replace(project.state, depth=options.depth, camera=None, pitch_deg=None, roll_deg=None, camera_height_m=None, measured=None)
+        )
     _offer(project, options)
     return replace(project, history=[project.state], place=0) if is_new else project
 

@@ -137,8 +137,9 @@ class StudioSite:
         return web.Response(text=bokeh_svg(lenses[int(number)]), content_type="image/svg+xml")
 
     async def _change(self, request: web.Request) -> web.Response:
-        """Handle POST /state: {"changes": {name: value}}."""
-        await self.desk.change((await _message(request)).get("changes"))
+        """Handle POST /state: {"changes": {name: value}, "metres_typed"}."""
+        message = await _message(request)
+        await self.desk.change(message.get("changes"), metres_typed=message.get("metres_typed") is True)
         return web.json_response(self._told())
 
     async def _add(self, request: web.Request) -> web.Response:

@@ -9,6 +9,9 @@ export type Pair = [number, number];
 /** Both ends of an edge in pixels, and its direction in the world: y upright, x and z the two level ones; h is the horizon. */
 export type DrawnLine = [number, number, number, number, "x" | "y" | "z" | "h"];
 
+/** Both ends of something upright on the ground, and how many metres high it is. */
+export type Measured = [number, number, number, number, number];
+
 /** An object that stands in the photograph. */
 export interface Placed {
   object: string;
@@ -34,6 +37,7 @@ export interface State {
   pitch_deg: number | null;
   roll_deg: number | null;
   camera_height_m: number | null;
+  measured: Measured | null;
   focal_length_mm: number | null;
   sensor_width_mm: number | null;
   f_number: number | null;
@@ -206,7 +210,7 @@ export class Studio extends EventTarget {
       if (!Object.keys(this.local).length) return;
       this.sending = this.local;
       this.local = {};
-      const told = await this.post("/state", { changes: this.sending });
+      const told = await this.post("/state", { changes: this.sending, metres_typed: this.metresTyped });
       this.sending = {};
       if (told) this.take(told);
       else this.dispatchEvent(new Event("state"));

@@ -59,7 +59,7 @@ const sun = (sun_deg: Pair): Partial<State> => ({ sun_deg, plain: false });
 
 const NUMBERS: { id: string; name: keyof State; also?: Partial<State> }[] = [
   { id: "focus", name: "focus_m", also: { focus_at_px: null } },
-  { id: "camera_height", name: "camera_height_m" },
+  { id: "camera_height", name: "camera_height_m", also: { measured: null } },
   { id: "focal_length", name: "focal_length_mm" },
   { id: "sensor_width", name: "sensor_width_mm" },
 ];
@@ -326,7 +326,8 @@ function keepingSizes(changes: Partial<State>): Partial<State> {
 
 /** What the number of the height counts. */
 function heightNote(state: State): string {
-  const guessed = state.camera_height_m && !studio.told?.photo?.has_depth ? ` for a camera ${state.camera_height_m} m above the ground (see below)` : "";
+  const by = state.measured ? ", by the known height" : " (see below)";
+  const guessed = state.camera_height_m && !studio.told?.photo?.has_depth ? ` for a camera ${state.camera_height_m} m above the ground${by}` : "";
   return `Metres${guessed}, or pixels such as 120px. Wheel, pinch, + and - scale it.`;
 }
 
@@ -335,6 +336,7 @@ function groundTold(): string[] {
   const [told, state] = [studio.told, studio.state];
   if (!told?.photo || told.photo.has_depth || !state?.camera_height_m) return [];
   const tilt = state.camera === null && state.pitch_deg !== null ? [`The camera looks down by ${state.pitch_deg}°, which little in the picture tells: see Camera and ground, or draw Lines.`] : [];
+  if (state.measured) return tilt;
   return [...tilt, `The camera is ${state.camera_height_m} m above the ground, or the table that it stands on; all metres hang on that.`];
 }
 
