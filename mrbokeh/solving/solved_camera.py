@@ -167,8 +167,8 @@ class SolvedCamera:
         aside = float(np.linalg.norm(reach * top[level] - foot[level]))
         if reach <= 0.0 or risen <= 1e-3 or aside > _MOST_LEAN * risen:
             raise InputError(
-                f"expected the top of something upright above its foot, but {ends_px} is a point or leans by more than 20 degrees: give the "
-                f"pixels of its foot and of its top, and check how the camera was held"
+                f"expected the top of something upright above its foot, but {ends_px} is a point or leans by more than 20 degrees: give "
+                f"the pixels of its foot and of its top, and check how the camera was held"
             )
         return self.standing(metres / risen)
 
