@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 7b30ddf4a36be82b28836de4dd96a44b613f3d44995ce63061a2e9295164ca00
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: f7422945a8c39d1bdd022ef788cc6f2005f336a2528b5b8a86f0f53e9dcb9251
 "use strict";
 (() => {
   // src/model.ts

@@ -32,6 +32,7 @@ export class Lines {
         for (const each of AXES) byId(`axis_${each}`).setAttribute("aria-pressed", String(each === axis));
         if (axis === "m") studio.say("draw from the foot to the head of somebody, or of something upright, and type how high that is", true);
         this.draw();
+        if (axis === "m") byId("metres_row").scrollIntoView({ block: "nearest", inline: "nearest" });
       });
     }
     byId("lines_clear").addEventListener("click", () => void studio.commit({ lines: [], measured: null }));
