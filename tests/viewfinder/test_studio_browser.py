@@ -321,7 +321,7 @@ async def test_an_enlarged_picture_shows_the_photographs_own_pixels(tmp_path: Pa
     light = read_image(photo).copy()
     light[300:500, 999] = 0.0
     write_image(photo, light)
-    async with opened(tmp_path, DESK, StudioState(photo=photo, pitch_deg=0.0)) as (page, _made):
+    async with opened(tmp_path, DESK, StudioState(photo=photo, pitch_deg=0.0)) as (page, made):
         await page.tap("#zoom")
         assert await page.value(ZOOMED) == "100 %"
         await page.comes_true("!document.getElementById('sharp').hidden", 30.0)
@@ -338,7 +338,25 @@ async def test_an_enlarged_picture_shows_the_photographs_own_pixels(tmp_path: Pa
         await page.value("studio.change({exposure: 2}), 0")
         assert await page.value("document.getElementById('sharp').hidden"), "an older picture is not shown over a newer one"
         await page.comes_true("!document.getElementById('sharp').hidden", 60.0)
+        number = await page.value("studio.told.number")
+        counted = "studio.region = (...all) => { asked++; return region(...all); }"
+        await page.value(f"(() => {{ window.asked = 0; const region = studio.region.bind(studio); {counted}; }})()")
+        made.desk.tell_all()
+        await page.comes_true(f"studio.told.number > {number}")
+        await held_before(page)
         assert page.errors == []
+
+
+async def held_before(page: Page) -> None:
+    """The photograph as it was is shown with its own pixels too, and news of the server ask for none."""
+    left, top, _width, _height = await page.box("#hold_before")
+    await asyncio.sleep(0.4)
+    assert await page.value("asked") == 0
+    await page.send("Input.dispatchMouseEvent", type="mousePressed", x=left + 5, y=top + 5, button="left", buttons=1, clickCount=1)
+    await page.comes_true("!document.getElementById('sharp_before').hidden", 30.0)
+    assert await darkest(page, "sharp_before", 999.5, 400.0) < 60 and await page.value("asked") == 1
+    await page.send("Input.dispatchMouseEvent", type="mouseReleased", x=left + 5, y=top + 5, button="left", clickCount=1)
+    assert await page.value("document.getElementById('sharp_before').hidden && !document.getElementById('sharp').hidden")
 
 
 @pytest.mark.parametrize("size_px", [DESK, UPRIGHT], ids=["desk", "upright"])

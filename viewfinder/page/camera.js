@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: f7422945a8c39d1bdd022ef788cc6f2005f336a2528b5b8a86f0f53e9dcb9251
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 16837f92e72e2006019152fffa2ca8626c85fd958aa812f129f16f4fa5dc9b42
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: f7422945a8c39d1bdd022ef788cc6f2005f336a2528b5b8a86f0f53e9dcb9251
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 16837f92e72e2006019152fffa2ca8626c85fd958aa812f129f16f4fa5dc9b42
 "use strict";
 (() => {
   // src/model.ts
@@ -227,10 +227,10 @@
     async whole(change) {
       if (change === this.changes) await this.ask(false, change);
     }
-    /** The part of the finished picture around a pixel, as the loupe shows it; null where another one was asked for since. */
-    async region(x_px, y_px, side_px) {
+    /** The part of the finished picture, or of the photograph as it is, around a pixel; null where another one was asked for since. */
+    async region(x_px, y_px, side_px, before = false) {
       const region = [x_px, y_px, side_px, this.shown?.coc_px[1] ?? 0];
-      const message = { changes: { ...this.sending, ...this.local }, pixels: this.pixels, page: pageName, region };
+      const message = { changes: { ...this.sending, ...this.local }, pixels: this.pixels, page: before ? `${pageName}b` : pageName, region, before };
       const answer = await fetch("/preview", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(message) });
       if (answer.status !== 200) return null;
       const body = await answer.arrayBuffer();
@@ -873,6 +873,7 @@
       const hidden = (on) => {
         hide.setAttribute("aria-pressed", String(on));
         byId("before").hidden = !on;
+        studio.dispatchEvent(new Event("before"));
       };
       hide.addEventListener("click", () => hidden(hide.getAttribute("aria-pressed") !== "true"));
       button.addEventListener("click", () => hidden(false));
@@ -1116,15 +1117,19 @@
     stage = byId("stage");
     picture = byId("picture");
     sharp = byId("sharp");
+    sharpBefore = byId("sharp_before");
+    before = byId("before");
     button = byId("zoom");
     /** Times the fitted size, and what of the photograph lies in the middle of the window, in shares of it. */
     times = 1;
     middle = [0.5, 0.5];
+    laid = "";
     looking;
     constructor() {
       this.button.addEventListener("click", () => this.isEnlarged ? this.reset() : this.enlarge());
       studio.addEventListener("state", () => studio.isComplete && (this.sharp.hidden = true));
       studio.addEventListener("picture", () => studio.shown?.draft || this.lookLater());
+      studio.addEventListener("before", () => this.before.hidden ? this.sharpBefore.hidden = true : void this.look(this.sharpBefore));
     }
     get isEnlarged() {
       return this.times > 1;
@@ -1156,7 +1161,9 @@
       told.hidden = !this.isEnlarged;
       told.textContent = `${Math.round(100 * this.scale)} %`;
       studio.dispatchEvent(new Event("view"));
-      this.lookLater();
+      const laid = `${width} ${left} ${top}`;
+      if (laid !== this.laid) this.lookLater();
+      this.laid = laid;
     }
     /** Enlarge about a point of the window, which moved by (dx, dy): what lies under it stays there. */
     by(factor, x, y, dx = 0, dy = 0) {
@@ -1172,7 +1179,7 @@
     }
     reset() {
       [this.times, this.middle] = [1, [0.5, 0.5]];
-      this.sharp.hidden = true;
+      this.sharp.hidden = this.sharpBefore.hidden = true;
       if (studio.told?.photo) this.fit();
     }
     /** One pixel of the photograph to one of the screen, about the object; twice the size where that is less. */
@@ -1204,25 +1211,36 @@
       this.middle = [x_px / photo.width_px, y_px / photo.height_px];
       this.fit();
     }
+    /** What is shown is of another picture than before. */
+    lookAnew() {
+      this.sharp.hidden = this.sharpBefore.hidden = true;
+      this.lookLater();
+    }
     lookLater() {
       clearTimeout(this.looking);
-      if (this.isEnlarged) this.looking = setTimeout(() => void this.look(), LOOKS_MS);
+      if (this.isEnlarged) this.looking = setTimeout(() => void this.lookAgain(), LOOKS_MS);
     }
-    /** Lay the finished picture's own pixels over the preview, where that is too coarse. */
-    async look() {
+    async lookAgain() {
+      if (!this.before.hidden) await this.look(this.sharpBefore);
+      await this.look(this.sharp);
+    }
+    /** Lay the own pixels of the finished picture, or of the photograph, over the preview, where that is too coarse. */
+    async look(sharp) {
       const [timer, photo] = [this.looking, studio.told.photo];
-      if (this.stage.clientWidth * devicePixelRatio < COARSE * this.picture.width || this.picture.width >= photo.width_px) return;
+      const coarse = this.stage.clientWidth * devicePixelRatio > COARSE * this.picture.width && this.picture.width < photo.width_px;
+      if (!coarse || !this.isEnlarged) return;
       const [left, top, right2, bottom] = this.inSight;
       const side = Math.min(LARGEST_PX, Math.ceil(Math.max(right2 - left, bottom - top)) + 2);
       const [x, y] = [Math.round((left + right2) / 2), Math.round((top + bottom) / 2)];
-      const bitmap = await studio.region(x, y, side).catch(() => null);
-      if (!bitmap || timer !== this.looking) return;
-      [this.sharp.width, this.sharp.height] = [side, side];
-      this.sharp.getContext("2d").drawImage(bitmap, 0, 0);
-      const corner = [x - Math.floor(side / 2), y - Math.floor(side / 2)];
+      const isBefore = sharp === this.sharpBefore;
+      const bitmap = await studio.region(x, y, side, isBefore).catch(() => null);
+      if (!bitmap || timer !== this.looking || isBefore && this.before.hidden) return;
+      [sharp.width, sharp.height] = [side, side];
+      sharp.getContext("2d").drawImage(bitmap, 0, 0);
       const percent = (value, most) => `${100 * value / most}%`;
-      Object.assign(this.sharp.style, { left: percent(corner[0], photo.width_px), top: percent(corner[1], photo.height_px), width: percent(side, photo.width_px), height: percent(side, photo.height_px) });
-      this.sharp.hidden = false;
+      const [across, down] = [x - Math.floor(side / 2), y - Math.floor(side / 2)];
+      Object.assign(sharp.style, { left: percent(across, photo.width_px), top: percent(down, photo.height_px), width: percent(side, photo.width_px), height: percent(side, photo.height_px) });
+      sharp.hidden = false;
     }
   };
   var Loupe = class {
@@ -1304,11 +1322,13 @@
       this.stage.hidden = !photo;
       byId("welcome").hidden = Boolean(photo);
       if (!photo) return;
-      const name = `${photo.name} ${studio.told?.state.photo} ${photo.slice ?? ""} ${photo.width_px}`;
+      const of = `${photo.name} ${studio.told?.state.photo} ${photo.width_px}`;
+      const name = `${of} ${photo.slice ?? ""}`;
       if (name !== this.photoName) {
+        if (this.photoName.startsWith(`${of} `)) this.view.lookAnew();
+        else this.view.reset();
         this.photoName = name;
         this.hint = "";
-        this.view.reset();
         this.before.src = `/photo?of=${encodeURIComponent(name)}`;
         this.before.decode().then(() => studio.isComplete || this.showPhotograph()).catch(() => void 0);
       }
@@ -1568,6 +1588,7 @@
       const hold = byId("hold_before");
       const show = (on) => {
         this.before.hidden = !on && byId("brush_hide").getAttribute("aria-pressed") !== "true";
+        studio.dispatchEvent(new Event("before"));
       };
       hold.addEventListener("pointerdown", () => show(true));
       for (const end of ["pointerup", "pointercancel", "pointerleave", "blur"]) hold.addEventListener(end, () => show(false));

@@ -172,9 +172,10 @@ class StudioSite:
         return web.json_response(self._told())
 
     async def _preview(self, request: web.Request) -> web.Response:
-        """Handle POST /preview: {"changes", "draft", "pixels", "page", "region"}; the answer is a length, JSON of that length, and a JPEG.
+        """Handle POST /preview: {"changes", "draft", "pixels", "page", "region", "before"}; the answer is a length, JSON of that length,
+        and a JPEG.
 
-        204 says that the page has asked for a newer picture since.
+        before: the photograph as it is, in a region; so it is where no object stands yet. 204 says that the page has asked for a newer picture since.
         """
         from viewfinder.studio.preview import Previewer, Wish
 
@@ -186,7 +187,8 @@ class StudioSite:
             raise InputError(f"expected how many pixels the screen shows, got {str(pixels)[:20]!r}: load the page again")
         state, opened = self.desk.changed_state(message.get("changes") or {}), self._opened()
         region = _region_of(message.get("region"))
-        options = None if region is not None and not state.is_complete else options_of(placed_state(state, opened))
+        as_it_is = region is not None and (message.get("before") is True or not state.is_complete)
+        options = None if as_it_is else options_of(placed_state(state, opened))
         if draft not in self._previewers:
             self._previewers[draft] = Previewer("studio drafts" if draft else "studio previews")
         wish = Wish(photograph=opened, options=options, most_px=min(float(pixels), _LARGEST_SCREEN_PX), draft=draft, region=region)

@@ -307,10 +307,10 @@ export class Studio extends EventTarget {
     if (change === this.changes) await this.ask(false, change);
   }
 
-  /** The part of the finished picture around a pixel, as the loupe shows it; null where another one was asked for since. */
-  async region(x_px: number, y_px: number, side_px: number): Promise<ImageBitmap | null> {
+  /** The part of the finished picture, or of the photograph as it is, around a pixel; null where another one was asked for since. */
+  async region(x_px: number, y_px: number, side_px: number, before = false): Promise<ImageBitmap | null> {
     const region = [x_px, y_px, side_px, this.shown?.coc_px[1] ?? 0];
-    const message = { changes: { ...this.sending, ...this.local }, pixels: this.pixels, page: pageName, region };
+    const message = { changes: { ...this.sending, ...this.local }, pixels: this.pixels, page: before ? `${pageName}b` : pageName, region, before };
     const answer = await fetch("/preview", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(message) });
     if (answer.status !== 200) return null;
     const body = await answer.arrayBuffer();

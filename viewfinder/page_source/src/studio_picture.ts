@@ -52,11 +52,14 @@ export class PictureStage {
     this.stage.hidden = !photo;
     byId<HTMLElement>("welcome").hidden = Boolean(photo);
     if (!photo) return;
-    const name = `${photo.name} ${studio.told?.state.photo} ${photo.slice ?? ""} ${photo.width_px}`;
+    const of = `${photo.name} ${studio.told?.state.photo} ${photo.width_px}`;
+    const name = `${of} ${photo.slice ?? ""}`;
     if (name !== this.photoName) {
+      // Slices of one stack are compared at the same place.
+      if (this.photoName.startsWith(`${of} `)) this.view.lookAnew();
+      else this.view.reset();
       this.photoName = name;
       this.hint = "";
-      this.view.reset();
       this.before.src = `/photo?of=${encodeURIComponent(name)}`;
       this.before.decode().then(() => studio.isComplete || this.showPhotograph()).catch(() => undefined);
     }
@@ -339,6 +342,7 @@ export class PictureStage {
     const hold = byId<HTMLElement>("hold_before");
     const show = (on: boolean): void => {
       this.before.hidden = !on && byId("brush_hide").getAttribute("aria-pressed") !== "true";
+      studio.dispatchEvent(new Event("before"));
     };
     hold.addEventListener("pointerdown", () => show(true));
     for (const end of ["pointerup", "pointercancel", "pointerleave", "blur"]) hold.addEventListener(end, () => show(false));

@@ -13,16 +13,20 @@ export class View {
   private readonly stage = byId<HTMLElement>("stage");
   private readonly picture = byId<HTMLCanvasElement>("picture");
   private readonly sharp = byId<HTMLCanvasElement>("sharp");
+  private readonly sharpBefore = byId<HTMLCanvasElement>("sharp_before");
+  private readonly before = byId<HTMLImageElement>("before");
   private readonly button = byId<HTMLElement>("zoom");
   /** Times the fitted size, and what of the photograph lies in the middle of the window, in shares of it. */
   private times = 1;
   private middle: Pair = [0.5, 0.5];
+  private laid = "";
   private looking: ReturnType<typeof setTimeout> | undefined;
 
   constructor() {
     this.button.addEventListener("click", () => (this.isEnlarged ? this.reset() : this.enlarge()));
     studio.addEventListener("state", () => studio.isComplete && (this.sharp.hidden = true));
     studio.addEventListener("picture", () => studio.shown?.draft || this.lookLater());
+    studio.addEventListener("before", () => this.before.hidden ? (this.sharpBefore.hidden = true) : void this.look(this.sharpBefore));
   }
 
   get isEnlarged(): boolean {
@@ -59,7 +63,10 @@ export class View {
     told.hidden = !this.isEnlarged;
     told.textContent = `${Math.round(100 * this.scale)} %`;
     studio.dispatchEvent(new Event("view"));
-    this.lookLater();
+    // News of the server leave the picture where it is.
+    const laid = `${width} ${left} ${top}`;
+    if (laid !== this.laid) this.lookLater();
+    this.laid = laid;
   }
 
   /** Enlarge about a point of the window, which moved by (dx, dy): what lies under it stays there. */
@@ -77,7 +84,7 @@ export class View {
 
   reset(): void {
     [this.times, this.middle] = [1, [0.5, 0.5]];
-    this.sharp.hidden = true;
+    this.sharp.hidden = this.sharpBefore.hidden = true;
     if (studio.told?.photo) this.fit();
   }
 
@@ -114,26 +121,39 @@ export class View {
     this.fit();
   }
 
-  private lookLater(): void {
-    clearTimeout(this.looking);
-    if (this.isEnlarged) this.looking = setTimeout(() => void this.look(), LOOKS_MS);
+  /** What is shown is of another picture than before. */
+  lookAnew(): void {
+    this.sharp.hidden = this.sharpBefore.hidden = true;
+    this.lookLater();
   }
 
-  /** Lay the finished picture's own pixels over the preview, where that is too coarse. */
-  private async look(): Promise<void> {
+  private lookLater(): void {
+    clearTimeout(this.looking);
+    if (this.isEnlarged) this.looking = setTimeout(() => void this.lookAgain(), LOOKS_MS);
+  }
+
+  private async lookAgain(): Promise<void> {
+    if (!this.before.hidden) await this.look(this.sharpBefore);
+    await this.look(this.sharp);
+  }
+
+  /** Lay the own pixels of the finished picture, or of the photograph, over the preview, where that is too coarse. */
+  private async look(sharp: HTMLCanvasElement): Promise<void> {
     const [timer, photo] = [this.looking, studio.told!.photo!];
-    if (this.stage.clientWidth * devicePixelRatio < COARSE * this.picture.width || this.picture.width >= photo.width_px) return;
+    const coarse = this.stage.clientWidth * devicePixelRatio > COARSE * this.picture.width && this.picture.width < photo.width_px;
+    if (!coarse || !this.isEnlarged) return;
     const [left, top, right, bottom] = this.inSight;
     const side = Math.min(LARGEST_PX, Math.ceil(Math.max(right - left, bottom - top)) + 2);
     const [x, y] = [Math.round((left + right) / 2), Math.round((top + bottom) / 2)];
-    const bitmap = await studio.region(x, y, side).catch(() => null);
-    if (!bitmap || timer !== this.looking) return;
-    [this.sharp.width, this.sharp.height] = [side, side];
-    this.sharp.getContext("2d")!.drawImage(bitmap, 0, 0);
-    const corner = [x - Math.floor(side / 2), y - Math.floor(side / 2)] as const;
+    const isBefore = sharp === this.sharpBefore;
+    const bitmap = await studio.region(x, y, side, isBefore).catch(() => null);
+    if (!bitmap || timer !== this.looking || (isBefore && this.before.hidden)) return;
+    [sharp.width, sharp.height] = [side, side];
+    sharp.getContext("2d")!.drawImage(bitmap, 0, 0);
     const percent = (value: number, most: number): string => `${(100 * value) / most}%`;
-    Object.assign(this.sharp.style, { left: percent(corner[0], photo.width_px), top: percent(corner[1], photo.height_px), width: percent(side, photo.width_px), height: percent(side, photo.height_px) });
-    this.sharp.hidden = false;
+    const [across, down] = [x - Math.floor(side / 2), y - Math.floor(side / 2)];
+    Object.assign(sharp.style, { left: percent(across, photo.width_px), top: percent(down, photo.height_px), width: percent(side, photo.width_px), height: percent(side, photo.height_px) });
+    sharp.hidden = false;
   }
 }
 
