@@ -116,7 +116,7 @@ def _object_layers(options: ObjectOptions, rendering: RenderingOptions, first: P
     contrast = 1.0 if options.plain else first.shadow_contrast
     filming = replace(rendering.of_photograph.filming(), catches=catches, caught_share=shadow, caught_contrast=contrast)
     placed = objects_of(options, first, shadow)
-    light = _light(options, first, options.first_px if options.at_pixel else _pixel_of(first.camera, placed[0].stands_at_m), kept)
+    light = light_of(options, first, options.first_px if options.at_pixel else _pixel_of(first.camera, placed[0].stands_at_m), kept)
     placed = [replace(each, light=light) for each in placed]
     grounds = _grounds(placed)
 
@@ -208,7 +208,7 @@ def held_upright(plate: Plate, options: ObjectOptions) -> Plate:
     return held_as_told(replace(plate, world_from_camera=found), options)
 
 
-def _light(options: ObjectOptions, plate: Plate, foot_px: tuple[float, float], kept: "KeptParts | None") -> "Lighting":
+def light_of(options: ObjectOptions, plate: Plate, foot_px: tuple[float, float], kept: "KeptParts | None") -> "Lighting":
     """Return the light of objects: its panorama, even light, or what the photograph tells of it."""
     from mrbokeh.compositing.plate_light import is_sunlit, picture_light
     from mrbokeh.scene.staging.scene_description import Lighting

@@ -13,8 +13,13 @@ from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.tracking.camera_track.formats import write_track
+from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
+from mrbokeh.video.picture_source import open_source
+from tests.support.live_clip import write_live_clip
 from tests.support.made_studio import ALIEN, CAKE, HEIGHT, WIDTH, MadeStudio, made_studio, write_floor
 from tests.support.waiting import comes_true
+from viewfinder.studio.clip import clip_state
 from viewfinder.studio.state import StudioState
 
 pytestmark = [
@@ -584,6 +589,39 @@ async def test_light_lens_and_before_are_shown(tmp_path: Path) -> None:
         await page.send("Input.dispatchMouseEvent", type="mouseMoved", x=left + width / 2, y=top + 0.7 * height)
         await page.comes_true("Number(document.getElementById('loupe').dataset.looked) > 0", 30.0)
         assert (await page.box("#loupe"))[2] == 240
+        assert page.errors == []
+
+
+@pytest.mark.parametrize("size_px", [DESK, UPRIGHT, LEVEL], ids=["desk", "upright", "level"])
+async def test_a_clip_shows_its_track_and_is_filmed(tmp_path: Path, size_px: tuple[int, int]) -> None:
+    """The path of the object's foot through the frames follows where it stands; saved is what `mrbokeh video` makes of it."""
+    clip = write_live_clip(tmp_path, WIDTH, HEIGHT, 3)
+    write_track(tmp_path / "track.json", CameraTrack({number: TrackedFrame(each) for number, each in enumerate(clip.cameras)}))
+    first = clip_state(clip.path, tmp_path / "track.json", tmp_path / "studio_files", StudioState())
+    async with opened(tmp_path, size_px, first) as (page, made):
+        hidden = "[...document.querySelectorAll('.of_still')].every((each) => each.hidden)"
+        assert await page.value(hidden), "the track says how the camera was held"
+        await placed(page, made, 0.5, 0.6)
+        above_m = -clip.cameras[0].world_from_camera[2, 3]
+        assert made.desk.state.camera_height_m == pytest.approx(above_m, rel=1e-3) and made.desk.state.pitch_deg is None
+        drawn = "(document.querySelector('#ground .track')?.getAttribute('d') ?? '')"
+        await page.comes_true(f"{drawn}.length && studio.told.clip.command")
+        path = await page.value(drawn)
+        assert path.count("L") == len(clip.plates) - 1
+        left, top, width, height = await page.box("#stage")
+        await dragged(page, (left + 0.5 * width, top + 0.55 * height), (0.1 * width, 0.05 * height), mouse=size_px == DESK)
+        await page.comes_true(f"!studio.isChanging && studio.told.clip.command && {drawn}.length && {drawn} !== '{path}'", 30.0)
+        start = await page.value(f"{drawn}.match(/-?[0-9.]+/g).slice(0, 2).map(Number)")
+        assert start == pytest.approx(made.desk.state.at_px, abs=0.2)
+        commands = (await page.value("document.getElementById('command').textContent")).split("\n\n")
+        assert [each.split()[1] for each in commands] == ["video", "composite"] and str(tmp_path / "track.json") in commands[0]
+        if size_px == DESK:
+            await page.tap("[data-format=clip]")
+            await page.comes_true("studio.told.saves[0]?.state === 'done'", 60.0)
+            filmed = list(open_source(tmp_path / "board_mrbokeh.mp4").frames(0, 4, 1))
+            assert len(filmed) == len(clip.plates) and filmed[0].rgb.shape == (HEIGHT, WIDTH, 3)
+            assert (np.abs(filmed[0].rgb - read_image(first.photo)).max(axis=2) > 0.05).sum() > 300  # type: ignore[arg-type]
+            assert commands[0] == made.desk.saves.told()[0]["command"]
         assert page.errors == []
 
 

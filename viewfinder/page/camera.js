@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 16837f92e72e2006019152fffa2ca8626c85fd958aa812f129f16f4fa5dc9b42
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 6cba12dc0a0ff3eca355fa547f1d7475b88cfcb9e09dc24fa68b1afdffe2d3fb
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 16837f92e72e2006019152fffa2ca8626c85fd958aa812f129f16f4fa5dc9b42
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 6cba12dc0a0ff3eca355fa547f1d7475b88cfcb9e09dc24fa68b1afdffe2d3fb
 "use strict";
 (() => {
   // src/model.ts
@@ -450,7 +450,7 @@
 
   // src/studio_panel.ts
   var F_NUMBERS = [1, 1.2, 1.4, 1.8, 2, 2.2, 2.4, 2.8, 3.2, 3.5, 4, 4.5, 5, 5.6, 6.3, 7.1, 8, 9, 10, 11, 13, 14, 16, 18, 20, 22, 25, 29, 32];
-  var LONG_FORMATS = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers" };
+  var LONG_FORMATS = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers", clip: "Clip, MP4" };
   var DEFAULT_SUN = [-125, 50];
   var DAYLIGHT_MIRED = 1e6 / 6504;
   var nearestF = (f_number) => {
@@ -635,6 +635,7 @@
       byId("camera_found").disabled = told.camera?.file === void 0;
       byId("plain").disabled = Boolean(told.photo && !told.photo.has_depth && !told.state.plain);
       const photo = told.photo;
+      document.querySelectorAll(".of_still").forEach((each) => each.hidden = told.clip !== null);
       byId("slice_row").hidden = photo?.slices === void 0;
       document.querySelectorAll(".of_one").forEach((each) => each.hidden = photo?.slices !== void 0);
       if (photo?.slices !== void 0) {
@@ -659,7 +660,9 @@
         lenses.append(lensChoice("", "as the photograph tells", null), ...told.lenses.map((each, i) => lensChoice(each.path, each.name, i)));
       }
       const formats = byId("formats");
-      if (!formats.childElementCount) {
+      if (formats.dataset.shown !== String(told.formats)) {
+        formats.dataset.shown = String(told.formats);
+        formats.replaceChildren();
         for (const format of told.formats) {
           const button = document.createElement("button");
           button.textContent = LONG_FORMATS[format] ?? format;
@@ -704,9 +707,14 @@
       lamp.setAttribute("cx", String(reach * Math.sin(turn * Math.PI / 180)));
       lamp.setAttribute("cy", String(-reach * Math.cos(turn * Math.PI / 180)));
       byId("dome").classList.toggle("off", state.sun_deg === null);
-      byId("command").textContent = (studio.isChanging ? studio.shown?.command : studio.told?.command) ?? "Place an object first.";
+      byId("command").textContent = this.commands((studio.isChanging ? studio.shown?.command : studio.told?.command) ?? null);
       document.querySelectorAll("#formats button").forEach((each) => each.disabled = !studio.isComplete);
       byId("focus_told").textContent = focusTold(state);
+    }
+    /** The command of the picture, and before it that of the whole clip. */
+    commands(picture) {
+      const clip = studio.told?.clip && !studio.isChanging ? studio.told.clip.command : null;
+      return [...clip ? [clip] : [], picture ?? "Place an object first."].join("\n\n");
     }
     fill(id, text) {
       const input = byId(id);
@@ -717,7 +725,7 @@
       byId("guessed").replaceChildren(
         ...[...groundTold(), ...shown.guessed, ...shown.warnings].map((sentence) => Object.assign(document.createElement("li"), { textContent: sentence }))
       );
-      if (studio.isChanging) byId("command").textContent = shown.command ?? "";
+      if (studio.isChanging) byId("command").textContent = this.commands(shown.command);
       if (studio.state) byId("focus_told").textContent = focusTold(studio.state);
     }
   };
@@ -733,7 +741,7 @@
     return { ...changes, height: state.at_px && scaled({ at_px: state.at_px, height: state.height }), before: all(state.before), after: all(state.after) };
   }
   function heightNote(state) {
-    const by = state.measured ? ", by the known height" : " (see below)";
+    const by = studio.told?.clip ? ", by the track" : state.measured ? ", by the known height" : " (see below)";
     const guessed = state.camera_height_m && !studio.told?.photo?.has_depth ? ` for a camera ${state.camera_height_m} m above the ground${by}` : "";
     return `Metres${guessed}, or pixels such as 120px. Wheel, pinch, + and - scale it.`;
   }
@@ -1373,6 +1381,8 @@
           const radius_m = box2 ? ground.length_m(each.at_px, 0.5 * (box2[2] - box2[0]) * photo.width_px) : ground.cell_m / 2;
           this.path(number === state.before.length ? "foot" : "foot other", ground.circle(each.at_px, radius_m));
         });
+        const seen = studio.isChanging ? [] : studio.told?.clip?.path_px ?? [];
+        if (seen.length) this.path("track", seen.map(([x, y], i) => `${i ? "L" : "M"}${x} ${y}`).join(""));
         const [left, , right2, bottom] = this.view.inSight;
         this.words(`one square: ${ground.cell_m} m`, left + 0.015 * (right2 - left), bottom - 0.015 * (right2 - left), this.px);
       }
@@ -1502,6 +1512,7 @@
       if (!studio.state?.object) return studio.say("choose an object first: in the list at the right, or drop a GLB file");
       const ground = groundOf(studio.told.photo, studio.state);
       if (!ground || ground.isInSight) return void studio.commit({ at_px: this.inside(this.pixel(x, y)) });
+      if (studio.told.clip) return studio.say("the first frame shows no ground of the track's world: begin the clip where it does");
       const at_px = this.pixel(x, y);
       void studio.commit({ at_px, camera: null, pitch_deg: ground.usualTilt_deg(at_px) });
       this.hint = "the camera looks up, so that no ground is in sight: another tilt is taken, see Camera and ground";

@@ -3,6 +3,7 @@
 import asyncio
 import logging
 import re
+import shlex
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import suppress
 from dataclasses import replace
@@ -46,6 +47,8 @@ class Desk:
         self._drawn: tuple[object, dict[str, Any]] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._tools = asyncio.Lock()
+        self._filming = asyncio.Lock()
+        self._filmed: tuple[StudioState, list[str], list[Pair]] | None = None
         self._metres_typed = False
         self._brush: tuple[Path, Brush] | None = None
 
@@ -111,6 +114,8 @@ class Desk:
             "object": [*self.project.objects],
             "lens": [*self.project.lenses],
             "photo": [self.state.photo],
+            "clip": [self.state.clip],
+            "track": [self.state.track],
             "depth": [self.state.depth],
             "matte": [self.state.matte],
             "camera": [self.state.camera, Path(found) if found else None],
@@ -250,6 +255,38 @@ class Desk:
             why = f"the project could not be kept in {self.project.path} ({error.strerror})"
             self.problem = f"{why}: make room, or the last changes are lost"
         self.tell_all()
+        if self.state.clip is not None:
+            self._begin(self.film())
+
+    async def film(self) -> None:
+        """Write the scene of a clip's state, so that `mrbokeh video` films what is shown."""
+        async with self._filming:
+            state, opened = self.state, self.photograph
+            if state.clip is None or opened is None or not state.is_complete or (self._filmed is not None and self._filmed[0] == state):
+                return
+            try:
+                words, seen = await asyncio.to_thread(_filmed, state, opened, self.uploads)
+            except (InputError, OSError) as error:
+                self.problem = str(error)
+            else:
+                self._filmed = state, words, seen
+        self.tell_all()
+
+    def clip_told(self) -> dict[str, Any] | None:
+        """Return a clip's name, the command that films it, and where the chosen object's foot is seen in it; None for a photograph."""
+        if self.state.clip is None:
+            return None
+        if self._filmed is None or self._filmed[0] != self.state:
+            return {"name": self.state.clip.name, "command": None, "path_px": []}
+        words = self.saves.clip_words(self.state.clip, self._filmed[1])
+        return {"name": self.state.clip.name, "command": shlex.join(["mrbokeh", *words]), "path_px": self._filmed[2]}
+
+    async def save_clip(self) -> None:
+        """Start to film the clip. Raises InputError if there is none, or nothing stands in it."""
+        await self.film()
+        if self.state.clip is None or self._filmed is None or self._filmed[0] != self.state:
+            raise InputError(self.problem or "there is nothing to film yet: open a clip with the track of its camera, and place an object")
+        self.saves.start_clip(self.state.clip, self._filmed[1])
 
     def _begin(self, work: Any) -> None:
         task = asyncio.get_running_loop().create_task(work)
@@ -273,6 +310,8 @@ class Desk:
                 if (self.state.photo, self.state.depth, self.state.slice) == (path, depth, state.slice):
                     self.project.amend(lambda state: replace(state, slice=opened.slice))
                     self._keep()
+            if state.clip is not None:
+                self._cameras.setdefault(path, {})
             self.busy = "looking for the camera in the picture's lines" if path not in self._cameras else ""
             self.tell_all()
             if path not in self._cameras:
@@ -281,6 +320,7 @@ class Desk:
                 )
                 self._take_camera(path)
             await self._complete()
+            await self.film()
         except InputError as error:
             self.problem = str(error)
         except Exception as error:
@@ -343,6 +383,13 @@ def _opened_photograph(
             return str(error)
 
     return opened, camera
+
+
+def _filmed(state: StudioState, opened: "OpenedPhotograph", folder: Path) -> tuple[list[str], list[Pair]]:
+    """Write a clip's scene; return the words that film it, and the path of the chosen object's foot through its frames."""
+    from viewfinder.studio.clip import clip_words, path_px
+
+    return clip_words(state, opened, folder), path_px(state)
 
 
 def _require_measured(state: StudioState, opened: "OpenedPhotograph | None") -> None:

@@ -55,7 +55,7 @@ def preview_of(photograph: OpenedPhotograph, options: CompositeOptions, kept: Ke
         plate, small = placed(plate, small, known_height_m)
         if kept.draft and plate.depth_m is not None:
             small = replace(small, virtual=replace(small.virtual, mode="over"))
-        finishing = white_balanced(small.look.wanted) if kept.draft else _finishing(photograph, plate, small)
+        finishing = white_balanced(small.look.wanted) if kept.draft else finishing_by(photograph, plate, small)
         made = composited(plate, small, renderer, finishing, kept=kept, asked=options.standing)
         plate, sharp = made.plate, made.sharp
         blur, _known, figures = blur_told(plate, sharp)
@@ -71,7 +71,7 @@ def preview_of(photograph: OpenedPhotograph, options: CompositeOptions, kept: Ke
     return Preview(made.inserted.rgb, told)
 
 
-def _finishing(photograph: OpenedPhotograph, plate: Plate, options: CompositeOptions) -> Finishing:
+def finishing_by(photograph: OpenedPhotograph, plate: Plate, options: CompositeOptions) -> Finishing:
     """Return what makes the object look photographed, measured once for each size of the photograph.
 
     A photograph made smaller shows no trace of its compression.

@@ -17,7 +17,7 @@ from viewfinder.server.access import Access, error, json_value, message_body
 from viewfinder.server.site import page_routes
 from viewfinder.studio.command_line import command_line, options_of
 from viewfinder.studio.desk import LARGEST, Desk, placed_state
-from viewfinder.studio.saving import FORMATS
+from viewfinder.studio.saving import CLIP, FORMATS
 from viewfinder.studio.state import StudioState, shadow_of, stroke_of
 
 if TYPE_CHECKING:
@@ -36,7 +36,7 @@ _LARGEST_SCREEN_PX = 1e6
 _FEW_PX = 1e4
 _LARGEST_REGION_PX = 1600
 _PAGE_NAME = re.compile(r"\w{1,40}", re.ASCII)
-_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".tif": "image/tiff", ".exr": "image/x-exr"}
+_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".tif": "image/tiff", ".exr": "image/x-exr", ".mp4": "video/mp4"}
 
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -97,7 +97,8 @@ class StudioSite:
             "objects": [{"path": str(each), "name": each.stem} for each in project.objects],
             "lenses": [{"path": str(each), "name": each.stem} for each in project.lenses],
             "saves": desk.saves.told(),
-            "formats": list(FORMATS),
+            "formats": [*FORMATS, *([CLIP] if desk.state.clip is not None else [])],
+            "clip": desk.clip_told(),
             "format": desk.saves.format,
             "project": str(project.path.absolute()),
             "largest": LARGEST,
@@ -116,7 +117,7 @@ class StudioSite:
             return None
         assert state.photo is not None
         return command_line(
-            options_of(placed_state(state, opened)), self.desk.saves.free_name(state.photo, FORMATS[self.desk.saves.format])
+            options_of(placed_state(state, opened)), self.desk.saves.free_name(state.photo, FORMATS.get(self.desk.saves.format, ".png"))
         )
 
     async def _photo(self, _request: web.Request) -> web.Response:
@@ -175,7 +176,8 @@ class StudioSite:
         """Handle POST /preview: {"changes", "draft", "pixels", "page", "region", "before"}; the answer is a length, JSON of that length,
         and a JPEG.
 
-        before: the photograph as it is, in a region; so it is where no object stands yet. 204 says that the page has asked for a newer picture since.
+        before: the photograph as it is, in a region; so it is where no object stands yet. 204 says that the page has asked for a newer
+        picture since.
         """
         from viewfinder.studio.preview import Previewer, Wish
 
@@ -208,8 +210,12 @@ class StudioSite:
         return web.json_response(self._told())
 
     async def _save(self, request: web.Request) -> web.Response:
-        """Handle POST /save: {"format": one of FORMATS}."""
+        """Handle POST /save: {"format": one of FORMATS, or CLIP}."""
         kind = (await _message(request)).get("format")
+        if kind == CLIP:
+            await self.desk.save_clip()
+            self.desk.tell_all()
+            return web.json_response(self._told())
         self.desk.saves.start(options_of(placed_state(self.desk.state, self._opened())), kind)
         self.desk.tell_all()
         return web.json_response(self._told())

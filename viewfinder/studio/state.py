@@ -37,7 +37,8 @@ class Placed:
 class StudioState:
     """State of the studio; None leaves a thing to the command's own default.
 
-    photo: a photograph, or the folder of a focal stack, of which slice counts the pictures from 0. matte: what of the photograph the brush
+    photo: a photograph, or the folder of a focal stack, of which slice counts the pictures from 0; of a clip its first frame, and track
+    is the file of its cameras. matte: what of the photograph the brush
     says is in front. object, at_px, height, turn_deg: of the chosen object; before, after: those that come before and after it in the
     command line. at_px: where it stands, in pixels of the whole photograph. height: metres such as "0.3", or pixels such as "120px".
     focus_at_px: the pixel that is in focus, where the photograph has depth; focus_m otherwise. sun_deg: where the main light comes from,
@@ -49,6 +50,8 @@ class StudioState:
     """
 
     photo: Path | None = None
+    clip: Path | None = None
+    track: Path | None = None
     slice: int | None = None
     depth: Path | None = None
     matte: Path | None = None
@@ -272,6 +275,8 @@ def _shown(value: Any) -> str:
 _PIXELS, _MOST_OBJECTS, _MOST_POINTS, _MOST_LINES = (0.0, 200_000.0), 50, 2000, 60
 _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "photo": _path,
+    "clip": _path,
+    "track": _path,
     "slice": _whole(0, 100_000),
     "depth": _path,
     "matte": _path,

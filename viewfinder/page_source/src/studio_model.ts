@@ -23,6 +23,8 @@ export interface Placed {
 /** The state as the server keeps it; null leaves a thing to the command's own default. Object, place, height and turn are the chosen one's. */
 export interface State {
   photo: string | null;
+  clip: string | null;
+  track: string | null;
   slice: number | null;
   matte: string | null;
   object: string | null;
@@ -103,6 +105,8 @@ export interface Told {
   camera: { told: string; file?: string } | null;
   command: string | null;
   photo: Photo | null;
+  /** Of a clip: the command that films it, and where the chosen object's foot is seen in its frames. */
+  clip: { name: string; command: string | null; path_px: Pair[] } | null;
 }
 
 export type Box = [number, number, number, number];

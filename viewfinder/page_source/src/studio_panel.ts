@@ -3,7 +3,7 @@ import { groundOf } from "./studio_ground";
 import { byId, type Pair, type Placed, type Save, scaledHeight, type State, studio } from "./studio_model";
 
 const F_NUMBERS = [1, 1.2, 1.4, 1.8, 2, 2.2, 2.4, 2.8, 3.2, 3.5, 4, 4.5, 5, 5.6, 6.3, 7.1, 8, 9, 10, 11, 13, 14, 16, 18, 20, 22, 25, 29, 32];
-const LONG_FORMATS: Record<string, string> = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers" };
+const LONG_FORMATS: Record<string, string> = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers", clip: "Clip, MP4" };
 /** As the server guesses where only the exposure tells of the sun. */
 const DEFAULT_SUN: Pair = [-125, 50];
 
@@ -219,6 +219,8 @@ export class Panel {
     byId<HTMLButtonElement>("camera_found").disabled = told.camera?.file === undefined;
     byId<HTMLInputElement>("plain").disabled = Boolean(told.photo && !told.photo.has_depth && !told.state.plain);
     const photo = told.photo;
+    // How a clip's camera was held, and how much light its ground loses, its track and its scene say.
+    document.querySelectorAll<HTMLElement>(".of_still").forEach((each) => (each.hidden = told.clip !== null));
     byId<HTMLElement>("slice_row").hidden = photo?.slices === undefined;
     document.querySelectorAll<HTMLElement>(".of_one").forEach((each) => (each.hidden = photo?.slices !== undefined));
     if (photo?.slices !== undefined) {
@@ -244,7 +246,9 @@ export class Panel {
       lenses.append(lensChoice("", "as the photograph tells", null), ...told.lenses.map((each, i) => lensChoice(each.path, each.name, i)));
     }
     const formats = byId<HTMLElement>("formats");
-    if (!formats.childElementCount) {
+    if (formats.dataset.shown !== String(told.formats)) {
+      formats.dataset.shown = String(told.formats);
+      formats.replaceChildren();
       for (const format of told.formats) {
         const button = document.createElement("button");
         button.textContent = LONG_FORMATS[format] ?? format;
@@ -291,9 +295,15 @@ export class Panel {
     lamp.setAttribute("cx", String(reach * Math.sin((turn * Math.PI) / 180)));
     lamp.setAttribute("cy", String(-reach * Math.cos((turn * Math.PI) / 180)));
     byId("dome").classList.toggle("off", state.sun_deg === null);
-    byId("command").textContent = (studio.isChanging ? studio.shown?.command : studio.told?.command) ?? "Place an object first.";
+    byId("command").textContent = this.commands((studio.isChanging ? studio.shown?.command : studio.told?.command) ?? null);
     document.querySelectorAll<HTMLButtonElement>("#formats button").forEach((each) => (each.disabled = !studio.isComplete));
     byId("focus_told").textContent = focusTold(state);
+  }
+
+  /** The command of the picture, and before it that of the whole clip. */
+  private commands(picture: string | null): string {
+    const clip = studio.told?.clip && !studio.isChanging ? studio.told.clip.command : null;
+    return [...(clip ? [clip] : []), picture ?? "Place an object first."].join("\n\n");
   }
 
   private fill(id: string, text: string): void {
@@ -306,7 +316,7 @@ export class Panel {
     byId("guessed").replaceChildren(
       ...[...groundTold(), ...shown.guessed, ...shown.warnings].map((sentence) => Object.assign(document.createElement("li"), { textContent: sentence })),
     );
-    if (studio.isChanging) byId("command").textContent = shown.command ?? "";
+    if (studio.isChanging) byId("command").textContent = this.commands(shown.command);
     if (studio.state) byId("focus_told").textContent = focusTold(studio.state);
   }
 }
@@ -326,7 +336,7 @@ function keepingSizes(changes: Partial<State>): Partial<State> {
 
 /** What the number of the height counts. */
 function heightNote(state: State): string {
-  const by = state.measured ? ", by the known height" : " (see below)";
+  const by = studio.told?.clip ? ", by the track" : state.measured ? ", by the known height" : " (see below)";
   const guessed = state.camera_height_m && !studio.told?.photo?.has_depth ? ` for a camera ${state.camera_height_m} m above the ground${by}` : "";
   return `Metres${guessed}, or pixels such as 120px. Wheel, pinch, + and - scale it.`;
 }

@@ -108,6 +108,8 @@ export class PictureStage {
         const radius_m = box ? ground.length_m(each.at_px, 0.5 * (box[2] - box[0]) * photo.width_px) : ground.cell_m / 2;
         this.path(number === state.before.length ? "foot" : "foot other", ground.circle(each.at_px, radius_m));
       });
+      const seen = studio.isChanging ? [] : studio.told?.clip?.path_px ?? [];
+      if (seen.length) this.path("track", seen.map(([x, y], i) => `${i ? "L" : "M"}${x} ${y}`).join(""));
       const [left, , right, bottom] = this.view.inSight;
       this.words(`one square: ${ground.cell_m} m`, left + 0.015 * (right - left), bottom - 0.015 * (right - left), this.px);
     }
@@ -249,6 +251,7 @@ export class PictureStage {
     if (!studio.state?.object) return studio.say("choose an object first: in the list at the right, or drop a GLB file");
     const ground = groundOf(studio.told.photo, studio.state);
     if (!ground || ground.isInSight) return void studio.commit({ at_px: this.inside(this.pixel(x, y)) });
+    if (studio.told.clip) return studio.say("the first frame shows no ground of the track's world: begin the clip where it does");
     const at_px = this.pixel(x, y);
     void studio.commit({ at_px, camera: null, pitch_deg: ground.usualTilt_deg(at_px) });
     this.hint = "the camera looks up, so that no ground is in sight: another tilt is taken, see Camera and ground";
