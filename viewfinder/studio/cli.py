@@ -61,6 +61,8 @@ def studio(
 
     Example: mrbokeh studio SCENE/view_2 --object cake.glb
 
+    Example: mrbokeh studio clip.mp4 --camera track.json --object cake.glb
+
     Example: mrbokeh studio photo.studio.json --lan
     """
     say("mrbokeh studio starts")
@@ -69,6 +71,13 @@ def studio(
     listening = ListeningOptions(port=port, lan=lan, interface=interface, tls=tls, tls_key=tls_key, qr=qr)
     serve(
         StudioOptions(
-            photo, tuple(object_ or ()), depth, tuple(lens or ()), camera, project=project, pictures=pictures, listening=listening
+            photo=photo,
+            objects=tuple(object_ or ()),
+            depth=depth,
+            lenses=tuple(lens or ()),
+            camera=camera,
+            project=project,
+            pictures=pictures,
+            listening=listening,
         )
     )
