@@ -304,6 +304,15 @@ async def test_two_fingers_beside_the_object_zoom_the_picture(tmp_path: Path, si
         x, y = left + 0.8 * width, top + 0.7 * height
         await two_fingers(page, *(((x - 20 - 5 * i, y), (x + 20 + 5 * i, y)) for i in range(3)))
         await page.comes_true(f"parseFloat(document.getElementById('stage').style.width) > {1.2 * width}")
+        await page.tap("#brush")
+        wide = (await page.box("#stage"))[2]
+        await two_fingers(page, *(((x - 60 + 5 * i, y), (x + 60 - 5 * i, y)) for i in range(5)))
+        await page.comes_true(f"parseFloat(document.getElementById('stage').style.width) < {0.85 * wide}")
+        await page.tap("#magnify")
+        for gone in ("getElementById('brush_row').hidden", "getElementById('loupe').hidden", "getElementById('scale').hidden"):
+            assert not await page.value(f"document.{gone}")
+            await pressed(page, "Escape")
+            assert await page.value(f"document.{gone}"), "one after the other"
         assert made.desk.state == first and page.errors == []
 
 
