@@ -26,6 +26,7 @@ HELP = "\n\n".join(
         "--out is read by `mrbokeh.solving`; look at --picture before you trust a camera of low confidence.",
         "Example:  mrbokeh capture solve room.jpg --out camera.json --picture grid.png",
         "Example:  mrbokeh capture solve room.jpg --out camera.json --height 1.6",
+        "Example:  mrbokeh capture solve street.jpg --out camera.json --length 812,1490,820,1102,1.75,y",
         "Example:  mrbokeh capture solve old.png --focal-length 35 --sensor-width 36 --length 410,900,980,905,2.4 --out camera.json",
     )
 )
@@ -49,7 +50,11 @@ def solve_command(
     height: Annotated[float | None, typer.Option(metavar="METRES", help="of the camera above the ground, else 1.5 is guessed")] = None,
     length: Annotated[
         str | None,
-        typer.Option(metavar="X1,Y1,X2,Y2,METRES", help="a known length between two pixels of the ground, instead of --height"),
+        typer.Option(
+            metavar="X1,Y1,X2,Y2,METRES[,y]",
+            help="a known length between two pixels of the ground, or with y of something upright, from its foot on the ground to its top, "
+            "such as a person, instead of --height",
+        ),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace files that exist")] = False,
 ) -> None:
@@ -66,16 +71,21 @@ def solve_command(
     require_safe_outputs((out, picture), (photo,), overwrite)
     if height is not None and length is not None:
         raise InputError("give --height, or --length from which it follows, not both")
-    lines, ruler = [parse_line(each) for each in line or []], None if length is None else parse_ground_length(length)
+    lines, ruler = [parse_line(each) for each in line or []], None if length is None else parse_length(length)
     photograph = with_stated(read_photograph(photo), focal_length, sensor_width)
     if photograph.cut_from_px is not None:
         warn(f"{photograph.cut_told(photo)}: its middle is taken to be that of the whole")
     camera = solve_camera(photograph.rgb, stated_focal_px(photograph, photo), lines).of_sensor(photograph.sensor_width_mm)
-    camera = camera.standing(height) if height is not None else camera.with_length(*ruler) if ruler is not None else camera
+    camera = camera.standing(height) if height is not None else camera
+    off_m = 0.0
+    if ruler is not None:
+        ends_px, metres, upright = ruler
+        off_m = camera.height_off_m(ends_px, metres, upright=upright)
+        camera = camera.with_height(ends_px, metres) if upright else camera.with_length(ends_px, metres)
     write_solved_camera(out, camera)
     if picture is not None:
         write_solved_picture(picture, photograph.rgb, camera)
-    _tell(camera, f"wrote {out}" + (f" and {picture}" if picture is not None else ""))
+    _tell(camera, off_m, f"wrote {out}" + (f" and {picture}" if picture is not None else ""))
 
 
 def parse_line(text: str) -> "Line":
@@ -89,10 +99,13 @@ def parse_line(text: str) -> "Line":
     return Line((x1, y1, x2, y2), axis)
 
 
-def parse_ground_length(text: str) -> tuple[tuple[float, float, float, float], float]:
-    """Return the ends and the metres of X1,Y1,X2,Y2,METRES. Raises InputError."""
-    x1, y1, x2, y2, metres = numbers_in(text, "--length must be two pixels of the ground and metres, X1,Y1,X2,Y2,METRES", (5,))
-    return (x1, y1, x2, y2), metres
+def parse_length(text: str) -> tuple[tuple[float, float, float, float], float, bool]:
+    """Return the ends, the metres, and whether it is upright, of X1,Y1,X2,Y2,METRES[,y]. Raises InputError."""
+    numbers = text.removesuffix(",y")
+    x1, y1, x2, y2, metres = numbers_in(
+        numbers, "--length must be two pixels and metres, X1,Y1,X2,Y2,METRES, with ,y after that for something upright", (5,)
+    )
+    return (x1, y1, x2, y2), metres, numbers != text
 
 
 def with_stated(photograph: "Photograph", focal_length_mm: float | None, sensor_width_mm: float | None) -> "Photograph":
@@ -123,7 +136,7 @@ def stated_focal_px(photograph: "Photograph", photo: Path) -> float | None:
     return focal_px
 
 
-def _tell(camera: "SolvedCamera", wrote: str) -> None:
+def _tell(camera: "SolvedCamera", height_off_m: float, wrote: str) -> None:
     from mrbokeh.solving.solved_camera import GUESSED, LOW, SOLVED, camera_document
 
     own = "" if camera.focal_length_mm is None else f" ({camera.focal_length_mm:.3g} mm)"
@@ -144,7 +157,8 @@ def _tell(camera: "SolvedCamera", wrote: str) -> None:
     if camera.camera_height_source == GUESSED:
         guess(f"guessed: the camera stands {camera.camera_height_m:g} m above the ground (--height METRES, or --length)")
     else:
-        say(f"the camera stands {camera.camera_height_m:.3g} m above the ground")
+        off = f" +- {height_off_m:.2g}" if height_off_m else ""
+        say(f"the camera stands {camera.camera_height_m:.3g}{off} m above the ground")
     for sentence in camera.assumed:
         guess(sentence) if sentence.startswith("guessed") else say(sentence)
     if disagreement := camera.disagreement():

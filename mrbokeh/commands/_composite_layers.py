@@ -17,12 +17,12 @@ from mrbokeh.commands._composite_options import (
     typed_place_m,
     typed_sun,
 )
-from mrbokeh.commands._level_ground import HIGH_SHARE
+from mrbokeh.commands._level_ground import HIGH_SHARE, held_as_told
 from mrbokeh.compositing.ground import ended_shadow, ground_under
 from mrbokeh.compositing.plate import Plate
 from mrbokeh.images.layer import Layer, flatten
 from mrbokeh.optics.camera import Camera
-from mrbokeh.scene.staging.scene_description import SceneDescription, looking_down
+from mrbokeh.scene.staging.scene_description import SceneDescription
 from mrbokeh.stacks.capture_bundle import CaptureBundle
 from mrbokeh.system.channel import guess, warn
 from mrbokeh.system.errors import InputError
@@ -116,7 +116,7 @@ def _object_layers(options: ObjectOptions, rendering: RenderingOptions, first: P
     contrast = 1.0 if options.plain else first.shadow_contrast
     filming = replace(rendering.of_photograph.filming(), catches=catches, caught_share=shadow, caught_contrast=contrast)
     placed = objects_of(options, first, shadow)
-    light = _light(options, first, options.first_px if options.at_pixel else _pixel_of(first.camera, placed[0].stands_at_m), kept)
+    light = light_of(options, first, options.first_px if options.at_pixel else _pixel_of(first.camera, placed[0].stands_at_m), kept)
     placed = [replace(each, light=light) for each in placed]
     grounds = _grounds(placed)
 
@@ -195,22 +195,20 @@ def _pixel_of(camera: Camera, place_m: tuple[float, float, float]) -> tuple[floa
 
 def held_upright(plate: Plate, options: ObjectOptions) -> Plate:
     """Return the plate with the turn of its camera: as told, as known already, by the ground at the foot of an object, or none."""
-    if options.pitch is not None:
-        return replace(plate, world_from_camera=looking_down(math.radians(options.pitch)))
-    if plate.world_from_camera is not None or options.plain or not options.at_pixel:
-        return plate
+    if options.pitch is not None or plate.world_from_camera is not None or options.plain or not options.at_pixel:
+        return held_as_told(plate, options)
     foot_px = options.first_px
     plate.require_pixel(*foot_px)
     found = ground_under(plate, foot_px)
     if found is None:
         guess("the depth around the foot is no ground with a slope: a level camera is taken (--pitch DEGREES says how far it looks down)")
-        return plate
+        return held_as_told(plate, options)
     down_deg = math.degrees(math.asin(float(np.clip(found[1, 2], -1.0, 1.0))))
     guess(f"by the depth around the foot the camera looks down by {down_deg:.0f} degrees (else --pitch DEGREES)")
-    return replace(plate, world_from_camera=found)
+    return held_as_told(replace(plate, world_from_camera=found), options)
 
 
-def _light(options: ObjectOptions, plate: Plate, foot_px: tuple[float, float], kept: "KeptParts | None") -> "Lighting":
+def light_of(options: ObjectOptions, plate: Plate, foot_px: tuple[float, float], kept: "KeptParts | None") -> "Lighting":
     """Return the light of objects: its panorama, even light, or what the photograph tells of it."""
     from mrbokeh.compositing.plate_light import is_sunlit, picture_light
     from mrbokeh.scene.staging.scene_description import Lighting

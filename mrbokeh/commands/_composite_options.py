@@ -134,6 +134,13 @@ class ObjectOptions:
             help="How far the camera looks down, in degrees. Default: as an iPhone tells, or by the ground at --at-pixel, else 0."
         ),
     ] = None
+    roll: Annotated[
+        float | None,
+        typer.Option(
+            help="How far the camera is turned clockwise about its view, in degrees: the horizon then rises to the right. Default: as an "
+            "iPhone, --camera or the lines of the picture tell, else 0."
+        ),
+    ] = None
     camera_height: Annotated[
         float | None,
         typer.Option(
@@ -221,6 +228,8 @@ class ObjectOptions:
             )
         if self.pitch is not None and not -90.0 < self.pitch < 90.0:
             raise InputError(f"--pitch: expected how far the camera looks down, between -90 and 90 degrees, got {self.pitch:g}")
+        if self.roll is not None and not -90.0 < self.roll < 90.0:
+            raise InputError(f"--roll: expected how far the camera is turned clockwise, between -90 and 90 degrees, got {self.roll:g}")
         if self.camera_height is not None and not 0.0 < self.camera_height < math.inf:
             raise InputError(f"--camera-height: expected metres above 0, got {self.camera_height:g}")
         if self.camera_height is not None and (depth is not None or photo.is_dir() or not self.at_pixel or self.plain):

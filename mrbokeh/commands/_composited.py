@@ -10,7 +10,7 @@ import numpy as np
 from mrbokeh.commands._composite_layers import held_upright, layers_by
 from mrbokeh.commands._composite_options import CompositeOptions, ObjectOptions, typed_shadow
 from mrbokeh.commands._insertion_options import VirtualOptions
-from mrbokeh.commands._level_ground import focused_on_foot, held_told, on_level_ground, sun_by_shadow
+from mrbokeh.commands._level_ground import focused_on_foot, held_as_told, held_told, on_level_ground, sun_by_shadow
 from mrbokeh.compositing.choose import best_mode, insertion_of, without_what_touches_the_lens
 from mrbokeh.compositing.ground import with_ground_behind
 from mrbokeh.compositing.near_and_far import nearer_than
@@ -51,7 +51,8 @@ def placed(plate: Plate, options: CompositeOptions, known_height_m: float | None
         standing.require_no_depth()
     guess(plate.depth_note)
     if plate.phone_level and plate.world_from_camera is not None and standing.object_ and standing.pitch is None:
-        guess(f"by the phone's own level the camera {held_told(plate.world_from_camera)} (--pitch DEGREES)")
+        held = held_as_told(plate, standing).world_from_camera
+        guess(f"by the phone's own level the camera {held_told(np.eye(3) if held is None else held)} (--pitch DEGREES)")
     if options.guesses_ground and plate.depth_m is None:
         plate, standing = on_level_ground(plate, standing, known_height_m)
     elif options.guesses_ground:
@@ -79,7 +80,9 @@ def composited(
     of a picture. Raises InputError if nothing is seen.
     """
     mode, insertion = insertion_by(options, plate)
-    drawn = layers_by(options, plate, bundle, kept)(plate)
+    # What the ground catches is made of the photograph, whose light has its colour already.
+    given_back = finishing.light_before(plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb)
+    drawn = layers_by(options, plate, bundle, kept)(replace(plate, sharp_rgb=given_back))
     sharp = [without_what_touches_the_lens(layer, plate) for layer in drawn]
     if asked is not None and not any((layer.alpha > 0).any() for layer in drawn):
         _nothing_seen(asked, options.virtual)

@@ -246,7 +246,12 @@ class LookGroup:
             help="Exposure of the plate for --match-exposure, such as 1/50,400,2.8, where its file states none: any video.",
         ),
     ] = None
-    match_white: Annotated[float | None, typer.Option(metavar="KELVIN", help="Light that the plate was balanced for.")] = None
+    match_white: Annotated[
+        float | None,
+        typer.Option(
+            metavar="KELVIN", help="Light that the plate was balanced for: above 6504 virtual light gets warmer, below it cooler."
+        ),
+    ] = None
     match_black: Annotated[str | None, typer.Option(metavar="auto|X,Y[,R]", help="Virtual blacks are lifted to the plate's.")] = None
     vignetting: Annotated[str | None, typer.Option(metavar="auto|K1,K2,K3|FLAT.png", help="The lens darkens virtual light too.")] = None
     grain: Annotated[str | None, typer.Option(metavar="auto|FILE", help="Grain as measured in the plate, on virtual light.")] = None

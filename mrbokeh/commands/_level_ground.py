@@ -52,18 +52,17 @@ def on_level_ground(plate: Plate, standing: ObjectOptions, known_height_m: float
     for foot_px in standing.pixels:
         plate.require_pixel(*foot_px)
     taken = []
-    if standing.pitch is not None:
-        plate = replace(plate, world_from_camera=looking_down(math.radians(standing.pitch)))
-    elif plate.world_from_camera is None:
+    if standing.pitch is None and plate.world_from_camera is None:
         plate = _by_lines(plate)
     rays = [plate.camera.unproject(np.array(foot_px), np.array(1.0)) for foot_px in standing.pixels]
-    if plate.world_from_camera is None:
+    if standing.pitch is None and plate.world_from_camera is None:
         down_rad = usual_tilt_rad(plate, rays[0])
         down_rad = down_rad if abs(math.degrees(down_rad)) >= 1.0 else 0.0
         plate = replace(plate, world_from_camera=looking_down(down_rad))
         way = "down" if down_rad > 0.0 else "up"
         held = f"to look {way} by {abs(math.degrees(down_rad)):.0f} degrees" if down_rad else "to be level"
         taken.append(f"the camera {held} (--pitch DEGREES)")
+    plate = held_as_told(plate, standing)
     nearest_m = [_ground_m(plate, *each) for each in zip(rays, standing.at_pixel or (), strict=True)]
     height_m, told = _camera_height_m(plate, standing.camera_height or known_height_m, nearest_m[0])
     distance_m = height_m * nearest_m[0]
@@ -80,6 +79,16 @@ def on_level_ground(plate: Plate, standing: ObjectOptions, known_height_m: float
         guess(f"the object is made {height[0]} high, a quarter of the picture (--height METRES or such as 300px)")
     places = [",".join(f"{each:.9g}" for each in height_m * along_m * ray) for along_m, ray in zip(nearest_m, rays, strict=True)]
     return plate, replace(standing, at=places, at_pixel=None, height=height)
+
+
+def held_as_told(plate: Plate, standing: ObjectOptions) -> Plate:
+    """Return the plate of a camera that looks down and is turned as far as --pitch and --roll say; of what they leave out, as is known."""
+    if standing.pitch is None and standing.roll is None:
+        return plate
+    known = np.eye(3) if plate.world_from_camera is None else plate.world_from_camera
+    down_deg = _down_deg(known) if standing.pitch is None else standing.pitch
+    roll_deg = rolled_deg(known) if standing.roll is None else standing.roll
+    return replace(plate, world_from_camera=looking_down(math.radians(down_deg), math.radians(roll_deg)))
 
 
 def focused_on_foot(plate: Plate, standing: ObjectOptions) -> Plate:
@@ -236,7 +245,7 @@ def _told(plate: Plate, solved: SolvedCamera) -> str:
 
 def held_told(world_from_camera: Float[np.ndarray, "3 3"]) -> str:
     """Return in words how far a camera looks down or up, and is turned."""
-    down_deg, roll_deg = _down_deg(world_from_camera), math.degrees(math.atan2(world_from_camera[1, 0], world_from_camera[1, 1]))
+    down_deg, roll_deg = _down_deg(world_from_camera), rolled_deg(world_from_camera)
     turned = f", turned by {roll_deg:.1f}" if abs(roll_deg) >= 0.5 else ""
     return f"looks {'up' if down_deg < 0.0 else 'down'} by {abs(down_deg):.0f} degrees{turned}"
 
@@ -251,6 +260,11 @@ def _seen_by(plate: Plate, solved: SolvedCamera) -> Plate:
     focal_px = (factor * plate.camera.focal_px[0], factor * plate.camera.focal_px[1])
     lens = plate.lens.stating({"focal_length_mm": factor * plate.lens.focal_length_mm})
     return replace(plate, lens=lens, camera=replace(plate.camera, focal_px=focal_px), view_known=True)
+
+
+def rolled_deg(world_from_camera: Float[np.ndarray, "3 3"]) -> float:
+    """Return how far a camera is turned clockwise about its view."""
+    return math.degrees(math.atan2(world_from_camera[1, 0], world_from_camera[1, 1]))
 
 
 def _down_deg(world_from_camera: Float[np.ndarray, "3 3"]) -> float:

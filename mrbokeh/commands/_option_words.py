@@ -43,7 +43,7 @@ EVERYDAY = {
 PANELS = {
     "The plate": "all-slices behind depth-model-gives depth-scale disparity exact-depth first-number frames input-space matte "
     "near-distance rate refine rgb srgb steady-depth stereo stereo-cameras baseline linear side light-distance sidecar",
-    "What is put in": "camera catch layer mode objects paths pitch scene scene-begin scene-renderer time turn keyframes",
+    "What is put in": "camera catch layer mode objects paths pitch roll scene scene-begin scene-renderer time turn keyframes",
     "Its light": "environment exposure shadow",
     "Its look": "grain grey-value light-wrap match-black match-exposure match-grey match-white plate-exposure vignetting seed",
     "The lens": "distortion f-number focal-length focus focus-at focus-pull lens petzval-radius readout same-view sensor-height "
@@ -70,7 +70,7 @@ METAVARS = {
     "N": "f-number",
     "METRES": "baseline near far near-distance light-distance depth-scale",
     "PX": "image-width max-width max-image-size residual diameter longest-motion tile-px overlap-px focal-px steadier",
-    "DEGREES": "turn pitch rotation shutter",
+    "DEGREES": "turn pitch roll rotation shutter",
     "SECONDS": "settle timeout time scene-begin readout segment seconds",
     "MS": "delay",
     "MINUTES": "minutes",

@@ -1,11 +1,11 @@
 """What slices cannot know at rims: which part of the pupil is taken.
 
 Layers that lie over one another are blurred by themselves, then the front hides as much of what is behind as it covers. That is right
-only where both take parts of the pupil that have nothing to do with each other: beside a rim in front the free part of the pupil may see just the
-bright side of an edge behind. How far they go together (their covariance) is found by looking at the layers from points spread evenly over
-the pupil: one pinhole picture from each, in which every pixel moves by its share of its circle of confusion and the nearest wins. Only this
-difference is taken from so few points, as much of it as chance does not explain; coverage and light come from the renderer. A pixel that
-covers a share is there for that share of the points.
+only where both take parts of the pupil that have nothing to do with each other: beside a rim in front the free part of the pupil may see
+just the bright side of an edge behind. How far they go together (their covariance) is found by looking at the layers from points spread
+evenly over the pupil: one pinhole picture from each, in which every pixel moves by its share of its circle of confusion and the nearest
+wins. Only this difference is taken from so few points, as much of it as chance does not explain; coverage and light come from the
+renderer. A pixel that covers a share is there for that share of the points.
 
 Lights are too bright for that. Those whose blur reaches a rim are taken out before, spread by their own kernels, and at each pixel of its
 blur one sees along single rays whether something nearer is in the way: a lamp behind a twig is cut by it as by a knife.

@@ -17,6 +17,7 @@ from mrbokeh.system.errors import InputError
 GUESSED_HEIGHT_M = 1.5
 HIGH, FAIR, LOW = "high", "fair", "low"
 KNOWN, SOLVED, GUESSED = "known", "solved", "guessed"
+_POINTED_PX, _MOST_LEAN = 2.0, 0.36
 _EXPECTED = "a camera of `mrbokeh capture solve`"
 
 
@@ -136,8 +137,7 @@ class SolvedCamera:
         """Return the camera at the height for which two pixels of the ground, x1, y1, x2, y2, are so many metres apart."""
         if not 0.0 < metres < np.inf:
             raise InputError(f"expected a length on the ground in metres, above 0, got {metres:g}")
-        rays = np.array([[*(np.array(end) - self.principal_point_px) / self.focal_length_px, 1.0] for end in (ends_px[:2], ends_px[2:])])
-        in_world = rays @ self.camera_from_world
+        in_world = self._rays_in_world(ends_px)
         if in_world[:, 1].min() <= 1e-6:
             raise InputError(
                 f"expected both ends of a length on the ground below the horizon, but {ends_px} reaches above it: give other pixels"
@@ -147,6 +147,52 @@ class SolvedCamera:
         if apart == 0.0:
             raise InputError(f"expected a length between two pixels, but {ends_px} is one: give two")
         return self.standing(metres / apart)
+
+    def with_height(self, ends_px: tuple[float, float, float, float], metres: float) -> "SolvedCamera":
+        """Return the camera at the height for which something upright is so many metres high: x1, y1, x2, y2 of its foot on the ground and
+        of its top, in either order.
+        """
+        if not 0.0 < metres < np.inf:
+            raise InputError(f"expected the height of something upright in metres, above 0, got {metres:g}")
+        in_world = self._rays_in_world(ends_px)
+        top, foot = in_world[np.argsort(in_world[:, 1] / np.linalg.norm(in_world, axis=1))]
+        if foot[1] <= 1e-6:
+            raise InputError(
+                f"expected the foot of something upright on the ground, below the horizon, but {ends_px} lies above it: give other pixels"
+            )
+        level, foot = [0, 2], foot / foot[1]
+        # The top stands over the foot: where its ray is nearest to the vertical there, for a camera 1 m above the ground.
+        reach = float(top[level] @ foot[level]) / max(float(top[level] @ top[level]), 1e-12)
+        risen = 1.0 - reach * float(top[1])
+        aside = float(np.linalg.norm(reach * top[level] - foot[level]))
+        if reach <= 0.0 or risen <= 1e-3 or aside > _MOST_LEAN * risen:
+            raise InputError(
+                f"expected the top of something upright above its foot, but {ends_px} is a point or leans by more than 20 degrees: give "
+                f"the pixels of its foot and of its top, and check how the camera was held"
+            )
+        return self.standing(metres / risen)
+
+    def height_off_m(self, ends_px: tuple[float, float, float, float], metres: float, *, upright: bool) -> float:
+        """Return the standard deviation of a camera's height by `with_length` or `with_height`: for ends that are 2 px off, and the
+        camera's own pitch.
+        """
+
+        def height_m(camera: "SolvedCamera", ends: np.ndarray) -> float:
+            made = camera.with_height if upright else camera.with_length
+            try:
+                return made((float(ends[0]), float(ends[1]), float(ends[2]), float(ends[3])), metres).camera_height_m
+            except InputError:
+                return float("inf")
+
+        ends, tilt = np.array(ends_px), np.radians(self.pitch_sd_deg)
+        turn = np.array([[1.0, 0.0, 0.0], [0.0, np.cos(tilt), np.sin(tilt)], [0.0, -np.sin(tilt), np.cos(tilt)]])
+        tilted = replace(self, camera_from_world=turn @ self.camera_from_world)
+        moved = [height_m(self, ends + shift) for shift in _POINTED_PX * np.eye(4)]
+        return float(np.linalg.norm(np.array([*moved, height_m(tilted, ends)]) - height_m(self, ends)))
+
+    def _rays_in_world(self, ends_px: tuple[float, float, float, float]) -> Float64[np.ndarray, "2 3"]:
+        rays = np.array([[*(np.array(end) - self.principal_point_px) / self.focal_length_px, 1.0] for end in (ends_px[:2], ends_px[2:])])
+        return np.asarray(rays @ self.camera_from_world, np.float64)
 
 
 def camera_document(camera: SolvedCamera) -> dict[str, Any]:

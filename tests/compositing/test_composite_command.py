@@ -184,6 +184,7 @@ def test_objects_are_placed_in_camera_axes_wherever_the_camera_stood(tmp_path: P
     ({"--object": "cake", "--at-pixel": "10,80", "--sun": "0,40", "--plain": True}, "needs the light that --plain leaves out"),
     ({"--object": "cake", "--at-pixel": "10,80", "--sun": "0,95"}, "above 0 and up to 90 degrees over the horizon"),
     ({"--object": "cake", "--at-pixel": "10,80", "--pitch": "95"}, "--pitch: expected how far the camera looks down, between -90"),
+    ({"--object": "cake", "--at-pixel": "10,80", "--roll": "180"}, "--roll: expected how far the camera is turned clockwise, between -90"),
     ({"--object": "cake", "--at-pixel": "10,80", "--height": "high"}, "--height: expected metres above 0"),
     ({"--object": "cake", "--at-pixel": "10,80", "--catch": "shadow"}, "the photograph tells of none"),
     ({"--object": "cake", "--at-pixel": "10,80", "--camera-height": "0"}, "--camera-height: expected metres above 0, got 0"),

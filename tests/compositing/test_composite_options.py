@@ -280,6 +280,21 @@ def test_the_ground_catches_a_shadow_or_all_that_changes(files: Path) -> None:
     assert darker[2] == pytest.approx(0.5 * darker[1], rel=0.05)
 
 
+def test_a_colour_match_leaves_the_colour_of_shadowed_ground(files: Path) -> None:
+    """White balance and vignetting change the cake's light alone: its shadow lies on ground whose light has gone through the lens."""
+    standing = ("--object", CAKE, "--at", "0,0.2,2", "--height", "0.2", "--pitch", "25", "--sun", "-50,20", "--grain", "off")
+    alone = put_in(files, *standing, "--shadow", "0", card=None)
+    cake = cv2.dilate(changed(alone, plate_rgb()).astype(np.uint8), np.ones((9, 9))) > 0
+    plain = put_in(files, *standing, card=None)
+    ground = changed(plain, plate_rgb()) & ~cake
+    assert ground.sum() > 200, "there is a shadow beside the cake"
+    for words in (("--match-white", "3500"), ("--vignetting=-0.6",)):
+        other = put_in(files, *standing, *words, card=None)
+        assert changed(other, plain)[cake].any()
+        np.testing.assert_allclose(other[ground], plain[ground], rtol=2e-3, atol=1e-3)
+        assert np.abs(plain - plate_rgb())[ground].max() > 0.05
+
+
 def test_a_scene_file_with_its_camera(files: Path) -> None:
     """Seen from 5 cm to the right the cake stands 0.05 / 2 * 216 px = 5.4 px farther left."""
     cake = f'[[object]]\nname = "cake"\nglb = "{CAKE}"\nposition_m = [0.0, 0.1, 2.0]\nheight_m = 0.2\n'

@@ -37,6 +37,22 @@ def test_an_object_stands_so_far_below_the_camera_as_that_is_high(pitch_deg: flo
     assert (looking_down(np.radians(pitch_deg)) @ foot_m)[1] == pytest.approx(1.6)
 
 
+@pytest.mark.parametrize("known", ["both told", "tilt known", "roll known"])
+def test_a_camera_that_is_turned_clockwise_sees_the_ground_fall_to_the_left(known: str) -> None:
+    """A foot 1.6 m below the camera, 0.8 m to the right and 5 m ahead, seen by a camera that looks down by 12 degrees, turned by 7."""
+    turn, foot_m = looking_down(np.radians(12.0), np.radians(7.0)), np.array([0.8, 1.6, 5.0])
+    pixel = ",".join(f"{each:.9g}" for each in photograph().camera.project((turn.T @ foot_m)[None])[0][0])
+    plate = {
+        "both told": photograph(),
+        "tilt known": replace(photograph(), world_from_camera=looking_down(np.radians(12.0), np.radians(-3.0))),
+        "roll known": replace(photograph(), world_from_camera=looking_down(np.radians(1.0), np.radians(7.0))),
+    }[known]
+    told = {"both told": {"pitch": 12.0, "roll": 7.0}, "tilt known": {"roll": 7.0}, "roll known": {"pitch": 12.0}}[known]
+    plate, standing = on_level_ground(plate, replace(FOOT, at_pixel=[pixel], camera_height=1.6, **told))
+    np.testing.assert_allclose(turn @ place_m(standing), foot_m, atol=1e-6)
+    np.testing.assert_allclose(plate.world_from_camera, turn, atol=1e-9)
+
+
 def test_the_focus_tells_the_distance_unless_the_camera_would_float() -> None:
     """Ground 12.1 m away at that pixel is 2.2 m below a level camera: 150 px over a focal length of 777.8 px, and so many metres."""
     _, standing = on_level_ground(photograph(12.1), replace(FOOT, pitch=0.0))

@@ -1,5 +1,6 @@
 """The camera from one picture against pictures whose camera is known, and what is refused. The bars are those of the issue."""
 
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -150,6 +151,39 @@ def test_the_ground_lies_where_it_is() -> None:
         camera.with_length((10.0, 0.0, 40.0, 0.0), 1.0)
 
 
+@pytest.mark.parametrize(("down_deg", "roll_deg"), [(0.0, 0.0), (12.0, -7.0), (35.0, 5.0), (-6.0, 3.0)])
+def test_a_person_of_known_height_tells_how_high_the_camera_stands(down_deg: float, roll_deg: float) -> None:
+    """A pole of 1.75 m and one of 0.4 m, which ends below the horizon, on a floor 1.6 m below a pinhole, wherever they stand."""
+    turn = looking_down(np.radians(down_deg), np.radians(roll_deg)).T
+    made = Place(1200.0, 1500, 1000, turn, np.random.default_rng(0))
+    camera = replace(camera_of_room(), focal_length_px=1200.0, width_px=1500, height_px=1000, camera_from_world=turn)
+    for metres in (1.75, 0.4):
+        for x_m, z_m in ((-1.2, 4.0), (0.0, 6.0), (2.0, 9.0)):
+            foot, top = in_pixels(made, np.array([[x_m, 1.6, z_m], [x_m, 1.6 - metres, z_m]]))
+            for ends in ((*foot, *top), (*top, *foot)):
+                stands = camera.with_height(ends, metres)
+                assert stands.camera_height_m == pytest.approx(1.6, rel=1e-9) and stands.camera_height_source == "known"
+            sure = replace(camera, pitch_sd_deg=0.0)
+            off_m, pointed = sure.height_off_m((*foot, *top), metres, upright=True), np.random.default_rng(0)
+            drawn = [np.array([*foot, *top]) + pointed.normal(0.0, 2.0, 4) for _ in range(200)]
+            found_m = [camera.with_height(tuple(each), metres).camera_height_m for each in drawn]
+            assert off_m == pytest.approx(np.std(found_m), rel=0.25), "by hands that are two pixels off"
+            assert replace(camera, pitch_sd_deg=2.0).height_off_m((*foot, *top), metres, upright=True) > off_m
+
+
+def test_no_height_is_told_by_what_does_not_stand() -> None:
+    camera = replace(camera_of_room(), focal_length_px=1200.0, width_px=1500, height_px=1000, camera_from_world=np.eye(3))
+    for ends, why in (
+        ((700, 400, 700, 100), "below the horizon"),
+        ((700, 800, 700, 800), "above its foot"),
+        ((0, 800, 1400, 800), "above its foot"),
+    ):
+        with pytest.raises(InputError, match=why):
+            camera.with_height(ends, 1.7)
+    with pytest.raises(InputError, match="above 0"):
+        camera.with_height((700, 800, 700, 500), -1.0)
+
+
 @pytest.mark.parametrize(
     ("picture", "words"),
     [
@@ -196,9 +230,18 @@ def test_the_command_writes_a_camera_and_its_picture(tmp_path: Path) -> None:
     stated = ("--focal-length", 24, "--sensor-width", 36, "--height", 1.7, "--overwrite")
     done = mrbokeh("capture", "solve", tmp_path / "room.jpg", "--out", out, *stated)
     assert "(24 mm)" in done.stdout and "1.7 m above" in done.stdout
+    # 1.75 m upright on a floor 1.6 m below, and 1 m along it, as the true camera sees them.
+    for words, start, end in ((",1.75,y", [0.3, 1.6, 4.0], [0.3, -0.15, 4.0]), (",1", [-0.4, 1.6, 3.5], [0.6, 1.6, 3.5])):
+        ends = ",".join(f"{each:.1f}" for each in in_pixels(made, np.array([start, end])).ravel())
+        done = mrbokeh("capture", "solve", tmp_path / "room.jpg", "--out", out, "--length", ends + words, "--overwrite")
+        assert done.returncode == 0 and re.search(r"the camera stands 1\.\d+ \+- 0\.\d+ m above the ground", done.stdout), (
+            done.stdout + done.stderr
+        )
+        assert read_solved_camera(out).camera_height_m == pytest.approx(1.6, rel=0.04)
     for words, told in (
         (("--line", "1,2,3,4"), "--line must be"),
         (("--length", "1,2,3"), "--length must be"),
+        (("--length", "700,900,700,950,1.7,z"), "--length must be"),
         (("--height", "1", "--length", "1,900,9,900,2"), "not both"),
         (("--focal-length", 24), "--sensor-width"),
         (("--height", "0"), "above 0"),

@@ -1,7 +1,7 @@
 """The studio's page in a real headless Chromium: hands, keys, undo, focus, light, saving, on a desk and on a phone held both ways."""
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -9,11 +9,17 @@ import numpy as np
 import pytest
 
 from datasets_scripts.gallery.pictures import CHROMIUM, Page, chromium_page
+from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.tracking.camera_track.formats import write_track
+from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
+from mrbokeh.video.picture_source import open_source
+from tests.support.live_clip import write_live_clip
 from tests.support.made_studio import ALIEN, CAKE, HEIGHT, WIDTH, MadeStudio, made_studio, write_floor
 from tests.support.waiting import comes_true
+from viewfinder.studio.clip import clip_state
 from viewfinder.studio.state import StudioState
 
 pytestmark = [
@@ -211,6 +217,162 @@ async def test_two_fingers_scale_and_turn_and_the_wheel_too(tmp_path: Path) -> N
         assert float(made.desk.state.height or 0) == pytest.approx(1.5 * high / np.e, rel=0.06)
 
 
+ZOOMED = "document.getElementById('scale').textContent"
+
+
+async def wheeled(page: Page, x: float, y: float, delta: float, ctrl: bool = False) -> None:
+    """Turn the wheel over a point of the window."""
+    await page.send("Input.dispatchMouseEvent", type="mouseWheel", x=x, y=y, deltaX=0, deltaY=delta, modifiers=2 if ctrl else 0)
+
+
+async def two_fingers(page: Page, *places: tuple[tuple[float, float], tuple[float, float]]) -> None:
+    """Put two fingers down at the first places, move them along the others as slowly as a hand, rest, and lift them."""
+    for i, both in enumerate([*places, *places[-1:] * 3]):
+        points = [{"x": x, "y": y, "id": finger} for finger, (x, y) in enumerate(both)]
+        await page.send("Input.dispatchTouchEvent", type="touchMove" if i else "touchStart", touchPoints=points)
+        await asyncio.sleep(0.03)
+    await page.send("Input.dispatchTouchEvent", type="touchEnd", touchPoints=[])
+
+
+async def pixel_under(page: Page, x: float, y: float) -> tuple[float, float]:
+    """Return the pixel of the floor that a point of the window shows."""
+    left, top, width, height = await page.box("#stage")
+    return (x - left) / width * WIDTH, (y - top) / height * HEIGHT
+
+
+async def comes_true_of(found: Callable[[], Awaitable[tuple[float, float]]], wanted: tuple[float, float]) -> None:
+    """Wait until a place of the page is the wanted one within 2 px, or 5 s."""
+    for _ in range(100):
+        if await found() == pytest.approx(wanted, abs=2.0):
+            return
+        await asyncio.sleep(0.05)
+    assert await found() == pytest.approx(wanted, abs=2.0)
+
+
+async def test_the_wheel_with_ctrl_and_drags_beside_the_object_zoom_and_move_the_picture(tmp_path: Path) -> None:
+    """What lies under the pointer stays there, taps and drags land where they are seen, and all of it is one Escape away."""
+    async with opened(tmp_path, DESK) as (page, made):
+        await placed(page, made)
+        fitted, room = await page.box("#stage"), await page.box("#room")
+        x, y = fitted[0] + 0.4 * fitted[2], fitted[1] + 0.6 * fitted[3]
+        seen = await pixel_under(page, x, y)
+        first = made.desk.state
+        await wheeled(page, x, y, -200, ctrl=True)
+        await page.comes_true("parts.picture.view.isEnlarged")
+        assert (await page.box("#stage"))[2] == pytest.approx(fitted[2] * np.sqrt(np.e), rel=0.01)
+        assert await pixel_under(page, x, y) == pytest.approx(seen, abs=0.5)
+        assert made.desk.state == first, "the object keeps its size"
+        await dragged(page, (room[0] + 100, room[1] + 90), (70.0, 40.0), mouse=True)
+        assert await pixel_under(page, x + 70, y + 40) == pytest.approx(seen, abs=0.5)
+        assert made.desk.state == first, "and its place"
+        foot = np.array(await page.box("#stage"))[:2] + np.array([0.5, 0.75]) * (await page.box("#stage"))[2:]
+        await dragged(page, tuple(foot), (-60.0, 0.0), mouse=True)
+        px = WIDTH / (await page.box("#stage"))[2]
+        await page.comes_true(f"!studio.isChanging && studio.told.state.at_px[0] < {0.5 * WIDTH - 0.8 * 60 * px}")
+        assert made.desk.state.at_px == pytest.approx((0.5 * WIDTH - 60 * px, 0.8 * HEIGHT), abs=1.5), "finer than at full view"
+        await pressed(page, "Escape")
+        assert await page.box("#stage") == pytest.approx(fitted, abs=0.5)
+        await wheeled(page, x, y, 400, ctrl=True)
+        assert await page.box("#stage") == pytest.approx(fitted, abs=0.5), "never smaller than the window"
+        assert page.errors == []
+
+
+@pytest.mark.parametrize(("size_px", "at"), [(UPRIGHT, (0.25, 0.5)), (LEVEL, (0.5, 0.25))], ids=["upright", "level"])
+async def test_two_fingers_beside_the_object_zoom_the_picture(tmp_path: Path, size_px: tuple[int, int], at: tuple[float, float]) -> None:
+    """Along the side that fills the window what lies between the fingers stays there; along the other it is centred until it fills it."""
+    async with opened(tmp_path, size_px) as (page, made):
+        await placed(page, made, 0.8)
+        fitted, first = await page.box("#stage"), made.desk.state
+        x, y = fitted[0] + at[0] * fitted[2], fitted[1] + at[1] * fitted[3]
+        # Fingers 40 px apart come to 100 px, then both move by 24 px to the left and 12 up.
+        await two_fingers(page, *(((x - 20 - 10 * i, y), (x + 20 + 10 * i, y)) for i in range(4)))
+        await page.comes_true("parts.picture.view.isEnlarged")
+        assert (await page.box("#stage"))[2] == pytest.approx(2.5 * fitted[2], rel=0.06)
+        seen = await pixel_under(page, x, y)
+        assert seen == pytest.approx((at[0] * WIDTH, at[1] * HEIGHT), abs=4.0)
+        await two_fingers(page, *(((x - 50 - 6 * i, y - 3 * i), (x + 50 - 6 * i, y - 3 * i)) for i in range(5)))
+        await comes_true_of(lambda: pixel_under(page, x - 24, y - 12), seen)
+        assert made.desk.state == first
+        await page.tap("#zoom")
+        assert await page.box("#stage") == pytest.approx(fitted, abs=0.5)
+        await page.tap("#zoom")
+        left, top, width, height = await page.box("#stage")
+        assert width == pytest.approx(2.0 * fitted[2], rel=0.01), "twice as large, where one by one is smaller"
+        room = await page.box("#room")
+        assert room[0] < left + 0.8 * width < room[0] + room[2] and room[1] < top + 0.8 * height < room[1] + room[3], "the foot is in sight"
+        # On the object too, once it is enlarged.
+        x, y = left + 0.8 * width, top + 0.7 * height
+        await two_fingers(page, *(((x - 20 - 5 * i, y), (x + 20 + 5 * i, y)) for i in range(3)))
+        await page.comes_true(f"parseFloat(document.getElementById('stage').style.width) > {1.2 * width}")
+        await page.tap("#brush")
+        wide = (await page.box("#stage"))[2]
+        await two_fingers(page, *(((x - 60 + 5 * i, y), (x + 60 - 5 * i, y)) for i in range(5)))
+        await page.comes_true(f"parseFloat(document.getElementById('stage').style.width) < {0.85 * wide}")
+        await page.tap("#magnify")
+        for gone in ("getElementById('brush_row').hidden", "getElementById('loupe').hidden", "getElementById('scale').hidden"):
+            assert not await page.value(f"document.{gone}")
+            await pressed(page, "Escape")
+            assert await page.value(f"document.{gone}"), "one after the other"
+        assert made.desk.state == first and page.errors == []
+
+
+async def darkest(page: Page, canvas: str, x_px: float, y_px: float) -> int:
+    """Return the least red of a canvas within a pixel of where it shows a pixel of the photograph on the screen."""
+    told = f"""(() => {{
+        const [canvas, stage] = [document.getElementById('{canvas}'), document.getElementById('stage')];
+        const [own, whole, photo] = [canvas.getBoundingClientRect(), stage.getBoundingClientRect(), studio.told.photo];
+        const x = (whole.left + {x_px} / photo.width_px * whole.width - own.left) / own.width * canvas.width;
+        const y = (whole.top + {y_px} / photo.height_px * whole.height - own.top) / own.height * canvas.height;
+        const {{ data }} = canvas.getContext('2d').getImageData(Math.floor(x) - 1, Math.floor(y), 3, 1);
+        return Math.min(data[0], data[4], data[8]);
+    }})()"""
+    return int(await page.value(told))
+
+
+async def test_an_enlarged_picture_shows_the_photographs_own_pixels(tmp_path: Path) -> None:
+    """A line of one dark pixel in 3 megapixels is lost in the preview, and there at full size, with and without an object."""
+    photo = write_floor(tmp_path / "floor.png", 2000, 1500)
+    light = read_image(photo).copy()
+    light[300:500, 999] = 0.0
+    write_image(photo, light)
+    async with opened(tmp_path, DESK, StudioState(photo=photo, pitch_deg=0.0)) as (page, made):
+        await page.tap("#zoom")
+        assert await page.value(ZOOMED) == "100 %"
+        await page.comes_true("!document.getElementById('sharp').hidden", 30.0)
+        assert await darkest(page, "sharp", 999.5, 400.0) < 60 < 100 < await darkest(page, "picture", 999.5, 400.0)
+        await page.tap("#zoom")
+        assert await page.value("document.getElementById('sharp').hidden")
+        await page.choose("#object", str(CAKE))
+        await page.tap("#stage", 0.5, 0.8)
+        await page.comes_true(RESTS, 60.0)
+        fitted = await page.box("#stage")
+        await wheeled(page, fitted[0] + 0.5 * fitted[2], fitted[1] + 0.3 * fitted[3], -400, ctrl=True)
+        await page.comes_true("!document.getElementById('sharp').hidden", 30.0)
+        assert await darkest(page, "sharp", 999.5, 400.0) < 60
+        await page.value("studio.change({exposure: 2}), 0")
+        assert await page.value("document.getElementById('sharp').hidden"), "an older picture is not shown over a newer one"
+        await page.comes_true("!document.getElementById('sharp').hidden", 60.0)
+        number = await page.value("studio.told.number")
+        counted = "studio.region = (...all) => { asked++; return region(...all); }"
+        await page.value(f"(() => {{ window.asked = 0; const region = studio.region.bind(studio); {counted}; }})()")
+        made.desk.tell_all()
+        await page.comes_true(f"studio.told.number > {number}")
+        await held_before(page)
+        assert page.errors == []
+
+
+async def held_before(page: Page) -> None:
+    """The photograph as it was is shown with its own pixels too, and news of the server ask for none."""
+    left, top, _width, _height = await page.box("#hold_before")
+    await asyncio.sleep(0.4)
+    assert await page.value("asked") == 0
+    await page.send("Input.dispatchMouseEvent", type="mousePressed", x=left + 5, y=top + 5, button="left", buttons=1, clickCount=1)
+    await page.comes_true("!document.getElementById('sharp_before').hidden", 30.0)
+    assert await darkest(page, "sharp_before", 999.5, 400.0) < 60 and await page.value("asked") == 1
+    await page.send("Input.dispatchMouseEvent", type="mouseReleased", x=left + 5, y=top + 5, button="left", clickCount=1)
+    assert await page.value("document.getElementById('sharp_before').hidden && !document.getElementById('sharp').hidden")
+
+
 @pytest.mark.parametrize("size_px", [DESK, UPRIGHT], ids=["desk", "upright"])
 async def test_what_is_in_front_is_painted(tmp_path: Path, size_px: tuple[int, int]) -> None:
     """A dark tile of the floor is painted over the cake; then a smaller brush says that it is behind, and both are undone."""
@@ -254,8 +416,7 @@ async def test_lines_are_drawn_corrected_and_removed(tmp_path: Path, size_px: tu
             await dragged(page, (left + x1 * width, top + y1 * height), ((x2 - x1) * width, (y2 - y1) * height), mouse=size_px == DESK)
             await page.comes_true(f"studio.told.state.lines.length === {count} && studio.told.busy === '' && !studio.isChanging", 30.0)
         assert "drawn lines" in await page.value(MESSAGE)
-        await page.tap("#axis_z")
-        # The end of the second line was beside its edge: it is dragged there.
+        # The end of the second line was beside its edge: it is dragged there, though another direction is chosen.
         await dragged(page, (left + 0.1 * width, top + 0.944 * height), (0.067 * width, 0.0), mouse=size_px == DESK)
         await page.comes_true(f"studio.told.state.lines[1][2] > {0.15 * WIDTH} && studio.told.busy === '' && !studio.isChanging", 30.0)
         assert len(made.desk.state.lines) == 3 and made.desk.state.lines[1][2] == pytest.approx(40, abs=WIDTH / 100)
@@ -273,6 +434,37 @@ async def test_lines_are_drawn_corrected_and_removed(tmp_path: Path, size_px: tu
         await page.comes_true(f"Math.abs({down_px} - {0.25 * HEIGHT}) < 3")
         await page.tap("#brush")
         assert await page.value("document.getElementById('lines_row').hidden && document.getElementById('lines').childElementCount === 0")
+        assert page.errors == []
+
+
+@pytest.mark.parametrize("size_px", [DESK, UPRIGHT, LEVEL], ids=["desk", "upright", "level"])
+async def test_somebody_of_known_height_gives_the_ground_its_metres(tmp_path: Path, size_px: tuple[int, int]) -> None:
+    """A foot a third of the picture below the level horizon and a head a ninth below it: the camera is 1.5 times as high as that."""
+    async with opened(tmp_path, size_px) as (page, made):
+        await placed(page, made, 0.8, 0.9)
+        box = await page.value("studio.shown.boxes[0]")
+        await page.tap("#draw_lines")
+        await page.tap("#axis_m")
+        assert "foot to the head" in await page.value(MESSAGE)
+        left, top, width, height = await page.box("#stage")
+        await dragged(page, (left + 0.3 * width, top + 5 / 6 * height), (0.0, -2 / 9 * height), mouse=size_px == DESK)
+        await page.comes_true("studio.told.state.measured !== null && !studio.isChanging && studio.told.state.camera_height_m !== 1.5")
+        assert made.desk.state.camera_height_m == pytest.approx(1.5 * 1.7, rel=0.05)
+        await page.comes_true(f"{MESSAGE}.includes('By the known height the camera stands')")
+        await page.comes_true(RESTS, 60.0)
+        np.testing.assert_allclose(await page.value("studio.shown.boxes[0]"), box, atol=0.01)
+        await page.value(
+            "(() => { const m = document.getElementById('metres'); m.value = '0.85'; m.dispatchEvent(new Event('change')); })()"
+        )
+        await page.comes_true("studio.told.state.measured?.[4] === 0.85 && studio.told.state.camera_height_m < 2 && !studio.isChanging")
+        assert made.desk.state.camera_height_m == pytest.approx(1.5 * 0.85, rel=0.05)
+        # Its end is dragged like any other: half as long, it is taken nearly twice as high above the ground.
+        await dragged(page, (left + 0.3 * width, top + 11 / 18 * height), (0.0, 1 / 9 * height), mouse=size_px == DESK)
+        await page.comes_true("studio.told.state.camera_height_m > 2 && !studio.isChanging")
+        assert made.desk.state.camera_height_m == pytest.approx(3.0 * 0.85, rel=0.1) and made.desk.state.lines == ()
+        assert f"--camera-height {made.desk.state.camera_height_m:g}" in await page.value("document.getElementById('command').textContent")
+        await page.tap("#lines_clear")
+        await page.comes_true("studio.told.state.measured === null")
         assert page.errors == []
 
 
@@ -315,6 +507,65 @@ async def test_objects_keep_their_size_in_the_picture_when_the_ground_moves(tmp_
         assert made.desk.state.height == "0.5" and page.errors == []
 
 
+@pytest.mark.parametrize("size_px", [DESK, UPRIGHT, LEVEL], ids=["desk", "upright", "level"])
+async def test_a_turned_camera_is_levelled(tmp_path: Path, size_px: tuple[int, int]) -> None:
+    """The horizon rises to the right by the angle that the camera is turned clockwise; the tilt by the slider leaves that as it is."""
+    async with opened(tmp_path, size_px) as (page, made):
+        await placed(page, made)
+        await page.value("document.querySelectorAll('details').forEach((each) => (each.open = true))")
+        await page.value("document.getElementById('roll').scrollIntoView({block: 'center'})")
+        slider = "(() => {{ const s = document.getElementById('{}'); s.value = '{}'; s.dispatchEvent(new Event('{}')); }})()"
+        await page.value(slider.format("roll", 8, "input"))
+        line = "document.querySelector('#ground .horizon').getAttribute('d').match(/-?[0-9.]+/g).map(Number)"
+        x1, y1, x2, y2 = await page.value(line)
+        assert np.degrees(np.arctan2(y1 - y2, x2 - x1)) == pytest.approx(8.0, abs=0.01), "at once"
+        await page.value(slider.format("roll", 8, "change"))
+        await page.comes_true("!studio.isChanging && studio.told.state.roll_deg === 8")
+        await page.comes_true("Math.abs(studio.told.photo.roll_deg - 8) < 0.01")
+        await page.value(slider.format("pitch", 5, "change"))
+        await page.comes_true("!studio.isChanging && studio.told.state.pitch_deg === 5")
+        x1, y1, x2, y2 = await page.value(line)
+        assert np.degrees(np.arctan2(y1 - y2, x2 - x1)) == pytest.approx(8.0, abs=0.01)
+        words = await page.value("document.getElementById('command').textContent")
+        assert "--pitch 5 --roll 8 " in words
+        await page.comes_true(RESTS, 60.0)
+        assert made.desk.state.roll_deg == 8.0 and page.errors == []
+
+
+@pytest.mark.parametrize("size_px", [DESK, UPRIGHT, LEVEL], ids=["desk", "upright", "level"])
+async def test_the_objects_light_gets_warmer_at_once_and_the_ground_keeps_its_colour(tmp_path: Path, size_px: tuple[int, int]) -> None:
+    """By 75 millionths of 1 / K warmer: white then has 1.32 times as much red and 0.64 times as much blue."""
+    seen = """(() => {{
+        const canvas = document.getElementById('picture'), [left, top, right, bottom] = studio.shown.boxes[0];
+        const [from, to] = [{low}, {high}].map((share) => Math.floor((top + share * (bottom - top)) * canvas.height));
+        const [first, last] = [0.3, 0.7].map((share) => Math.floor((left + share * (right - left)) * canvas.width));
+        const data = canvas.getContext('2d').getImageData(first, from, last - first, to - from).data;
+        const light = (channel) => data.filter((_, i) => i % 4 === channel);
+        return [0, 2].map((channel) => [...light(channel)].reduce((sum, code) => sum + ((code / 255 + 0.055) / 1.055) ** 2.4, 0));
+    }})()"""
+    on_cake, in_shadow = seen.format(low=0.4, high=0.8), seen.format(low=1.02, high=1.08)
+    async with opened(tmp_path, size_px) as (page, made):
+        await placed(page, made)
+        before, ground = np.array(await page.value(on_cake)), np.array(await page.value(in_shadow))
+        await page.value("document.getElementById('warmth').scrollIntoView({block: 'center'})")
+        slider = "(() => {{ const s = document.getElementById('warmth'); s.value = '75'; s.dispatchEvent(new Event('{}')); }})()"
+        drafts = await page.value("studio.counts.drafts")
+        await page.value(slider.format("input"))
+        await page.comes_true(f"studio.counts.drafts > {drafts} && studio.shown.draft || studio.counts.drafts > {drafts + 1}")
+        ratio = np.array(await page.value(on_cake)) / before
+        assert ratio[0] == pytest.approx(1.32, rel=0.12) and ratio[1] == pytest.approx(0.64, rel=0.12)
+        await page.value(slider.format("change"))
+        await page.comes_true(f"{RESTS} && studio.told.state.warmth_k === {round(1e6 / (1e6 / 6504 - 75))}", 60.0)
+        ratio = np.array(await page.value(on_cake)) / before
+        assert ratio[0] == pytest.approx(1.32, rel=0.08) and ratio[1] == pytest.approx(0.64, rel=0.08)
+        np.testing.assert_allclose(np.array(await page.value(in_shadow)), ground, rtol=0.06)
+        assert "--match-white 12698" in await page.value("document.getElementById('command').textContent")
+        assert "warmer by 75" in await page.value("document.getElementById('warmth').parentElement.textContent")
+        await page.tap("#undo")
+        await page.comes_true("studio.state.warmth_k === null")
+        assert page.errors == []
+
+
 async def test_light_lens_and_before_are_shown(tmp_path: Path) -> None:
     photo = write_floor(tmp_path / "floor.png")
     async with opened(tmp_path, DESK, StudioState(photo=photo, pitch_deg=0.0)) as (page, made):
@@ -347,6 +598,39 @@ async def test_light_lens_and_before_are_shown(tmp_path: Path) -> None:
         await page.send("Input.dispatchMouseEvent", type="mouseMoved", x=left + width / 2, y=top + 0.7 * height)
         await page.comes_true("Number(document.getElementById('loupe').dataset.looked) > 0", 30.0)
         assert (await page.box("#loupe"))[2] == 240
+        assert page.errors == []
+
+
+@pytest.mark.parametrize("size_px", [DESK, UPRIGHT, LEVEL], ids=["desk", "upright", "level"])
+async def test_a_clip_shows_its_track_and_is_filmed(tmp_path: Path, size_px: tuple[int, int]) -> None:
+    """The path of the object's foot through the frames follows where it stands; saved is what `mrbokeh video` makes of it."""
+    clip = write_live_clip(tmp_path, WIDTH, HEIGHT, 3)
+    write_track(tmp_path / "track.json", CameraTrack({number: TrackedFrame(each) for number, each in enumerate(clip.cameras)}))
+    first = clip_state(clip.path, tmp_path / "track.json", tmp_path / "studio_files", StudioState())
+    async with opened(tmp_path, size_px, first) as (page, made):
+        hidden = "[...document.querySelectorAll('.of_still')].every((each) => each.hidden)"
+        assert await page.value(hidden), "the track says how the camera was held"
+        await placed(page, made, 0.5, 0.6)
+        above_m = -clip.cameras[0].world_from_camera[2, 3]
+        assert made.desk.state.camera_height_m == pytest.approx(above_m, rel=1e-3) and made.desk.state.pitch_deg is None
+        drawn = "(document.querySelector('#ground .track')?.getAttribute('d') ?? '')"
+        await page.comes_true(f"{drawn}.length && studio.told.clip.command")
+        path = await page.value(drawn)
+        assert path.count("L") == len(clip.plates) - 1
+        left, top, width, height = await page.box("#stage")
+        await dragged(page, (left + 0.5 * width, top + 0.55 * height), (0.1 * width, 0.05 * height), mouse=size_px == DESK)
+        await page.comes_true(f"!studio.isChanging && studio.told.clip.command && {drawn}.length && {drawn} !== '{path}'", 30.0)
+        start = await page.value(f"{drawn}.match(/-?[0-9.]+/g).slice(0, 2).map(Number)")
+        assert start == pytest.approx(made.desk.state.at_px, abs=0.2)
+        commands = (await page.value("document.getElementById('command').textContent")).split("\n\n")
+        assert [each.split()[1] for each in commands] == ["video", "composite"] and str(tmp_path / "track.json") in commands[0]
+        if size_px == DESK:
+            await page.tap("[data-format=clip]")
+            await page.comes_true("studio.told.saves[0]?.state === 'done'", 60.0)
+            filmed = list(open_source(tmp_path / "board_mrbokeh.mp4").frames(0, 4, 1))
+            assert len(filmed) == len(clip.plates) and filmed[0].rgb.shape == (HEIGHT, WIDTH, 3)
+            assert (np.abs(filmed[0].rgb - read_image(first.photo)).max(axis=2) > 0.05).sum() > 300  # type: ignore[arg-type]
+            assert commands[0] == made.desk.saves.told()[0]["command"]
         assert page.errors == []
 
 
@@ -414,6 +698,8 @@ async def test_the_page_is_accessible(tmp_path: Path, size_px: tuple[int, int]) 
             "shadow",
             "matched",
             "pitch",
+            "roll",
+            "zoom",
             "camera_height",
             "png",
             "copy",

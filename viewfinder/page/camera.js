@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 59bc23d7eb9a4c49972b783d393f89531f758afb296d6d802baf0c3f2d99159b
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: d2a670ebeedf50d40ef699754eaeeb931f6de2d94831300557e7e2c9283c6821
 "use strict";
 (() => {
   // src/model.ts

@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 59bc23d7eb9a4c49972b783d393f89531f758afb296d6d802baf0c3f2d99159b
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: d2a670ebeedf50d40ef699754eaeeb931f6de2d94831300557e7e2c9283c6821
 "use strict";
 (() => {
   // src/model.ts
@@ -146,7 +146,7 @@
         if (!Object.keys(this.local).length) return;
         this.sending = this.local;
         this.local = {};
-        const told = await this.post("/state", { changes: this.sending });
+        const told = await this.post("/state", { changes: this.sending, metres_typed: this.metresTyped });
         this.sending = {};
         if (told) this.take(told);
         else this.dispatchEvent(new Event("state"));
@@ -233,10 +233,10 @@
     async whole(change) {
       if (change === this.changes) await this.ask(false, change);
     }
-    /** The part of the finished picture around a pixel, as the loupe shows it; null where another one was asked for since. */
-    async region(x_px, y_px, side_px) {
+    /** The part of the finished picture, or of the photograph as it is, around a pixel; null where another one was asked for since. */
+    async region(x_px, y_px, side_px, before = false) {
       const region = [x_px, y_px, side_px, this.shown?.coc_px[1] ?? 0];
-      const message = { changes: { ...this.sending, ...this.local }, pixels: this.pixels, page: pageName, region };
+      const message = { changes: { ...this.sending, ...this.local }, pixels: this.pixels, page: before ? `${pageName}b` : pageName, region, before };
       const answer = await fetch("/preview", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(message) });
       if (answer.status !== 200) return null;
       const body = await answer.arrayBuffer();
@@ -327,15 +327,17 @@
   var LEAST_APART = 8e-3;
   var EYES_M = 1.5;
   var BELOW_DEG = 10;
-  function lookingDown(pitch_deg) {
+  function lookingDown(pitch_deg, roll_deg) {
     const [cos, sin] = [Math.cos(pitch_deg * Math.PI / 180), Math.sin(pitch_deg * Math.PI / 180)];
-    return [[1, 0, 0], [0, cos, sin], [0, -sin, cos]];
+    const [level, turned] = [Math.cos(roll_deg * Math.PI / 180), Math.sin(roll_deg * Math.PI / 180)];
+    return [[level, -turned, 0], [cos * turned, cos * level, sin], [-sin * turned, -sin * level, cos]];
   }
   var Ground = class {
     constructor(photo, focal_px, state) {
       this.photo = photo;
       this.focal_px = focal_px;
-      this.turn = state.pitch_deg === null ? photo.world_from_camera ?? lookingDown(0) : lookingDown(state.pitch_deg);
+      const isTold = state.pitch_deg !== null || state.roll_deg !== null || !photo.world_from_camera;
+      this.turn = isTold ? lookingDown(state.pitch_deg ?? photo.pitch_deg ?? 0, state.roll_deg ?? photo.roll_deg ?? 0) : photo.world_from_camera;
       this.high_m = state.camera_height_m ?? photo.camera_height_m ?? EYES_M;
     }
     photo;
@@ -454,8 +456,9 @@
 
   // src/studio_panel.ts
   var F_NUMBERS = [1, 1.2, 1.4, 1.8, 2, 2.2, 2.4, 2.8, 3.2, 3.5, 4, 4.5, 5, 5.6, 6.3, 7.1, 8, 9, 10, 11, 13, 14, 16, 18, 20, 22, 25, 29, 32];
-  var LONG_FORMATS = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers" };
+  var LONG_FORMATS = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers", clip: "Clip, MP4" };
   var DEFAULT_SUN = [-125, 50];
+  var DAYLIGHT_MIRED = 1e6 / 6504;
   var nearestF = (f_number) => {
     const apart = F_NUMBERS.map((each) => Math.abs(Math.log(each / f_number)));
     return apart.indexOf(Math.min(...apart));
@@ -477,8 +480,15 @@
       write: (v) => ({ exposure: Number((2 ** v).toPrecision(4)) }),
       shown: (v) => `${v > 0 ? "+" : ""}${v.toFixed(1)} stops`
     },
+    {
+      id: "warmth",
+      read: (s) => s.warmth_k ? Math.round(DAYLIGHT_MIRED - 1e6 / s.warmth_k) : 0,
+      write: (v) => ({ warmth_k: v === 0 ? null : Math.round(1e6 / (DAYLIGHT_MIRED - v)) }),
+      shown: (v) => v === 0 ? "as guessed" : `${v > 0 ? "warmer" : "cooler"} by ${Math.abs(v)}`
+    },
     { id: "shadow", read: (s) => s.shadow ?? 1, write: (v) => ({ shadow: v === 1 ? null : v }), shown: (v) => `${Math.round(100 * v)} %` },
-    { id: "pitch", read: (s) => s.pitch_deg ?? studio.told?.photo?.pitch_deg ?? 0, write: (pitch_deg) => keepingSizes({ pitch_deg }), shown: (v) => degrees(v) }
+    { id: "pitch", read: (s) => s.pitch_deg ?? studio.told?.photo?.pitch_deg ?? 0, write: (pitch_deg) => keepingSizes({ pitch_deg }), shown: (v) => degrees(v) },
+    { id: "roll", read: (s) => s.roll_deg ?? studio.told?.photo?.roll_deg ?? 0, write: (roll_deg) => keepingSizes({ roll_deg }), shown: (v) => degrees(v) }
   ];
   var sunOf = (state) => state?.sun_deg ?? studio.told?.photo?.sun_deg ?? DEFAULT_SUN;
   var right = () => sunOf(studio.state)[0];
@@ -486,7 +496,7 @@
   var sun = (sun_deg) => ({ sun_deg, plain: false });
   var NUMBERS = [
     { id: "focus", name: "focus_m", also: { focus_at_px: null } },
-    { id: "camera_height", name: "camera_height_m" },
+    { id: "camera_height", name: "camera_height_m", also: { measured: null } },
     { id: "focal_length", name: "focal_length_mm" },
     { id: "sensor_width", name: "sensor_width_mm" }
   ];
@@ -504,7 +514,7 @@
       const react = (id, changes) => byId(id).addEventListener("click", () => void studio.commit(changes()));
       react("focus_auto", () => ({ focus_m: null, focus_at_px: null }));
       react("f_number_auto", () => ({ f_number: null }));
-      react("camera_found", () => ({ camera: studio.told?.camera?.file ?? null, pitch_deg: null }));
+      react("camera_found", () => ({ camera: studio.told?.camera?.file ?? null, pitch_deg: null, roll_deg: null }));
       byId("object").addEventListener("change", (event) => {
         const object = event.target.value;
         if (object) void studio.commit({ object, height: null });
@@ -631,6 +641,7 @@
       byId("camera_found").disabled = told.camera?.file === void 0;
       byId("plain").disabled = Boolean(told.photo && !told.photo.has_depth && !told.state.plain);
       const photo = told.photo;
+      document.querySelectorAll(".of_still").forEach((each) => each.hidden = told.clip !== null);
       byId("slice_row").hidden = photo?.slices === void 0;
       document.querySelectorAll(".of_one").forEach((each) => each.hidden = photo?.slices !== void 0);
       if (photo?.slices !== void 0) {
@@ -655,7 +666,9 @@
         lenses.append(lensChoice("", "as the photograph tells", null), ...told.lenses.map((each, i) => lensChoice(each.path, each.name, i)));
       }
       const formats = byId("formats");
-      if (!formats.childElementCount) {
+      if (formats.dataset.shown !== String(told.formats)) {
+        formats.dataset.shown = String(told.formats);
+        formats.replaceChildren();
         for (const format of told.formats) {
           const button = document.createElement("button");
           button.textContent = LONG_FORMATS[format] ?? format;
@@ -700,9 +713,14 @@
       lamp.setAttribute("cx", String(reach * Math.sin(turn * Math.PI / 180)));
       lamp.setAttribute("cy", String(-reach * Math.cos(turn * Math.PI / 180)));
       byId("dome").classList.toggle("off", state.sun_deg === null);
-      byId("command").textContent = (studio.isChanging ? studio.shown?.command : studio.told?.command) ?? "Place an object first.";
+      byId("command").textContent = this.commands((studio.isChanging ? studio.shown?.command : studio.told?.command) ?? null);
       document.querySelectorAll("#formats button").forEach((each) => each.disabled = !studio.isComplete);
       byId("focus_told").textContent = focusTold(state);
+    }
+    /** The command of the picture, and before it that of the whole clip. */
+    commands(picture) {
+      const clip = studio.told?.clip && !studio.isChanging ? studio.told.clip.command : null;
+      return [...clip ? [clip] : [], picture ?? "Place an object first."].join("\n\n");
     }
     fill(id, text) {
       const input = byId(id);
@@ -713,7 +731,7 @@
       byId("guessed").replaceChildren(
         ...[...groundTold(), ...shown.guessed, ...shown.warnings].map((sentence) => Object.assign(document.createElement("li"), { textContent: sentence }))
       );
-      if (studio.isChanging) byId("command").textContent = shown.command ?? "";
+      if (studio.isChanging) byId("command").textContent = this.commands(shown.command);
       if (studio.state) byId("focus_told").textContent = focusTold(studio.state);
     }
   };
@@ -729,13 +747,15 @@
     return { ...changes, height: state.at_px && scaled({ at_px: state.at_px, height: state.height }), before: all(state.before), after: all(state.after) };
   }
   function heightNote(state) {
-    const guessed = state.camera_height_m && !studio.told?.photo?.has_depth ? ` for a camera ${state.camera_height_m} m above the ground (see below)` : "";
+    const by = studio.told?.clip ? ", by the track" : state.measured ? ", by the known height" : " (see below)";
+    const guessed = state.camera_height_m && !studio.told?.photo?.has_depth ? ` for a camera ${state.camera_height_m} m above the ground${by}` : "";
     return `Metres${guessed}, or pixels such as 120px. Wheel, pinch, + and - scale it.`;
   }
   function groundTold() {
     const [told, state] = [studio.told, studio.state];
     if (!told?.photo || told.photo.has_depth || !state?.camera_height_m) return [];
     const tilt = state.camera === null && state.pitch_deg !== null ? [`The camera looks down by ${state.pitch_deg}°, which little in the picture tells: see Camera and ground, or draw Lines.`] : [];
+    if (state.measured) return tilt;
     return [...tilt, `The camera is ${state.camera_height_m} m above the ground, or the table that it stands on; all metres hang on that.`];
   }
   async function save(format) {
@@ -790,6 +810,7 @@
   var TAP_PX = 10;
   var TWICE_MS = 300;
   function listen(element, gestures) {
+    const zoom = (factor, x, y, dx, dy) => gestures.zoom ? gestures.zoom(factor, x, y, dx, dy) : gestures.pinch(factor, x, y, dx, dy, 0);
     const fingers = /* @__PURE__ */ new Map();
     let start2 = { x: 0, y: 0 };
     let kind = "none";
@@ -799,7 +820,7 @@
       fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
       if (kind === "drag") gestures.dragEnd(true);
       start2 = { x: event.clientX, y: event.clientY };
-      kind = fingers.size === 1 ? "tap" : "pinch";
+      kind = fingers.size > 1 ? "pinch" : event.button === 1 ? "move" : "tap";
     });
     element.addEventListener("pointermove", (event) => {
       const finger = fingers.get(event.pointerId);
@@ -813,6 +834,8 @@
         gestures.drag(finger.x, finger.y, finger.x - start2.x, finger.y - start2.y);
       } else if (kind === "drag") {
         gestures.drag(finger.x, finger.y, dx, dy);
+      } else if (kind === "move") {
+        zoom(1, finger.x, finger.y, dx, dy);
       } else if (kind === "pinch" && fingers.size === 2) {
         const [a, b] = [...fingers.values()];
         const [c, d] = before;
@@ -835,7 +858,10 @@
     element.addEventListener("pointercancel", end);
     element.addEventListener("wheel", (event) => {
       event.preventDefault();
-      gestures.pinch(Math.exp(-event.deltaY / 400), event.clientX, event.clientY, 0, 0, event.deltaX / 8);
+      const factor = Math.exp(-event.deltaY / 400);
+      if (event.ctrlKey || event.metaKey) zoom(Math.abs(event.deltaY) < 50 ? factor ** 4 : factor, event.clientX, event.clientY, 0, 0);
+      else if (gestures.wheel) gestures.wheel(factor, event.deltaX / 8);
+      else gestures.pinch(factor, event.clientX, event.clientY, 0, 0, event.deltaX / 8);
     }, { passive: false });
   }
 
@@ -861,6 +887,7 @@
       const hidden = (on) => {
         hide.setAttribute("aria-pressed", String(on));
         byId("before").hidden = !on;
+        studio.dispatchEvent(new Event("before"));
       };
       hide.addEventListener("click", () => hidden(hide.getAttribute("aria-pressed") !== "true"));
       button.addEventListener("click", () => hidden(false));
@@ -938,11 +965,14 @@
   };
 
   // src/studio_lines.ts
-  var AXES = ["y", "x", "z", "h"];
+  var AXES = ["y", "x", "z", "h", "m"];
+  var isOnly = (axis) => axis === "h" || axis === "m";
   var NEAR = 16;
+  var ON_IT = 10;
   var SHORTEST = 12;
   var Lines = class {
     drawn = byId("lines");
+    metres = byId("metres");
     axis = "y";
     lines = null;
     /** The end that is dragged: line, and 0 or 2 for its first coordinate. */
@@ -951,29 +981,56 @@
       const button = byId("draw_lines");
       button.addEventListener("click", () => {
         button.setAttribute("aria-pressed", String(!this.on));
-        studio.say(this.on ? "draw along the horizon where it is seen, or along edges: two of one direction, such as Upright, and one of another; drag an end of the chosen direction, tap the middle of a line to remove it" : "", this.on);
+        studio.say(this.on ? "draw along the horizon where it is seen, or along edges: two of one direction, such as Upright, and one of another; drag an end to move it, tap the middle of a line to remove it" : "", this.on);
         this.draw();
       });
       for (const axis of AXES) {
         byId(`axis_${axis}`).addEventListener("click", () => {
           this.axis = axis;
           for (const each of AXES) byId(`axis_${each}`).setAttribute("aria-pressed", String(each === axis));
+          if (axis === "m") studio.say("draw from the foot to the head of somebody, or of something upright, and type how high that is", true);
+          this.draw();
+          if (axis === "m") byId("metres_row").scrollIntoView({ block: "nearest", inline: "nearest" });
         });
       }
-      byId("lines_clear").addEventListener("click", () => void studio.commit({ lines: [] }));
-      studio.addEventListener("state", () => this.draw());
-      studio.addEventListener("told", () => this.on && studio.state?.lines.length && studio.say(studio.told?.camera?.told ?? "", true));
+      byId("lines_clear").addEventListener("click", () => void studio.commit({ lines: [], measured: null }));
+      this.metres.addEventListener("change", () => this.keep(this.known));
+      for (const event of ["state", "view"]) studio.addEventListener(event, () => this.draw());
+      studio.addEventListener("told", () => this.on && this.known.length && studio.say(this.said(), true));
+    }
+    /** All lines of the state. */
+    get known() {
+      const [lines, measured] = [studio.state?.lines ?? [], studio.state?.measured];
+      return [...lines.map((each) => [...each]), ...measured ? [[...measured.slice(0, 4), "m"]] : []];
+    }
+    /** What the lines tell. */
+    said() {
+      const { lines, measured, camera_height_m } = studio.state;
+      const scale = measured && camera_height_m ? [`By the known height the camera stands ${Number(camera_height_m.toPrecision(3))} m above the ground.`] : [];
+      return [...lines.length ? [studio.told?.camera?.told ?? ""] : [], ...scale].join(" ");
+    }
+    /** Keep lines, of which one may be of known height. */
+    keep(lines) {
+      const metres = this.metres.valueAsNumber;
+      const known = lines.find((each) => each[4] === "m");
+      if (known && !(metres > 0)) return studio.say("give how many metres high it is, above 0");
+      const changes = { lines: lines.filter((each) => each[4] !== "m"), measured: known ? [...known.slice(0, 4), metres] : null };
+      const same = (name) => JSON.stringify(changes[name]) === JSON.stringify(studio.state?.[name]);
+      for (const name of ["lines", "measured"]) if (same(name)) delete changes[name];
+      if (Object.keys(changes).length) void studio.commit(changes);
+      else this.draw();
     }
     get on() {
       return byId("draw_lines").getAttribute("aria-pressed") === "true";
     }
-    /** Take the near end of a line of the chosen direction, or begin a new line. px: pixels of the photograph in one of the window. */
+    /** Take the near end of a line, or begin a new one. px: pixels of the photograph in one of the window. */
     start(at_px, px) {
-      this.lines = (studio.state?.lines ?? []).map((each) => [...each]);
-      const ends = this.lines.flatMap((each, line) => [0, 2].map((i) => ({ line, i, away: Math.hypot(each[i] - at_px[0], each[i + 1] - at_px[1]) })));
-      const nearest = ends.sort((one, other) => one.away - other.away).find((each) => this.lines[each.line][4] === this.axis);
-      if (nearest && nearest.away < NEAR * px) this.end = [nearest.line, nearest.i];
-      else this.end = [(this.lines = this.lines.filter((each) => this.axis !== "h" || each[4] !== "h")).push([at_px[0], at_px[1], at_px[0], at_px[1], this.axis]) - 1, 2];
+      this.lines = this.known;
+      const reach = (axis) => (axis === this.axis ? NEAR : ON_IT) * px;
+      const ends = this.lines.flatMap((each, line) => [0, 2].map((i) => ({ line, i, away: Math.hypot(each[i] - at_px[0], each[i + 1] - at_px[1]) / reach(each[4]) })));
+      const nearest = ends.sort((one, other) => one.away - other.away)[0];
+      if (nearest && nearest.away < 1) this.end = [nearest.line, nearest.i];
+      else this.end = [(this.lines = this.lines.filter((each) => each[4] !== this.axis || !isOnly(this.axis))).push([at_px[0], at_px[1], at_px[0], at_px[1], this.axis]) - 1, 2];
     }
     move(at_px) {
       const line = this.lines?.[this.end[0]];
@@ -986,23 +1043,25 @@
       const lines = pinched ? void 0 : this.lines?.filter((each) => Math.hypot(each[2] - each[0], each[3] - each[1]) > SHORTEST * px);
       this.lines = null;
       if (pinched) this.draw();
-      if (lines) void studio.commit({ lines });
+      if (lines) this.keep(lines);
     }
     /** Remove the line under a finger. */
     tap([x, y], px) {
-      const lines = studio.state?.lines ?? [];
+      const lines = this.known;
       const away = ([x1, y1, x2, y2]) => {
         const along = Math.min(1, Math.max(0, ((x - x1) * (x2 - x1) + (y - y1) * (y2 - y1)) / Math.hypot(x2 - x1, y2 - y1) ** 2));
         return Math.hypot(x1 + along * (x2 - x1) - x, y1 + along * (y2 - y1) - y);
       };
       const nearest = [...lines].sort((one, other) => away(one) - away(other))[0];
       const isAtEnd = nearest && Math.min(Math.hypot(x - nearest[0], y - nearest[1]), Math.hypot(x - nearest[2], y - nearest[3])) < NEAR * px;
-      if (nearest && !isAtEnd && away(nearest) < NEAR * px) void studio.commit({ lines: lines.filter((each) => each !== nearest) });
+      if (nearest && !isAtEnd && away(nearest) < NEAR * px) this.keep(lines.filter((each) => each !== nearest));
     }
     draw() {
       const photo = studio.told?.photo;
-      const lines = this.lines ?? studio.state?.lines ?? [];
+      const lines = this.lines ?? this.known;
       byId("lines_row").hidden = !this.on;
+      byId("metres_row").hidden = this.axis !== "m";
+      if (studio.state?.measured && document.activeElement !== this.metres) this.metres.value = String(studio.state.measured[4]);
       byId("lines_clear").disabled = !lines.length;
       this.drawn.replaceChildren();
       if (!photo || !this.on) return;
@@ -1062,18 +1121,193 @@
     }
   };
 
+  // src/studio_view.ts
+  var MOST = 4;
+  var LOOKS_MS = 150;
+  var LOUPE_PX = 240;
+  var LARGEST_PX = 1600;
+  var COARSE = 1.15;
+  var View = class {
+    stage = byId("stage");
+    picture = byId("picture");
+    sharp = byId("sharp");
+    sharpBefore = byId("sharp_before");
+    before = byId("before");
+    button = byId("zoom");
+    /** Times the fitted size, and what of the photograph lies in the middle of the window, in shares of it. */
+    times = 1;
+    middle = [0.5, 0.5];
+    laid = "";
+    looking;
+    constructor() {
+      this.button.addEventListener("click", () => this.isEnlarged ? this.reset() : this.enlarge());
+      studio.addEventListener("state", () => studio.isComplete && (this.sharp.hidden = true));
+      studio.addEventListener("picture", () => studio.shown?.draft || this.lookLater());
+      studio.addEventListener("before", () => this.before.hidden ? this.sharpBefore.hidden = true : void this.look(this.sharpBefore));
+    }
+    get isEnlarged() {
+      return this.times > 1;
+    }
+    get room() {
+      return byId("room").getBoundingClientRect();
+    }
+    /** Pixels of the window to one of the photograph where all of it is in sight. */
+    get fitted() {
+      const photo = studio.told.photo;
+      return Math.min(this.room.width / photo.width_px, this.room.height / photo.height_px);
+    }
+    /** How large pixels of the photograph are on the screen: 1 shows one by one. */
+    get scale() {
+      return this.fitted * this.times * devicePixelRatio;
+    }
+    /** Lay the picture out; nothing else does. */
+    fit() {
+      const photo = studio.told.photo;
+      const [room, size] = [this.room, this.fitted * this.times];
+      const [width, height] = [photo.width_px * size, photo.height_px * size];
+      const place = (share, most, length) => length <= most ? (most - length) / 2 : Math.min(0, Math.max(most - length, most / 2 - share * length));
+      const [left, top] = [place(this.middle[0], room.width, width), place(this.middle[1], room.height, height)];
+      this.middle = [(room.width / 2 - left) / width, (room.height / 2 - top) / height];
+      Object.assign(this.stage.style, { width: `${width}px`, height: `${height}px`, left: `${left}px`, top: `${top}px` });
+      studio.pixels = Math.max(4e4, photo.width_px * photo.height_px * (this.fitted * devicePixelRatio) ** 2);
+      this.button.setAttribute("aria-pressed", String(this.isEnlarged));
+      const told = byId("scale");
+      told.hidden = !this.isEnlarged;
+      told.textContent = `${Math.round(100 * this.scale)} %`;
+      studio.dispatchEvent(new Event("view"));
+      const laid = `${width} ${left} ${top}`;
+      if (laid !== this.laid) this.lookLater();
+      this.laid = laid;
+    }
+    /** Enlarge about a point of the window, which moved by (dx, dy): what lies under it stays there. */
+    by(factor, x, y, dx = 0, dy = 0) {
+      if (!studio.told?.photo) return;
+      const [room, box] = [this.room, this.stage.getBoundingClientRect()];
+      const share = [(x - dx - box.left) / box.width, (y - dy - box.top) / box.height];
+      const most = Math.max(MOST, MOST / (this.fitted * devicePixelRatio));
+      const times = Math.min(most, Math.max(1, this.times * factor));
+      const grown = times / this.times;
+      this.times = times;
+      this.middle = [share[0] + (room.left + room.width / 2 - x) / (box.width * grown), share[1] + (room.top + room.height / 2 - y) / (box.height * grown)];
+      this.fit();
+    }
+    reset() {
+      [this.times, this.middle] = [1, [0.5, 0.5]];
+      this.sharp.hidden = this.sharpBefore.hidden = true;
+      if (studio.told?.photo) this.fit();
+    }
+    /** One pixel of the photograph to one of the screen, about the object; twice the size where that is less. */
+    enlarge() {
+      const [photo, state] = [studio.told?.photo, studio.state];
+      if (!photo || !state) return;
+      this.times = Math.max(2, 1 / (this.fitted * devicePixelRatio));
+      const box = studio.isComplete ? studio.shown?.boxes[state.before.length] : null;
+      const high = this.room.height / (photo.height_px * this.fitted * this.times);
+      if (box) this.middle = [(box[0] + box[2]) / 2, box[3] - box[1] < high ? (box[1] + box[3]) / 2 : box[3] - 0.3 * high];
+      this.fit();
+      const hand = matchMedia("(pointer: coarse)").matches ? "two fingers zoom and move the picture" : "Ctrl and the wheel zoom, dragging beside the object moves the picture";
+      studio.say(`${hand}; Zoom again shows all of it`);
+    }
+    /** Left, top, right and bottom of what is in sight, in pixels of the photograph. */
+    get inSight() {
+      const photo = studio.told.photo;
+      const [room, box] = [this.room, this.stage.getBoundingClientRect()];
+      const share = (at, from, length) => Math.min(1, Math.max(0, (at - from) / length));
+      const [left, right2] = [share(room.left, box.left, box.width), share(room.right, box.left, box.width)];
+      const [top, bottom] = [share(room.top, box.top, box.height), share(room.bottom, box.top, box.height)];
+      return [left * photo.width_px, top * photo.height_px, right2 * photo.width_px, bottom * photo.height_px];
+    }
+    /** Bring a pixel of the photograph into sight. */
+    reveal([x_px, y_px]) {
+      const photo = studio.told.photo;
+      const [left, top, right2, bottom] = this.inSight;
+      if (x_px > left && x_px < right2 && y_px > top && y_px < bottom) return;
+      this.middle = [x_px / photo.width_px, y_px / photo.height_px];
+      this.fit();
+    }
+    /** What is shown is of another picture than before. */
+    lookAnew() {
+      this.sharp.hidden = this.sharpBefore.hidden = true;
+      this.lookLater();
+    }
+    lookLater() {
+      clearTimeout(this.looking);
+      if (this.isEnlarged) this.looking = setTimeout(() => void this.lookAgain(), LOOKS_MS);
+    }
+    async lookAgain() {
+      if (!this.before.hidden) await this.look(this.sharpBefore);
+      await this.look(this.sharp);
+    }
+    /** Lay the own pixels of the finished picture, or of the photograph, over the preview, where that is too coarse. */
+    async look(sharp) {
+      const [timer, photo] = [this.looking, studio.told.photo];
+      const coarse = this.stage.clientWidth * devicePixelRatio > COARSE * this.picture.width && this.picture.width < photo.width_px;
+      if (!coarse || !this.isEnlarged) return;
+      const [left, top, right2, bottom] = this.inSight;
+      const side = Math.min(LARGEST_PX, Math.ceil(Math.max(right2 - left, bottom - top)) + 2);
+      const [x, y] = [Math.round((left + right2) / 2), Math.round((top + bottom) / 2)];
+      const isBefore = sharp === this.sharpBefore;
+      const bitmap = await studio.region(x, y, side, isBefore).catch(() => null);
+      if (!bitmap || timer !== this.looking || isBefore && this.before.hidden) return;
+      [sharp.width, sharp.height] = [side, side];
+      sharp.getContext("2d").drawImage(bitmap, 0, 0);
+      const percent = (value, most) => `${100 * value / most}%`;
+      const [across, down] = [x - Math.floor(side / 2), y - Math.floor(side / 2)];
+      Object.assign(sharp.style, { left: percent(across, photo.width_px), top: percent(down, photo.height_px), width: percent(side, photo.width_px), height: percent(side, photo.height_px) });
+      sharp.hidden = false;
+    }
+  };
+  var Loupe = class {
+    stage = byId("stage");
+    picture = byId("picture");
+    glass = byId("loupe");
+    looking;
+    constructor() {
+      const button = byId("magnify");
+      button.addEventListener("click", () => {
+        button.setAttribute("aria-pressed", String(!this.on));
+        this.glass.hidden = !this.on;
+        this.glass.style.left = "-9999px";
+      });
+      this.stage.addEventListener("pointermove", (event) => this.on && studio.told?.photo && this.magnify(event));
+    }
+    get on() {
+      return byId("magnify").getAttribute("aria-pressed") === "true";
+    }
+    magnify(event) {
+      const [box, room] = [this.stage.getBoundingClientRect(), byId("room").getBoundingClientRect()];
+      const [x, y] = [(event.clientX - box.left) / box.width, (event.clientY - box.top) / box.height];
+      const photo = studio.told.photo;
+      const side = LOUPE_PX * devicePixelRatio;
+      this.glass.width = this.glass.height = side;
+      const cut = side * this.picture.width / photo.width_px;
+      this.glass.getContext("2d").drawImage(this.picture, x * this.picture.width - cut / 2, y * this.picture.height - cut / 2, cut, cut, 0, 0, side, side);
+      const within = (value, most) => Math.min(Math.max(0, most - LOUPE_PX), Math.max(0, value));
+      Object.assign(this.glass.style, { left: `${within(event.clientX - room.left + 20, room.width)}px`, top: `${within(event.clientY - room.top - LOUPE_PX - 20, room.height)}px` });
+      clearTimeout(this.looking);
+      this.looking = setTimeout(() => void this.look([x * photo.width_px, y * photo.height_px], side), LOOKS_MS);
+    }
+    async look([x_px, y_px], side) {
+      const timer = this.looking;
+      const bitmap = await studio.region(x_px, y_px, side).catch(() => null);
+      if (bitmap && timer === this.looking && this.on) this.glass.getContext("2d").drawImage(bitmap, 0, 0, side, side);
+      if (bitmap) this.glass.dataset.looked = String(Number(this.glass.dataset.looked ?? 0) + 1);
+    }
+  };
+
   // src/studio_picture.ts
   var NUDGES_REST_MS = 500;
-  var LOUPE_PX = 240;
   var DRAWN_AGAIN_MS = 900;
-  var LOOKS_MS = 150;
+  var BESIDE_PX = 12;
+  var FINGERS_BESIDE_PX = 48;
   var within180 = (turn_deg) => ((turn_deg + 180) % 360 + 360) % 360 - 180;
   var PictureStage = class {
     stage = byId("stage");
     picture = byId("picture");
     before = byId("before");
     ground = byId("ground");
-    loupe = byId("loupe");
+    view = new View();
+    loupe = new Loupe();
     brush = new Brush();
     lines = new Lines();
     shadow = new Shadow();
@@ -1081,37 +1315,38 @@
     hint = "";
     from = null;
     moved = [0, 0];
+    panning = false;
+    /** Whether the fingers that are down shape the object; null before they pinch. */
+    shaping = null;
     later;
-    looking;
     quiet;
     constructor() {
       new ResizeObserver(() => this.fit()).observe(byId("room"));
       studio.addEventListener("told", () => this.fit());
       studio.addEventListener("state", () => this.mark());
+      studio.addEventListener("view", () => this.mark());
       studio.addEventListener("picture", (event) => this.show(event.detail));
       this.gestures();
       this.keys();
       this.buttons();
     }
-    /** Make the picture as large as the window allows, and load the photograph when it is another one. */
+    /** Lay the picture out in the window, and load the photograph when it is another one. */
     fit() {
       const photo = studio.told?.photo ?? null;
       this.stage.hidden = !photo;
       byId("welcome").hidden = Boolean(photo);
       if (!photo) return;
-      const room = byId("room").getBoundingClientRect();
-      const scale = Math.min(room.width / photo.width_px, room.height / photo.height_px);
-      this.stage.style.width = `${photo.width_px * scale}px`;
-      this.stage.style.height = `${photo.height_px * scale}px`;
-      studio.pixels = Math.max(4e4, photo.width_px * photo.height_px * (scale * devicePixelRatio) ** 2);
-      const name = `${photo.name} ${studio.told?.state.photo} ${photo.slice ?? ""} ${photo.width_px}`;
+      const of = `${photo.name} ${studio.told?.state.photo} ${photo.width_px}`;
+      const name = `${of} ${photo.slice ?? ""}`;
       if (name !== this.photoName) {
+        if (this.photoName.startsWith(`${of} `)) this.view.lookAnew();
+        else this.view.reset();
         this.photoName = name;
         this.hint = "";
         this.before.src = `/photo?of=${encodeURIComponent(name)}`;
         this.before.decode().then(() => studio.isComplete || this.showPhotograph()).catch(() => void 0);
       }
-      this.mark();
+      this.view.fit();
     }
     /** What is to be done next, or what the studio does. */
     next() {
@@ -1152,7 +1387,10 @@
           const radius_m = box2 ? ground.length_m(each.at_px, 0.5 * (box2[2] - box2[0]) * photo.width_px) : ground.cell_m / 2;
           this.path(number === state.before.length ? "foot" : "foot other", ground.circle(each.at_px, radius_m));
         });
-        this.words(`one square: ${ground.cell_m} m`, photo.width_px * 0.015, photo.height_px * 0.985, photo.width_px / this.stage.clientWidth);
+        const seen = studio.isChanging ? [] : studio.told?.clip?.path_px ?? [];
+        if (seen.length) this.path("track", seen.map(([x, y], i) => `${i ? "L" : "M"}${x} ${y}`).join(""));
+        const [left, , right2, bottom] = this.view.inSight;
+        this.words(`one square: ${ground.cell_m} m`, left + 0.015 * (right2 - left), bottom - 0.015 * (right2 - left), this.px);
       }
       if (photo && !studio.isComplete && this.before.complete && this.before.naturalWidth) this.showPhotograph();
       const box = byId("box");
@@ -1216,14 +1454,27 @@
       studio.change(studio.choosing(nearest.number));
       return true;
     }
+    /** The button of the tool that waits for a hand on the picture. */
+    get tool() {
+      return this.brush.on ? "brush" : this.lines.on ? "draw_lines" : this.shadow.on ? "sun_by" : this.stage.classList.contains("focusing") ? "focus_here" : null;
+    }
+    /** Whether a point of the window lies on the chosen object, or so near beside it. */
+    isBy(x, y, beside_px) {
+      const box = studio.isComplete ? this.boxOf(studio.state.before.length) : null;
+      const stage = this.stage.getBoundingClientRect();
+      const [u, v, across, down] = [(x - stage.left) / stage.width, (y - stage.top) / stage.height, beside_px / stage.width, beside_px / stage.height];
+      return box !== null && u >= box[0] - across && u <= box[2] + across && v >= box[1] - down && v <= box[3] + down;
+    }
     gestures() {
+      this.stage.addEventListener("pointerdown", (event) => event.isPrimary && (this.shaping = null), true);
       listen(this.stage, {
         tap: (x, y) => this.tapped(x, y),
         twice: (x, y) => this.tapped(x, y),
         dragStart: (x, y) => {
           if (this.brush.on) return this.brush.start(this.pixel(x, y));
           if (this.lines.on) return this.lines.start(this.pixel(x, y), this.px);
-          if (this.loupe.hidden) this.chose(x, y);
+          if (!this.loupe.on) this.chose(x, y);
+          this.panning = this.view.isEnlarged && !this.loupe.on && (this.shadow.on || !this.isBy(x, y, BESIDE_PX));
           this.from = studio.state?.at_px ?? this.inside(this.pixel(x, y));
           this.moved = [0, 0];
           this.stage.classList.add("dragging");
@@ -1231,7 +1482,8 @@
         drag: (x, y, dx, dy) => {
           if (this.brush.on) return this.brush.move(this.pixel(x, y));
           if (this.lines.on) return this.lines.move(this.pixel(x, y));
-          if (!this.from || !studio.state?.object || !this.loupe.hidden || this.shadow.on) return;
+          if (this.panning) return this.view.by(1, x, y, dx, dy);
+          if (!this.from || !studio.state?.object || this.loupe.on || this.shadow.on) return;
           this.moved = [this.moved[0] + dx * this.px, this.moved[1] + dy * this.px];
           studio.change({ at_px: this.inside([this.from[0] + this.moved[0], this.from[1] + this.moved[1]]) });
         },
@@ -1239,10 +1491,17 @@
           if (this.brush.on) return pinched ? this.brush.drop() : void this.brush.end();
           if (this.lines.on) return this.lines.stop(this.px, pinched);
           this.from = null;
+          this.panning = false;
           this.stage.classList.remove("dragging");
           void studio.commit();
         },
-        pinch: (factor, _x, _y, _dx, _dy, turn_deg) => this.brush.on ? this.brush.scale(factor) : this.lines.on || this.shadow.on || this.shape(factor, turn_deg)
+        // Two fingers on the object scale and turn it; elsewhere, while a tool waits, and in the enlarged picture they zoom that.
+        pinch: (factor, x, y, dx, dy, turn_deg) => {
+          this.shaping ??= this.tool === null && !this.view.isEnlarged && this.isBy(x, y, FINGERS_BESIDE_PX);
+          return this.shaping ? this.shape(factor, turn_deg) : this.view.by(factor, x, y, dx, dy);
+        },
+        wheel: (factor, turn_deg) => this.brush.on ? this.brush.scale(factor) : this.lines.on || this.shadow.on || this.shape(factor, turn_deg),
+        zoom: (factor, x, y, dx, dy) => this.view.by(factor, x, y, dx, dy)
       });
     }
     tapped(x, y) {
@@ -1259,6 +1518,7 @@
       if (!studio.state?.object) return studio.say("choose an object first: in the list at the right, or drop a GLB file");
       const ground = groundOf(studio.told.photo, studio.state);
       if (!ground || ground.isInSight) return void studio.commit({ at_px: this.inside(this.pixel(x, y)) });
+      if (studio.told.clip) return studio.say("the first frame shows no ground of the track's world: begin the clip where it does");
       const at_px = this.pixel(x, y);
       void studio.commit({ at_px, camera: null, pitch_deg: ground.usualTilt_deg(at_px) });
       this.hint = "the camera looks up, so that no ground is in sight: another tilt is taken, see Camera and ground";
@@ -1301,7 +1561,9 @@
         const shapes = { "+": [1.05, 0], "=": [1.05, 0], "-": [1 / 1.05, 0], "[": [1, -step], "]": [1, step], "{": [1, -10], "}": [1, 10] };
         const [move, shape] = [moves[event.key], shapes[event.key]];
         if (move) {
-          studio.change({ at_px: this.inside([x + step * move[0], y + step * move[1]]) });
+          const at_px = this.inside([x + step * move[0], y + step * move[1]]);
+          studio.change({ at_px });
+          this.view.reveal(at_px);
           this.commitLater();
         } else if (shape) this.shape(...shape);
         else if (event.key === "Delete" || event.key === "Backspace") studio.remove();
@@ -1309,8 +1571,8 @@
         event.preventDefault();
       });
       document.addEventListener("keydown", (event) => {
-        const tool = this.brush.on ? "brush" : this.lines.on ? "draw_lines" : this.shadow.on ? "sun_by" : this.stage.classList.contains("focusing") ? "focus_here" : null;
-        if (event.key === "Escape" && tool) byId(tool).click();
+        const left = this.tool ?? (this.loupe.on ? "magnify" : this.view.isEnlarged ? "zoom" : null);
+        if (event.key === "Escape" && left) byId(left).click();
         if (!(event.ctrlKey || event.metaKey) || event.target.matches?.("input[type=text], input[type=number]")) return;
         const key = event.key.toLowerCase();
         if (key !== "z" && key !== "y") return;
@@ -1337,43 +1599,18 @@
         this.stage.classList.toggle("focusing", on);
         studio.say(on ? "click what is to be in focus: the object, or a place on the ground" : "", on);
       });
-      pressed("magnify", (on) => {
-        this.loupe.hidden = !on;
-        this.loupe.style.left = "-9999px";
-      });
       this.stage.addEventListener("pointermove", (event) => {
-        if (!this.loupe.hidden) this.magnify(event);
         if (this.brush.on && studio.told?.photo) this.brush.hover(this.pixel(event.clientX, event.clientY));
       });
       const hold = byId("hold_before");
       const show = (on) => {
         this.before.hidden = !on && byId("brush_hide").getAttribute("aria-pressed") !== "true";
+        studio.dispatchEvent(new Event("before"));
       };
       hold.addEventListener("pointerdown", () => show(true));
       for (const end of ["pointerup", "pointercancel", "pointerleave", "blur"]) hold.addEventListener(end, () => show(false));
       hold.addEventListener("keydown", (event) => (event.key === " " || event.key === "Enter") && show(true));
       hold.addEventListener("keyup", () => show(false));
-    }
-    /** Show what lies under the pointer with one pixel of the photograph to one of the screen: the preview, then the finished picture. */
-    magnify(event) {
-      const box = this.stage.getBoundingClientRect();
-      const [x, y] = [event.clientX - box.left, event.clientY - box.top];
-      const photo = studio.told.photo;
-      const side = LOUPE_PX * devicePixelRatio;
-      this.loupe.width = this.loupe.height = side;
-      const cut = side * this.picture.width / photo.width_px;
-      const [left, top] = [x / box.width * this.picture.width - cut / 2, y / box.height * this.picture.height - cut / 2];
-      this.loupe.getContext("2d").drawImage(this.picture, left, top, cut, cut, 0, 0, side, side);
-      const within = (value, most) => Math.min(Math.max(0, most - LOUPE_PX), Math.max(0, value));
-      Object.assign(this.loupe.style, { left: `${within(x + 20, box.width)}px`, top: `${within(y - LOUPE_PX - 20, box.height)}px` });
-      clearTimeout(this.looking);
-      this.looking = setTimeout(() => void this.look(this.pixel(event.clientX, event.clientY), side), LOOKS_MS);
-    }
-    async look([x_px, y_px], side) {
-      const timer = this.looking;
-      const bitmap = studio.isComplete ? await studio.region(x_px, y_px, side).catch(() => null) : null;
-      if (bitmap && timer === this.looking && !this.loupe.hidden) this.loupe.getContext("2d").drawImage(bitmap, 0, 0, side, side);
-      if (bitmap) this.loupe.dataset.looked = String(Number(this.loupe.dataset.looked ?? 0) + 1);
     }
   };
 

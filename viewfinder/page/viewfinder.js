@@ -1,4 +1,4 @@
-// Built from viewfinder/page_source by `npm run build`; do not edit. sources: 59bc23d7eb9a4c49972b783d393f89531f758afb296d6d802baf0c3f2d99159b
+// Built from viewfinder/page_source by `npm run build`; do not edit. sources: d2a670ebeedf50d40ef699754eaeeb931f6de2d94831300557e7e2c9283c6821
 "use strict";
 (() => {
   // src/model.ts
@@ -605,6 +605,7 @@
   var TAP_PX = 10;
   var TWICE_MS = 300;
   function listen(element, gestures) {
+    const zoom = (factor, x, y, dx, dy) => gestures.zoom ? gestures.zoom(factor, x, y, dx, dy) : gestures.pinch(factor, x, y, dx, dy, 0);
     const fingers = /* @__PURE__ */ new Map();
     let start2 = { x: 0, y: 0 };
     let kind = "none";
@@ -614,7 +615,7 @@
       fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
       if (kind === "drag") gestures.dragEnd(true);
       start2 = { x: event.clientX, y: event.clientY };
-      kind = fingers.size === 1 ? "tap" : "pinch";
+      kind = fingers.size > 1 ? "pinch" : event.button === 1 ? "move" : "tap";
     });
     element.addEventListener("pointermove", (event) => {
       const finger = fingers.get(event.pointerId);
@@ -628,6 +629,8 @@
         gestures.drag(finger.x, finger.y, finger.x - start2.x, finger.y - start2.y);
       } else if (kind === "drag") {
         gestures.drag(finger.x, finger.y, dx, dy);
+      } else if (kind === "move") {
+        zoom(1, finger.x, finger.y, dx, dy);
       } else if (kind === "pinch" && fingers.size === 2) {
         const [a, b] = [...fingers.values()];
         const [c, d] = before;
@@ -650,7 +653,10 @@
     element.addEventListener("pointercancel", end);
     element.addEventListener("wheel", (event) => {
       event.preventDefault();
-      gestures.pinch(Math.exp(-event.deltaY / 400), event.clientX, event.clientY, 0, 0, event.deltaX / 8);
+      const factor = Math.exp(-event.deltaY / 400);
+      if (event.ctrlKey || event.metaKey) zoom(Math.abs(event.deltaY) < 50 ? factor ** 4 : factor, event.clientX, event.clientY, 0, 0);
+      else if (gestures.wheel) gestures.wheel(factor, event.deltaX / 8);
+      else gestures.pinch(factor, event.clientX, event.clientY, 0, 0, event.deltaX / 8);
     }, { passive: false });
   }
   var MOST = 8;

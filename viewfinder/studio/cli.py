@@ -18,7 +18,8 @@ def studio(
         Path | None,
         typer.Argument(
             metavar="PHOTO",
-            help="A photograph (RAW, JPEG, HEIC, TIFF, PNG), the folder of a merged focal stack, or the .json project of an earlier time.",
+            help="A photograph (RAW, JPEG, HEIC, TIFF, PNG), the folder of a merged focal stack, a clip with --camera, or the .json "
+            "project of an earlier time.",
         ),
     ] = None,
     object_: Annotated[
@@ -35,6 +36,10 @@ def studio(
         typer.Option(
             help="LENS.json, a name of `lens list`, a bank (folder) or NETWORK.onnx (repeat: the page switches); else the photograph's."
         ),
+    ] = None,
+    camera: Annotated[
+        Path | None,
+        typer.Option(metavar="TRACK", help="Track of a clip's camera: objects are placed in the first frame, `mrbokeh video` films them."),
     ] = None,
     project: Annotated[
         Path | None,
@@ -56,10 +61,23 @@ def studio(
 
     Example: mrbokeh studio SCENE/view_2 --object cake.glb
 
+    Example: mrbokeh studio clip.mp4 --camera track.json --object cake.glb
+
     Example: mrbokeh studio photo.studio.json --lan
     """
     say("mrbokeh studio starts")
     from viewfinder.studio.running import StudioOptions, serve
 
     listening = ListeningOptions(port=port, lan=lan, interface=interface, tls=tls, tls_key=tls_key, qr=qr)
-    serve(StudioOptions(photo, tuple(object_ or ()), depth, tuple(lens or ()), project=project, pictures=pictures, listening=listening))
+    serve(
+        StudioOptions(
+            photo=photo,
+            objects=tuple(object_ or ()),
+            depth=depth,
+            lenses=tuple(lens or ()),
+            camera=camera,
+            project=project,
+            pictures=pictures,
+            listening=listening,
+        )
+    )

@@ -33,6 +33,7 @@ def options_of(state: StudioState) -> CompositeOptions:
         height=[each.height or known[0] for each in objects] if known else None,
         turn=turns if any(turns) else None,
         pitch=state.pitch_deg,
+        roll=state.roll_deg,
         camera_height=None if state.plain or state.depth is not None else state.camera_height_m,
         sun=None if state.sun_deg is None else _numbers(state.sun_deg),
         exposure=state.exposure,
@@ -40,12 +41,13 @@ def options_of(state: StudioState) -> CompositeOptions:
         plain=state.plain,
     )
     focus_at = None if state.focus_at_px is None else ",".join(str(int(each)) for each in state.focus_at_px)
+    unmatched = None if state.matched else "off"
     return CompositeOptions(
         photo=state.photo,
         taken=PlateOptions(slice_=state.slice, depth=state.depth, matte=state.matte),
         standing=standing,
         virtual=VirtualOptions(camera=state.camera),
-        look=LookGroup() if state.matched else LookGroup(grain="off", match_black="off"),
+        look=LookGroup(match_white=state.warmth_k, grain=unmatched, match_black=unmatched),
         optics=LensOptions(lens=state.lens, focus=state.focus_m, focus_at=focus_at),
         facts=LensFacts(focal_length_mm=state.focal_length_mm, f_number=state.f_number, sensor_width_mm=state.sensor_width_mm),
     )

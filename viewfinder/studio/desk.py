@@ -3,7 +3,9 @@
 import asyncio
 import logging
 import re
+import shlex
 from collections.abc import AsyncIterator, Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,6 +47,9 @@ class Desk:
         self._drawn: tuple[object, dict[str, Any]] | None = None
         self._tasks: set[asyncio.Task[None]] = set()
         self._tools = asyncio.Lock()
+        self._filming = asyncio.Lock()
+        self._filmed: tuple[StudioState, list[str], list[Pair]] | None = None
+        self._metres_typed = False
         self._brush: tuple[Path, Brush] | None = None
 
     @property
@@ -109,14 +114,23 @@ class Desk:
             "object": [*self.project.objects],
             "lens": [*self.project.lenses],
             "photo": [self.state.photo],
+            "clip": [self.state.clip],
+            "track": [self.state.track],
             "depth": [self.state.depth],
             "matte": [self.state.matte],
             "camera": [self.state.camera, Path(found) if found else None],
         }
 
-    async def change(self, changes: Any) -> None:
-        """Take changes of a page over, complete what follows from them, and keep the project."""
+    async def change(self, changes: Any, *, metres_typed: bool = False) -> None:
+        """Take changes of a page over, complete what follows from them, and keep the project.
+
+        metres_typed: heights are known in metres, which stay when the scale of the ground is found; else objects keep their size in the
+        picture. Raises InputError.
+        """
         before, state, opened = self.state, self.changed_state(changes), self.photograph
+        self._metres_typed = metres_typed
+        if state.measured not in (None, before.measured):
+            await asyncio.to_thread(_require_measured, state, opened)
         if opened is not None and opened.stack is not None and state.focus_at_px is not None:
             state = replace(state, slice=opened.slice_in_focus(*state.focus_at_px), focus_at_px=None)
         self.project.add(state)
@@ -147,7 +161,7 @@ class Desk:
             # Lines that tell no camera yet leave the one that is there.
             if (self.state.photo, self.state.lines) == (state.photo, state.lines) and (found.get("file") or not state.lines):
                 camera = Path(found["file"]) if state.lines or found.get("is_sure") else None
-                self.project.amend(lambda state: replace(state, camera=camera, pitch_deg=None))
+                self.project.amend(lambda state: replace(state, camera=camera, pitch_deg=None, roll_deg=None))
             self._keep()
 
     async def add_object(self, path: Any) -> None:
@@ -241,6 +255,38 @@ class Desk:
             why = f"the project could not be kept in {self.project.path} ({error.strerror})"
             self.problem = f"{why}: make room, or the last changes are lost"
         self.tell_all()
+        if self.state.clip is not None:
+            self._begin(self.film())
+
+    async def film(self) -> None:
+        """Write the scene of a clip's state, so that `mrbokeh video` films what is shown."""
+        async with self._filming:
+            state, opened = self.state, self.photograph
+            if state.clip is None or opened is None or not state.is_complete or (self._filmed is not None and self._filmed[0] == state):
+                return
+            try:
+                words, seen = await asyncio.to_thread(_filmed, state, opened, self.uploads)
+            except (InputError, OSError) as error:
+                self.problem = str(error)
+            else:
+                self._filmed = state, words, seen
+        self.tell_all()
+
+    def clip_told(self) -> dict[str, Any] | None:
+        """Return a clip's name, the command that films it, and where the chosen object's foot is seen in it; None for a photograph."""
+        if self.state.clip is None:
+            return None
+        if self._filmed is None or self._filmed[0] != self.state:
+            return {"name": self.state.clip.name, "command": None, "path_px": []}
+        words = self.saves.clip_words(self.state.clip, self._filmed[1])
+        return {"name": self.state.clip.name, "command": shlex.join(["mrbokeh", *words]), "path_px": self._filmed[2]}
+
+    async def save_clip(self) -> None:
+        """Start to film the clip. Raises InputError if there is none, or nothing stands in it."""
+        await self.film()
+        if self.state.clip is None or self._filmed is None or self._filmed[0] != self.state:
+            raise InputError(self.problem or "there is nothing to film yet: open a clip with the track of its camera, and place an object")
+        self.saves.start_clip(self.state.clip, self._filmed[1])
 
     def _begin(self, work: Any) -> None:
         task = asyncio.get_running_loop().create_task(work)
@@ -264,6 +310,8 @@ class Desk:
                 if (self.state.photo, self.state.depth, self.state.slice) == (path, depth, state.slice):
                     self.project.amend(lambda state: replace(state, slice=opened.slice))
                     self._keep()
+            if state.clip is not None:
+                self._cameras.setdefault(path, {})
             self.busy = "looking for the camera in the picture's lines" if path not in self._cameras else ""
             self.tell_all()
             if path not in self._cameras:
@@ -272,6 +320,7 @@ class Desk:
                 )
                 self._take_camera(path)
             await self._complete()
+            await self.film()
         except InputError as error:
             self.problem = str(error)
         except Exception as error:
@@ -287,6 +336,7 @@ class Desk:
         is_free = (
             state.camera is None
             and state.pitch_deg is None
+            and state.roll_deg is None
             and opened is not None
             and not opened.has_depth
             and opened.plate.world_from_camera is None
@@ -298,9 +348,9 @@ class Desk:
     async def _complete(self) -> None:
         """Give a complete state the metres that follow from it, once its camera was looked for."""
         opened, before = self.photograph, self.state
-        if opened is None or not before.is_complete or before.photo not in self._cameras:
+        if opened is None or before.photo not in self._cameras or not (before.is_complete or before.measured):
             return
-        completed = await asyncio.to_thread(placed_state, before, opened)
+        completed = await asyncio.to_thread(_completed, before, opened, self._metres_typed)
         if completed != before and self.state == before:
             self.project.amend(lambda _state: completed)
             self._keep()
@@ -333,6 +383,34 @@ def _opened_photograph(
             return str(error)
 
     return opened, camera
+
+
+def _filmed(state: StudioState, opened: "OpenedPhotograph", folder: Path) -> tuple[list[str], list[Pair]]:
+    """Write a clip's scene; return the words that film it, and the path of the chosen object's foot through its frames."""
+    from viewfinder.studio.clip import clip_words, path_px
+
+    return clip_words(state, opened, folder), path_px(state)
+
+
+def _require_measured(state: StudioState, opened: "OpenedPhotograph | None") -> None:
+    """Raise InputError if something of known height cannot tell how high the camera stands."""
+    from viewfinder.studio.photograph import measured_height_m
+
+    if opened is None or opened.has_depth or state.plain:
+        raise InputError("a known height tells how far level ground is, but depth tells that here already, or Plain is on: leave it out")
+    measured_height_m(state, opened)
+
+
+def _completed(state: StudioState, opened: "OpenedPhotograph", metres_typed: bool) -> StudioState:
+    """Return the state with the camera's height by something measured, and with its tilt and metres."""
+    from viewfinder.studio.photograph import measured_height_m
+
+    if state.measured is not None and not opened.has_depth and not state.plain:
+        with suppress(InputError):
+            height_m, before_m = measured_height_m(state, opened), state.camera_height_m
+            kept = state.scaled(height_m / before_m) if before_m not in (None, height_m) and not metres_typed else state
+            state = replace(kept, camera_height_m=height_m)
+    return placed_state(state, opened)
 
 
 def placed_state(state: StudioState, opened: "OpenedPhotograph") -> StudioState:

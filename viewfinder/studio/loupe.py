@@ -12,7 +12,7 @@ from mrbokeh.commands._composite_options import CompositeOptions
 from mrbokeh.commands._composited import composited, placed
 from mrbokeh.compositing.between import COLOURS_REACH_PX
 from mrbokeh.compositing.plate import Plate
-from mrbokeh.compositing.plate_look.finishing import Finishing
+from mrbokeh.compositing.plate_look.finishing import white_balanced
 from mrbokeh.layering.pixel_box import Box, is_same_everywhere
 from mrbokeh.optics.camera import camera_of_lens
 from mrbokeh.renderers.base import Renderer
@@ -59,6 +59,20 @@ class WholePhotograph:
         return np.ascontiguousarray(box.of(self._read[1]), dtype=np.float32)
 
 
+def photographed(whole: WholePhotograph, region: Region) -> Float32[np.ndarray, "side side 3"]:
+    """Return the light of a region of the photograph as it is; beyond the frame it is black."""
+    seen = _box_of(region)
+    shown, wanted = np.zeros((region.side_px, region.side_px, 3), np.float32), seen.within(whole.dark_plate.rgb.shape[:2])
+    if not wanted.is_empty:
+        shown[wanted.top - seen.top : wanted.bottom - seen.top, wanted.left - seen.left : wanted.right - seen.left] = whole.light(wanted)
+    return shown
+
+
+def _box_of(region: Region) -> Box:
+    top, left = (round(each) - region.side_px // 2 for each in (region.y_px, region.x_px))
+    return Box(top, top + region.side_px, left, left + region.side_px)
+
+
 def region_of(whole: WholePhotograph, options: CompositeOptions, kept: KeptParts, region: Region) -> Float32[np.ndarray, "side side 3"]:
     """Return the light of a region as `mrbokeh composite` makes it, but for grain and for a shadow's end at an edge of the ground.
 
@@ -68,8 +82,7 @@ def region_of(whole: WholePhotograph, options: CompositeOptions, kept: KeptParts
         plate, renderer, options = _standing(whole, options)
     height_px, width_px = plate.rgb.shape[:2]
     margin_px = min(_MOST_MARGIN_PX, int(region.blur_px / 2) + _SPARE_PX) + (0 if plate.near_alpha is None else COLOURS_REACH_PX)
-    top, left = (round(each) - region.side_px // 2 for each in (region.y_px, region.x_px))
-    seen = Box(top, top + region.side_px, left, left + region.side_px)
+    seen = _box_of(region)
     # Cat's eyes and the like depend on the place in the frame.
     grown = seen.grown(margin_px) if is_same_everywhere(plate.lens) else Box(0, height_px, 0, width_px)
     box = grown.within((height_px, width_px))
@@ -87,7 +100,7 @@ def region_of(whole: WholePhotograph, options: CompositeOptions, kept: KeptParts
         camera=box.camera_of(plate.camera),
     )
     with apart():
-        light = composited(part, options, renderer, Finishing(), kept=kept).inserted.rgb
+        light = composited(part, options, renderer, white_balanced(options.look.wanted), kept=kept).inserted.rgb
     wanted = seen.within((height_px, width_px))
     inner = light[wanted.top - box.top : wanted.bottom - box.top, wanted.left - box.left : wanted.right - box.left]
     shown[wanted.top - seen.top : wanted.bottom - seen.top, wanted.left - seen.left : wanted.right - seen.left] = inner

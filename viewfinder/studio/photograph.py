@@ -11,7 +11,7 @@ from jaxtyping import Float32
 from mrbokeh.commands._composite_layers import held_upright
 from mrbokeh.commands._composite_options import CompositeOptions, typed_sun
 from mrbokeh.commands._insertion_options import focused_at_pixel, require_one_focus
-from mrbokeh.commands._level_ground import HIGH_SHARE, on_level_ground, sun_by_shadow, usual_tilt_rad, with_camera_of_file
+from mrbokeh.commands._level_ground import HIGH_SHARE, held_as_told, on_level_ground, sun_by_shadow, usual_tilt_rad, with_camera_of_file
 from mrbokeh.compositing.plate import (
     HeldLens,
     LensWishes,
@@ -36,7 +36,7 @@ from mrbokeh.renderers.choose import lens_and_renderer
 from mrbokeh.scene.staging.scene_description import looking_down
 from mrbokeh.scene.staging.staged_scene import modified_s
 from mrbokeh.solving.solve_camera import Line, solve_camera
-from mrbokeh.solving.solved_camera import SolvedCamera
+from mrbokeh.solving.solved_camera import KNOWN, SolvedCamera
 from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, read_focal_stack
 from mrbokeh.stacks.photograph import Photograph, read_photograph
 from mrbokeh.system.channel import apart
@@ -46,7 +46,7 @@ from viewfinder.studio.state import DrawnLine, Pair, StudioState
 
 MOST_PX = 1e6
 """Pixels of the largest preview."""
-_LEAST_TILT_DEG = 1.0
+_LEAST_TILT_DEG, _FEW_PX = 1.0, 1e4
 
 
 @dataclass
@@ -140,12 +140,11 @@ class OpenedPhotograph:
             plate, known_height_m = with_camera_of_file(plate, options.virtual.camera)
         if plate.depth_m is not None or standing.plain:
             return held_upright(plate, self.small(options, most_px).standing), renderer, known_height_m
-        if standing.pitch is not None:
-            plate = replace(plate, world_from_camera=looking_down(np.radians(standing.pitch)))
-        elif plate.world_from_camera is None:
+        if standing.pitch is None and plate.world_from_camera is None:
             foot_px = self.small(options, most_px).standing.first_px
             down_rad = usual_tilt_rad(plate, plate.camera.unproject(np.array(foot_px), np.array(1.0)))
             plate = replace(plate, world_from_camera=looking_down(down_rad if abs(down_rad) >= np.radians(_LEAST_TILT_DEG) else 0.0))
+        plate = held_as_told(plate, standing)
         return plate, renderer, known_height_m
 
     def _small_px(self, most_px: float) -> tuple[int, int]:
@@ -237,13 +236,25 @@ def solved_by_hand(opened: OpenedPhotograph, lines: Sequence[DrawnLine]) -> Solv
     return solved(replace(opened.told, rgb=opened.plate.rgb), small).resized(*opened.size_px)
 
 
+def measured_height_m(state: StudioState, opened: OpenedPhotograph) -> float:
+    """Return the height of the camera above the ground by something of known height. Raises InputError if it does not tell."""
+    assert state.measured is not None
+    x1, y1, x2, y2, metres = state.measured
+    with apart():
+        plate, *_ = opened.upright(options_of(anywhere(replace(state, measured=None), opened)), _FEW_PX)
+    width_px, height_px = opened.size_px
+    assert plate.world_from_camera is not None
+    camera = SolvedCamera(width_px, height_px, plate.lens.focal_px(width_px), KNOWN, camera_from_world=plate.world_from_camera.T)
+    return float(f"{camera.with_height((x1, y1, x2, y2), metres).camera_height_m:.4g}")
+
+
 def placed(state: StudioState, opened: OpenedPhotograph) -> StudioState:
     """Return a complete state with the tilt and metres that `mrbokeh composite` would guess, so that they stay while the object is moved.
 
     Raises InputError for a place that is no ground.
     """
-    if opened.has_depth and state.camera_height_m is not None:
-        state = replace(state, camera_height_m=None)
+    if opened.has_depth and (state.camera_height_m, state.measured) != (None, None):
+        state = replace(state, camera_height_m=None, measured=None)
     is_told = state.camera is not None or state.pitch_deg is not None or opened.plate.world_from_camera is not None
     whole = state.height is not None and (opened.has_depth or (state.camera_height_m is not None and is_told))
     if not state.is_complete or state.plain or whole:

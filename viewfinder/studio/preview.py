@@ -17,13 +17,13 @@ from mrbokeh.commands._composite_options import CompositeOptions
 from mrbokeh.commands._composite_parts import blur_told
 from mrbokeh.commands._composited import composited, placed
 from mrbokeh.compositing.plate import Plate
-from mrbokeh.compositing.plate_look.finishing import Finishing, finishing_of, matched_finishing
+from mrbokeh.compositing.plate_look.finishing import Finishing, finishing_of, matched_finishing, white_balanced
 from mrbokeh.images.color import srgb_codes
 from mrbokeh.images.layer import Layer
 from mrbokeh.scene.staging.staged_scene import StagedObject
 from mrbokeh.system.channel import apart
 from mrbokeh.system.errors import InputError
-from viewfinder.studio.loupe import Region, WholePhotograph, region_of
+from viewfinder.studio.loupe import Region, WholePhotograph, photographed, region_of
 from viewfinder.studio.photograph import MOST_PX, OpenedPhotograph
 
 _log = logging.getLogger(__name__)
@@ -55,7 +55,7 @@ def preview_of(photograph: OpenedPhotograph, options: CompositeOptions, kept: Ke
         plate, small = placed(plate, small, known_height_m)
         if kept.draft and plate.depth_m is not None:
             small = replace(small, virtual=replace(small.virtual, mode="over"))
-        finishing = Finishing() if kept.draft else _finishing(photograph, plate, small)
+        finishing = white_balanced(small.look.wanted) if kept.draft else finishing_by(photograph, plate, small)
         made = composited(plate, small, renderer, finishing, kept=kept, asked=options.standing)
         plate, sharp = made.plate, made.sharp
         blur, _known, figures = blur_told(plate, sharp)
@@ -71,7 +71,7 @@ def preview_of(photograph: OpenedPhotograph, options: CompositeOptions, kept: Ke
     return Preview(made.inserted.rgb, told)
 
 
-def _finishing(photograph: OpenedPhotograph, plate: Plate, options: CompositeOptions) -> Finishing:
+def finishing_by(photograph: OpenedPhotograph, plate: Plate, options: CompositeOptions) -> Finishing:
     """Return what makes the object look photographed, measured once for each size of the photograph.
 
     A photograph made smaller shows no trace of its compression.
@@ -119,13 +119,13 @@ def jpeg_of(rgb: Float32[np.ndarray, "height width 3"], quality: int = _QUALITY)
 
 @dataclass
 class Wish:
-    """Picture that a page waits for, or a region of it.
+    """Picture that a page waits for, or a region of it. options: None shows a region of the photograph as it is.
 
     answer: (what is told, JPEG), or None where a newer wish of the page took its place.
     """
 
     photograph: OpenedPhotograph
-    options: CompositeOptions
+    options: CompositeOptions | None
     most_px: float
     draft: bool
     region: Region | None = None
@@ -188,6 +188,7 @@ class Previewer:
         kept, began_s = self._kept[1], time.perf_counter()
         if wish.region is not None:
             return self._region(wish, wish.region, kept)
+        assert wish.options is not None, "only a region may be of the photograph alone"
         kept.holds_light = False
         kept.draft, kept.small = wish.draft, wish.photograph.scale(wish.most_px) < 1.0
         most_px = min(wish.most_px, self._draft_px) if wish.draft else wish.most_px
@@ -202,6 +203,8 @@ class Previewer:
     def _region(self, wish: Wish, region: Region, kept: KeptParts) -> tuple[dict[str, Any], bytes]:
         if self._whole is None or self._whole.photograph is not wish.photograph:
             self._whole = WholePhotograph(wish.photograph)
+        if wish.options is None:
+            return {"region": True}, jpeg_of(photographed(self._whole, region))
         kept.draft, kept.small, kept.holds_light = False, True, True
         return {"region": True}, jpeg_of(region_of(self._whole, wish.options, kept, region))
 

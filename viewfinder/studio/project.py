@@ -17,7 +17,7 @@ _MOST_STORED = 500
 """States of the history that a file keeps: half a megabyte; while the studio runs there is no limit."""
 _OF_LIBRARY = "library:"
 """Before the name of a lens of the library, which no folder beside the project may take the place of."""
-_PATHS = ("photo", "depth", "matte", "object", "lens", "camera")
+_PATHS = ("photo", "clip", "track", "depth", "matte", "object", "lens", "camera")
 
 
 @dataclass

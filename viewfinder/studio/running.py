@@ -21,16 +21,18 @@ from viewfinder.studio.state import StudioState
 
 SHIPPED = Path(mrbokeh.__file__).parent / "demo_data" / "objects"
 _SUFFIX = ".studio.json"
+_CLIPS = (".mp4", ".mov", ".mkv", ".mxf", ".avi", ".webm", ".m4v")
 
 
 @dataclass(frozen=True)
 class StudioOptions:
-    """Options of `mrbokeh studio`. photo: may be a project file; None lets the page ask."""
+    """Options of `mrbokeh studio`. photo: may be a project file; None lets the page ask. camera: the track of a clip."""
 
     photo: Path | None = None
     objects: tuple[Path, ...] = ()
     depth: Path | None = None
     lenses: tuple[Path, ...] = ()
+    camera: Path | None = None
     project: Path | None = None
     pictures: Path = Path()
     listening: ListeningOptions = field(default_factory=ListeningOptions)
@@ -50,10 +52,21 @@ def project_of(options: StudioOptions) -> Project:
     path = path or options.pictures / f"{photo.stem if photo else 'untitled'}{_SUFFIX}"
     is_new = not path.exists()
     project = Project(path) if is_new else read_project(path)
-    if photo is not None and project.state.photo != photo:
+    if options.camera is not None:
+        if photo is None or photo.is_dir():
+            raise InputError(f"--camera {options.camera} is the track of a clip: give that as PHOTO")
+        if (photo, options.camera) != (project.state.clip, project.state.track):
+            from viewfinder.studio.clip import clip_state
+
+            project.add(clip_state(photo, options.camera, options.pictures / "studio_files", project.state))
+    elif photo is not None and photo.suffix.lower() in _CLIPS:
+        raise InputError(f"{photo} is a clip, in which things stand by the track of its camera: give --camera TRACK (`mrbokeh track clip`)")
+    elif photo is not None and project.state.photo != photo:
         project.add(StudioState(photo=photo, object=project.state.object, lens=project.state.lens))
     if options.depth is not None and project.state.depth != _there(options.depth, "the depth of the photograph"):
-        project.add(replace(project.state, depth=options.depth, camera=None, pitch_deg=None, camera_height_m=None))
+        project.add(
+            replace(project.state, depth=options.depth, camera=None, pitch_deg=None, roll_deg=None, camera_height_m=None, measured=None)
+        )
     _offer(project, options)
     return replace(project, history=[project.state], place=0) if is_new else project
 

@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import os
+import shlex
 import signal
 import sys
 import time
@@ -13,10 +14,12 @@ from typing import Any
 
 from mrbokeh.commands._composite_options import CompositeOptions
 from mrbokeh.system.errors import InputError
-from viewfinder.studio.command_line import command_line, words_of
+from viewfinder.studio.command_line import words_of
 
 FORMATS = {"png": ".png", "jpeg": ".jpg", "tiff": ".tif", "exr": ".exr"}
 """Suffixes by the names of formats on the page: PNG and TIFF have 16 bits, EXR is linear and holds all layers."""
+CLIP = "clip"
+_SUFFIXES = FORMATS | {CLIP: ".mp4"}
 _ENDS_S = 3.0
 _MOST_AT_ONCE, _MOST_KEPT = 2, 50
 
@@ -54,7 +57,7 @@ class Saves:
     def format(self) -> str:
         """Name of the format that was chosen last."""
         suffix = self._saves[-1].out.suffix if self._saves else FORMATS["png"]
-        return next(name for name, each in FORMATS.items() if each == suffix)
+        return next(name for name, each in _SUFFIXES.items() if each == suffix)
 
     def told(self) -> list[dict[str, Any]]:
         """Return the saves, newest first."""
@@ -73,11 +76,23 @@ class Saves:
         """Start to make a picture in a format of FORMATS. Raises InputError if that cannot be."""
         if not isinstance(kind, str) or kind not in FORMATS:
             raise InputError(f"expected a format out of {', '.join(FORMATS)}, got {kind!r}")
+        out = self.free_name(options.photo, FORMATS[kind])
+        return self._begin(out, words_of(options, out))
+
+    def clip_words(self, clip: Path, words: list[str]) -> list[str]:
+        """Return the words of `mrbokeh video` with the file that the next clip gets."""
+        return [*words, "--out", str(self.free_name(clip, _SUFFIXES[CLIP]))]
+
+    def start_clip(self, clip: Path, words: list[str]) -> Save:
+        """Start to film a clip by words without --out. Raises InputError if that cannot be."""
+        words = self.clip_words(clip, words)
+        return self._begin(Path(words[-1]), words)
+
+    def _begin(self, out: Path, words: list[str]) -> Save:
         if sum(each.state == "running" for each in self._saves) >= _MOST_AT_ONCE:
             raise InputError(f"{_MOST_AT_ONCE} pictures are being made already: wait for one of them, or cancel it")
-        out = self.free_name(options.photo, FORMATS[kind])
         number = self._saves[-1].number + 1 if self._saves else 1
-        save = Save(number=number, out=out, command=command_line(options, out), words=words_of(options, out))
+        save = Save(number=number, out=out, command=shlex.join(["mrbokeh", *words]), words=words)
         self._saves = [*self._saves, save][-_MOST_KEPT:]
         task = asyncio.get_running_loop().create_task(self._run(save))
         self._tasks.add(task)

@@ -17,7 +17,7 @@ from viewfinder.server.access import Access, error, json_value, message_body
 from viewfinder.server.site import page_routes
 from viewfinder.studio.command_line import command_line, options_of
 from viewfinder.studio.desk import LARGEST, Desk, placed_state
-from viewfinder.studio.saving import FORMATS
+from viewfinder.studio.saving import CLIP, FORMATS
 from viewfinder.studio.state import StudioState, shadow_of, stroke_of
 
 if TYPE_CHECKING:
@@ -34,9 +34,9 @@ _LARGEST_MESSAGE = 65536
 _NEWS_WAIT_S = 20.0
 _LARGEST_SCREEN_PX = 1e6
 _FEW_PX = 1e4
-_LARGEST_LOUPE_PX = 800
+_LARGEST_REGION_PX = 1600
 _PAGE_NAME = re.compile(r"\w{1,40}", re.ASCII)
-_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".tif": "image/tiff", ".exr": "image/x-exr"}
+_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".tif": "image/tiff", ".exr": "image/x-exr", ".mp4": "video/mp4"}
 
 _Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
@@ -97,7 +97,8 @@ class StudioSite:
             "objects": [{"path": str(each), "name": each.stem} for each in project.objects],
             "lenses": [{"path": str(each), "name": each.stem} for each in project.lenses],
             "saves": desk.saves.told(),
-            "formats": list(FORMATS),
+            "formats": [*FORMATS, *([CLIP] if desk.state.clip is not None else [])],
+            "clip": desk.clip_told(),
             "format": desk.saves.format,
             "project": str(project.path.absolute()),
             "largest": LARGEST,
@@ -116,7 +117,7 @@ class StudioSite:
             return None
         assert state.photo is not None
         return command_line(
-            options_of(placed_state(state, opened)), self.desk.saves.free_name(state.photo, FORMATS[self.desk.saves.format])
+            options_of(placed_state(state, opened)), self.desk.saves.free_name(state.photo, FORMATS.get(self.desk.saves.format, ".png"))
         )
 
     async def _photo(self, _request: web.Request) -> web.Response:
@@ -137,8 +138,9 @@ class StudioSite:
         return web.Response(text=bokeh_svg(lenses[int(number)]), content_type="image/svg+xml")
 
     async def _change(self, request: web.Request) -> web.Response:
-        """Handle POST /state: {"changes": {name: value}}."""
-        await self.desk.change((await _message(request)).get("changes"))
+        """Handle POST /state: {"changes": {name: value}, "metres_typed"}."""
+        message = await _message(request)
+        await self.desk.change(message.get("changes"), metres_typed=message.get("metres_typed") is True)
         return web.json_response(self._told())
 
     async def _add(self, request: web.Request) -> web.Response:
@@ -171,9 +173,11 @@ class StudioSite:
         return web.json_response(self._told())
 
     async def _preview(self, request: web.Request) -> web.Response:
-        """Handle POST /preview: {"changes", "draft", "pixels", "page", "region"}; the answer is a length, JSON of that length, and a JPEG.
+        """Handle POST /preview: {"changes", "draft", "pixels", "page", "region", "before"}; the answer is a length, JSON of that length,
+        and a JPEG.
 
-        204 says that the page has asked for a newer picture since.
+        before: the photograph as it is, in a region; so it is where no object stands yet. 204 says that the page has asked for a newer
+        picture since.
         """
         from viewfinder.studio.preview import Previewer, Wish
 
@@ -184,10 +188,11 @@ class StudioSite:
         if isinstance(pixels, bool) or not isinstance(pixels, int | float) or not 1e3 <= pixels <= 1e9:
             raise InputError(f"expected how many pixels the screen shows, got {str(pixels)[:20]!r}: load the page again")
         state, opened = self.desk.changed_state(message.get("changes") or {}), self._opened()
-        options = options_of(placed_state(state, opened))
+        region = _region_of(message.get("region"))
+        as_it_is = region is not None and (message.get("before") is True or not state.is_complete)
+        options = None if as_it_is else options_of(placed_state(state, opened))
         if draft not in self._previewers:
             self._previewers[draft] = Previewer("studio drafts" if draft else "studio previews")
-        region = _region_of(message.get("region"))
         wish = Wish(photograph=opened, options=options, most_px=min(float(pixels), _LARGEST_SCREEN_PX), draft=draft, region=region)
         made = await asyncio.wrap_future(self._previewers[draft].ask(f"{page} loupe" if region else page, wish))
         if made is None:
@@ -205,8 +210,12 @@ class StudioSite:
         return web.json_response(self._told())
 
     async def _save(self, request: web.Request) -> web.Response:
-        """Handle POST /save: {"format": one of FORMATS}."""
+        """Handle POST /save: {"format": one of FORMATS, or CLIP}."""
         kind = (await _message(request)).get("format")
+        if kind == CLIP:
+            await self.desk.save_clip()
+            self.desk.tell_all()
+            return web.json_response(self._told())
         self.desk.saves.start(options_of(placed_state(self.desk.state, self._opened())), kind)
         self.desk.tell_all()
         return web.json_response(self._told())
@@ -232,6 +241,7 @@ class StudioSite:
 
 def _photo_told(opened: "OpenedPhotograph", state: StudioState) -> dict[str, Any]:
     """Return what the page needs of the photograph: its size, and the pinhole by which it draws the ground."""
+    from mrbokeh.commands._level_ground import rolled_deg
     from viewfinder.studio.photograph import anywhere, looks_down_deg
 
     width_px, height_px = opened.size_px
@@ -261,8 +271,9 @@ def _photo_told(opened: "OpenedPhotograph", state: StudioState) -> dict[str, Any
         shown |= {"widest_f_number": plate.lens.widest_f_number}
         shown |= {"camera_height_m": eyes_m, "world_from_camera": None if held is None else held.tolist()}
         shown |= {"pitch_deg": None if held is None else round(looks_down_deg(plate), 2)}
+        shown |= {"roll_deg": None if held is None else round(rolled_deg(held), 2)}
     except InputError as problem:
-        shown |= dict.fromkeys(("focal_px", "lens_f_number", "camera_height_m", "world_from_camera", "pitch_deg")) | {
+        shown |= dict.fromkeys(("focal_px", "lens_f_number", "camera_height_m", "world_from_camera", "pitch_deg", "roll_deg")) | {
             "problem": str(problem)
         }
     return shown
@@ -278,7 +289,7 @@ def _region_of(value: Any) -> "Region | None":
     if not sound or not all(isinstance(each, int | float) and not isinstance(each, bool) and -1e6 < each < 1e6 for each in value):
         raise InputError(f"expected the region of a loupe as x, y, side and blur in pixels, got {str(value)[:60]!r}")
     x_px, y_px, side_px, blur_px = value
-    return Region(float(x_px), float(y_px), max(16, min(_LARGEST_LOUPE_PX, int(side_px))), max(0.0, float(blur_px)))
+    return Region(float(x_px), float(y_px), max(16, min(_LARGEST_REGION_PX, int(side_px))), max(0.0, float(blur_px)))
 
 
 async def _message(request: web.Request) -> dict[str, Any]:

@@ -12,6 +12,9 @@ Pair = tuple[float, float]
 DrawnLine = tuple[float, float, float, float, str]
 """Both ends of an edge in pixels, and its direction in the world: "y" upright, "x" and "z" the two level ones; "h" is the horizon."""
 
+Measured = tuple[float, float, float, float, float]
+"""Both ends in pixels of something that stands upright on the ground, and how many metres high it is."""
+
 _DIGITS = 6
 """Significant digits of numbers: the command line shows them all, so that it makes the very same picture."""
 
@@ -34,16 +37,21 @@ class Placed:
 class StudioState:
     """State of the studio; None leaves a thing to the command's own default.
 
-    photo: a photograph, or the folder of a focal stack, of which slice counts the pictures from 0. matte: what of the photograph the brush
+    photo: a photograph, or the folder of a focal stack, of which slice counts the pictures from 0; of a clip its first frame, and track
+    is the file of its cameras. matte: what of the photograph the brush
     says is in front. object, at_px, height, turn_deg: of the chosen object; before, after: those that come before and after it in the
     command line. at_px: where it stands, in pixels of the whole photograph. height: metres such as "0.3", or pixels such as "120px".
     focus_at_px: the pixel that is in focus, where the photograph has depth; focus_m otherwise. sun_deg: where the main light comes from,
-    degrees to the right of the view and above the horizon. camera: file of `mrbokeh capture solve`; pitch_deg comes before it. lines:
-    drawn ones, by which it was solved. matched: black and grain of the objects are those of the photograph. plain: guess neither light
-    nor ground.
+    degrees to the right of the view and above the horizon. camera: file of `mrbokeh capture solve`; pitch_deg and
+    roll_deg (clockwise) come before it. lines: drawn ones, by which it was solved. measured: by which camera_height_m
+    was found. warmth_k: of --match-white, by
+    which objects are as warm as under a light of daylight's colour in a photograph balanced for so many kelvin. matched: black and grain
+    of the objects are those of the photograph. plain: guess neither light nor ground.
     """
 
     photo: Path | None = None
+    clip: Path | None = None
+    track: Path | None = None
     slice: int | None = None
     depth: Path | None = None
     matte: Path | None = None
@@ -57,7 +65,9 @@ class StudioState:
     before: tuple[Placed, ...] = ()
     after: tuple[Placed, ...] = ()
     pitch_deg: float | None = None
+    roll_deg: float | None = None
     camera_height_m: float | None = None
+    measured: Measured | None = None
     focal_length_mm: float | None = None
     sensor_width_mm: float | None = None
     f_number: float | None = None
@@ -66,6 +76,7 @@ class StudioState:
     sun_deg: Pair | None = None
     shadow: float | None = None
     exposure: float = 1.0
+    warmth_k: float | None = None
     matched: bool = True
     plain: bool = False
 
@@ -79,6 +90,15 @@ class StudioState:
         """All objects that have a place, in the order of the command line."""
         chosen = () if self.object is None or self.at_px is None else (Placed(self.object, self.at_px, self.height, self.turn_deg),)
         return (*self.before, *chosen, *self.after)
+
+    def scaled(self, factor: float) -> "StudioState":
+        """Return the state with all heights in metres times a factor, by which objects look as large on ground so much farther away."""
+
+        def times(height: str | None) -> str | None:
+            return height if height is None or height.endswith("px") else f"{factor * float(height):.{_DIGITS}g}"
+
+        before, after = (tuple(replace(each, height=times(each.height)) for each in placed) for placed in (self.before, self.after))
+        return replace(self, height=times(self.height), before=before, after=after)
 
     def with_object(self, path: Path, beside_px: float) -> "StudioState":
         """Return the state with one more object, which is chosen: so far to the right of the chosen one, and as high.
@@ -217,6 +237,14 @@ def _lines(name: str, value: Any) -> tuple[DrawnLine, ...]:
     return tuple(lines)
 
 
+def _measured(name: str, value: Any) -> Measured:
+    """Return something upright of known height: both its ends, and metres."""
+    if not isinstance(value, list | tuple) or len(value) != 5:
+        raise InputError(f"expected {name} to be x1, y1, x2, y2 and metres, got {_shown(value)}")
+    x1, y1, x2, y2 = (_number(*_PIXELS)(name, each) for each in value[:4])
+    return x1, y1, x2, y2, _number(0.001, 10_000.0)(f"metres of {name}", value[4])
+
+
 def _flag(name: str, value: Any) -> bool:
     if not isinstance(value, bool):
         raise InputError(f"expected {name} to be true or false, got {_shown(value)}")
@@ -247,6 +275,8 @@ def _shown(value: Any) -> str:
 _PIXELS, _MOST_OBJECTS, _MOST_POINTS, _MOST_LINES = (0.0, 200_000.0), 50, 2000, 60
 _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "photo": _path,
+    "clip": _path,
+    "track": _path,
     "slice": _whole(0, 100_000),
     "depth": _path,
     "matte": _path,
@@ -260,7 +290,9 @@ _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "before": _placed,
     "after": _placed,
     "pitch_deg": _number(-89.0, 89.0),
+    "roll_deg": _number(-89.0, 89.0),
     "camera_height_m": _number(0.001, 10_000.0),
+    "measured": _measured,
     "focal_length_mm": _number(0.1, 10_000.0),
     "sensor_width_mm": _number(0.1, 500.0),
     "f_number": _number(0.1, 1000.0),
@@ -269,6 +301,7 @@ _CHECKS: dict[str, Callable[[str, Any], Any]] = {
     "sun_deg": _pair((-360.0, 360.0), (0.1, 90.0)),
     "shadow": _number(0.0, 1.0),
     "exposure": _number(0.0, 1000.0),
+    "warmth_k": _number(2000.0, 25_000.0),
     "matched": _flag,
     "plain": _flag,
 }

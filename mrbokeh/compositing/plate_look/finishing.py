@@ -106,6 +106,13 @@ class Finishing:
         bare = self.vignetting is None and self.compression is None
         return colour and grain and bare and (self.light_wrap is None or self.light_wrap.strength == 0.0)
 
+    def light_before(self, rgb: Picture) -> Picture:
+        """Return the photograph's light as layers must have it that give it back: colour match and vignetting then make it what it is."""
+        if self.vignetting is not None:
+            rgb = rgb / self.vignetting.gain(Box(0, rgb.shape[0], 0, rgb.shape[1]), rgb.shape[:2])
+        gain = (1.0, 1.0, 1.0) if self.colour is None else self.colour.gain
+        return rgb if gain == (1.0, 1.0, 1.0) else rgb / np.array(gain, np.float32)
+
 
 def finished(inserted: Inserted, plate: Plate, finishing: Finishing, frame: int = 0) -> Inserted:
     """The virtual part finished; the photograph's part stays as it is, and so do all pixels without virtual coverage and light.
@@ -175,6 +182,12 @@ def finishing_of(options: LookOptions, plate_rgb: Picture, photo: Path | None = 
     colour = _colour(options, plate_rgb, photo, vignetting)
     grain = _grain(options, plate_rgb, next_rgb)
     return Finishing(None if colour.is_nothing else colour, vignetting, grain, _light_wrap(options.light_wrap))
+
+
+def white_balanced(options: LookOptions) -> Finishing:
+    """Build a Finishing of the white balance alone, which costs nothing, as for drafts. Raises InputError for what is no temperature."""
+    kelvin = options.match_white_k
+    return Finishing() if kelvin is None else Finishing(ColourMatch(triple_of(np.asarray(white_balance_gain(kelvin)))))
 
 
 def matched_finishing(options: LookOptions, plate_rgb: Picture, photo: Path, *, uncompressed: bool = False) -> tuple[Finishing, list[str]]:

@@ -12,6 +12,10 @@ export interface Gestures {
   /** factor: of the distance of the fingers since the last call, about the point between them, which moved by (dx, dy). turn_deg: clockwise. */
   pinch(factor: number, x_px: number, y_px: number, dx_px: number, dy_px: number, turn_deg: number): void;
   twice(x_px: number, y_px: number): void;
+  /** A wheel; without this it pinches, and a level one turns. */
+  wheel?(factor: number, turn_deg: number): void;
+  /** The wheel with Ctrl or Cmd, as a trackpad's pinch is, and the middle button, which only moves; without this they pinch. */
+  zoom?(factor: number, x_px: number, y_px: number, dx_px: number, dy_px: number): void;
 }
 
 const TAP_PX = 10;
@@ -22,11 +26,12 @@ interface Finger {
   y: number;
 }
 
-/** Listen on an element whose touch-action is none. A wheel pinches too, a level one turns. */
+/** Listen on an element whose touch-action is none. */
 export function listen(element: HTMLElement, gestures: Gestures): void {
+  const zoom = (factor: number, x: number, y: number, dx: number, dy: number): void => (gestures.zoom ? gestures.zoom(factor, x, y, dx, dy) : gestures.pinch(factor, x, y, dx, dy, 0));
   const fingers = new Map<number, Finger>();
   let start: Finger = { x: 0, y: 0 };
-  let kind: "none" | "tap" | "drag" | "pinch" = "none";
+  let kind: "none" | "tap" | "drag" | "pinch" | "move" = "none";
   let lastTap_ms = -Infinity;
 
   element.addEventListener("pointerdown", (event) => {
@@ -34,7 +39,7 @@ export function listen(element: HTMLElement, gestures: Gestures): void {
     fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
     if (kind === "drag") gestures.dragEnd(true);
     start = { x: event.clientX, y: event.clientY };
-    kind = fingers.size === 1 ? "tap" : "pinch";
+    kind = fingers.size > 1 ? "pinch" : event.button === 1 ? "move" : "tap";
   });
 
   element.addEventListener("pointermove", (event) => {
@@ -49,6 +54,8 @@ export function listen(element: HTMLElement, gestures: Gestures): void {
       gestures.drag(finger.x, finger.y, finger.x - start.x, finger.y - start.y);
     } else if (kind === "drag") {
       gestures.drag(finger.x, finger.y, dx, dy);
+    } else if (kind === "move") {
+      zoom(1, finger.x, finger.y, dx, dy);
     } else if (kind === "pinch" && fingers.size === 2) {
       const [a, b] = [...fingers.values()] as [Finger, Finger];
       const [c, d] = before as [Finger, Finger];
@@ -72,7 +79,11 @@ export function listen(element: HTMLElement, gestures: Gestures): void {
   element.addEventListener("pointercancel", end);
   element.addEventListener("wheel", (event) => {
     event.preventDefault();
-    gestures.pinch(Math.exp(-event.deltaY / 400), event.clientX, event.clientY, 0, 0, event.deltaX / 8);
+    const factor = Math.exp(-event.deltaY / 400);
+    // A trackpad's pinch counts in small steps.
+    if (event.ctrlKey || event.metaKey) zoom(Math.abs(event.deltaY) < 50 ? factor ** 4 : factor, event.clientX, event.clientY, 0, 0);
+    else if (gestures.wheel) gestures.wheel(factor, event.deltaX / 8);
+    else gestures.pinch(factor, event.clientX, event.clientY, 0, 0, event.deltaX / 8);
   }, { passive: false });
 }
 

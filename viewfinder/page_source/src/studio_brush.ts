@@ -24,6 +24,7 @@ export class Brush {
     const hidden = (on: boolean): void => {
       hide.setAttribute("aria-pressed", String(on));
       byId<HTMLElement>("before").hidden = !on;
+      studio.dispatchEvent(new Event("before"));
     };
     hide.addEventListener("click", () => hidden(hide.getAttribute("aria-pressed") !== "true"));
     button.addEventListener("click", () => hidden(false));

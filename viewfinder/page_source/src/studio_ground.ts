@@ -13,10 +13,11 @@ const BELOW_DEG = 10;
 
 type Point = [number, number];
 
-/** The turn from camera axes to upright ones (x right, y down, z ahead) of a camera that looks down. */
-function lookingDown(pitch_deg: number): Matrix3 {
+/** The turn from camera axes to upright ones (x right, y down, z ahead) of a camera that looks down, and is turned clockwise. */
+function lookingDown(pitch_deg: number, roll_deg: number): Matrix3 {
   const [cos, sin] = [Math.cos((pitch_deg * Math.PI) / 180), Math.sin((pitch_deg * Math.PI) / 180)];
-  return [[1, 0, 0], [0, cos, sin], [0, -sin, cos]];
+  const [level, turned] = [Math.cos((roll_deg * Math.PI) / 180), Math.sin((roll_deg * Math.PI) / 180)];
+  return [[level, -turned, 0], [cos * turned, cos * level, sin], [-sin * turned, -sin * level, cos]];
 }
 
 /** A pinhole above level ground; pixels are those of the whole photograph. */
@@ -25,7 +26,8 @@ export class Ground {
   readonly high_m: number;
 
   constructor(private readonly photo: Photo, private readonly focal_px: number, state: State) {
-    this.turn = state.pitch_deg === null ? photo.world_from_camera ?? lookingDown(0) : lookingDown(state.pitch_deg);
+    const isTold = state.pitch_deg !== null || state.roll_deg !== null || !photo.world_from_camera;
+    this.turn = isTold ? lookingDown(state.pitch_deg ?? photo.pitch_deg ?? 0, state.roll_deg ?? photo.roll_deg ?? 0) : photo.world_from_camera!;
     this.high_m = state.camera_height_m ?? photo.camera_height_m ?? EYES_M;
   }
 

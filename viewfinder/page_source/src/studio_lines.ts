@@ -1,14 +1,21 @@
-// Lines drawn along edges, by which the server solves the camera, and a shadow that is pointed at, by which it finds the sun.
-import { byId, type DrawnLine, type Pair, type Told, inPhoto, studio } from "./studio_model";
+// Lines drawn along edges, by which the server solves the camera, one of known height, by which it finds its scale, and a shadow that is pointed at, by which it finds the sun.
+import { byId, type DrawnLine, type Measured, type Pair, type State, type Told, inPhoto, studio } from "./studio_model";
 
-const AXES = ["y", "x", "z", "h"] as const;
+const AXES = ["y", "x", "z", "h", "m"] as const;
+/** A line of the page: one of an edge, or "m" along something of known height. */
+type Line = [number, number, number, number, (typeof AXES)[number]];
+/** There is one horizon, and one known height. */
+const isOnly = (axis: Line[4]): boolean => axis === "h" || axis === "m";
+/** How near an end is taken: of the chosen direction, and of others, as edges of several directions meet in corners. */
 const NEAR = 16;
+const ON_IT = 10;
 const SHORTEST = 12;
 
 export class Lines {
   private readonly drawn = byId<SVGSVGElement>("lines");
-  private axis: DrawnLine[4] = "y";
-  private lines: DrawnLine[] | null = null;
+  private readonly metres = byId<HTMLInputElement>("metres");
+  private axis: Line[4] = "y";
+  private lines: Line[] | null = null;
   /** The end that is dragged: line, and 0 or 2 for its first coordinate. */
   private end: [number, 0 | 2] = [0, 2];
 
@@ -16,31 +23,61 @@ export class Lines {
     const button = byId<HTMLElement>("draw_lines");
     button.addEventListener("click", () => {
       button.setAttribute("aria-pressed", String(!this.on));
-      studio.say(this.on ? "draw along the horizon where it is seen, or along edges: two of one direction, such as Upright, and one of another; drag an end of the chosen direction, tap the middle of a line to remove it" : "", this.on);
+      studio.say(this.on ? "draw along the horizon where it is seen, or along edges: two of one direction, such as Upright, and one of another; drag an end to move it, tap the middle of a line to remove it" : "", this.on);
       this.draw();
     });
     for (const axis of AXES) {
       byId(`axis_${axis}`).addEventListener("click", () => {
         this.axis = axis;
         for (const each of AXES) byId(`axis_${each}`).setAttribute("aria-pressed", String(each === axis));
+        if (axis === "m") studio.say("draw from the foot to the head of somebody, or of something upright, and type how high that is", true);
+        this.draw();
+        if (axis === "m") byId("metres_row").scrollIntoView({ block: "nearest", inline: "nearest" });
       });
     }
-    byId("lines_clear").addEventListener("click", () => void studio.commit({ lines: [] }));
-    studio.addEventListener("state", () => this.draw());
-    studio.addEventListener("told", () => this.on && studio.state?.lines.length && studio.say(studio.told?.camera?.told ?? "", true));
+    byId("lines_clear").addEventListener("click", () => void studio.commit({ lines: [], measured: null }));
+    this.metres.addEventListener("change", () => this.keep(this.known));
+    for (const event of ["state", "view"]) studio.addEventListener(event, () => this.draw());
+    studio.addEventListener("told", () => this.on && this.known.length && studio.say(this.said(), true));
+  }
+
+  /** All lines of the state. */
+  private get known(): Line[] {
+    const [lines, measured] = [studio.state?.lines ?? [], studio.state?.measured];
+    return [...lines.map((each): Line => [...each]), ...(measured ? [[...measured.slice(0, 4), "m"] as Line] : [])];
+  }
+
+  /** What the lines tell. */
+  private said(): string {
+    const { lines, measured, camera_height_m } = studio.state!;
+    const scale = measured && camera_height_m ? [`By the known height the camera stands ${Number(camera_height_m.toPrecision(3))} m above the ground.`] : [];
+    return [...(lines.length ? [studio.told?.camera?.told ?? ""] : []), ...scale].join(" ");
+  }
+
+  /** Keep lines, of which one may be of known height. */
+  private keep(lines: Line[]): void {
+    const metres = this.metres.valueAsNumber;
+    const known = lines.find((each) => each[4] === "m");
+    if (known && !(metres > 0)) return studio.say("give how many metres high it is, above 0");
+    const changes: Partial<State> = { lines: lines.filter((each): each is DrawnLine => each[4] !== "m"), measured: known ? ([...known.slice(0, 4), metres] as Measured) : null };
+    const same = (name: "lines" | "measured"): boolean => JSON.stringify(changes[name]) === JSON.stringify(studio.state?.[name]);
+    for (const name of ["lines", "measured"] as const) if (same(name)) delete changes[name];
+    if (Object.keys(changes).length) void studio.commit(changes);
+    else this.draw();
   }
 
   get on(): boolean {
     return byId<HTMLElement>("draw_lines").getAttribute("aria-pressed") === "true";
   }
 
-  /** Take the near end of a line of the chosen direction, or begin a new line. px: pixels of the photograph in one of the window. */
+  /** Take the near end of a line, or begin a new one. px: pixels of the photograph in one of the window. */
   start(at_px: Pair, px: number): void {
-    this.lines = (studio.state?.lines ?? []).map((each): DrawnLine => [...each]);
-    const ends = this.lines.flatMap((each, line) => ([0, 2] as const).map((i) => ({ line, i, away: Math.hypot(each[i] - at_px[0], each[i + 1 as 1 | 3] - at_px[1]) })));
-    const nearest = ends.sort((one, other) => one.away - other.away).find((each) => this.lines![each.line]![4] === this.axis);
-    if (nearest && nearest.away < NEAR * px) this.end = [nearest.line, nearest.i];
-    else this.end = [(this.lines = this.lines.filter((each) => this.axis !== "h" || each[4] !== "h")).push([at_px[0], at_px[1], at_px[0], at_px[1], this.axis]) - 1, 2];
+    this.lines = this.known;
+    const reach = (axis: Line[4]): number => (axis === this.axis ? NEAR : ON_IT) * px;
+    const ends = this.lines.flatMap((each, line) => ([0, 2] as const).map((i) => ({ line, i, away: Math.hypot(each[i] - at_px[0], each[i + 1 as 1 | 3] - at_px[1]) / reach(each[4]) })));
+    const nearest = ends.sort((one, other) => one.away - other.away)[0];
+    if (nearest && nearest.away < 1) this.end = [nearest.line, nearest.i];
+    else this.end = [(this.lines = this.lines.filter((each) => each[4] !== this.axis || !isOnly(this.axis))).push([at_px[0], at_px[1], at_px[0], at_px[1], this.axis]) - 1, 2];
   }
 
   move(at_px: Pair): void {
@@ -55,25 +92,27 @@ export class Lines {
     const lines = pinched ? undefined : this.lines?.filter((each) => Math.hypot(each[2] - each[0], each[3] - each[1]) > SHORTEST * px);
     this.lines = null;
     if (pinched) this.draw();
-    if (lines) void studio.commit({ lines });
+    if (lines) this.keep(lines);
   }
 
   /** Remove the line under a finger. */
   tap([x, y]: Pair, px: number): void {
-    const lines = studio.state?.lines ?? [];
-    const away = ([x1, y1, x2, y2]: DrawnLine): number => {
+    const lines = this.known;
+    const away = ([x1, y1, x2, y2]: Line): number => {
       const along = Math.min(1, Math.max(0, ((x - x1) * (x2 - x1) + (y - y1) * (y2 - y1)) / Math.hypot(x2 - x1, y2 - y1) ** 2));
       return Math.hypot(x1 + along * (x2 - x1) - x, y1 + along * (y2 - y1) - y);
     };
     const nearest = [...lines].sort((one, other) => away(one) - away(other))[0];
     const isAtEnd = nearest && Math.min(Math.hypot(x - nearest[0], y - nearest[1]), Math.hypot(x - nearest[2], y - nearest[3])) < NEAR * px;
-    if (nearest && !isAtEnd && away(nearest) < NEAR * px) void studio.commit({ lines: lines.filter((each) => each !== nearest) });
+    if (nearest && !isAtEnd && away(nearest) < NEAR * px) this.keep(lines.filter((each) => each !== nearest));
   }
 
   private draw(): void {
     const photo = studio.told?.photo;
-    const lines = this.lines ?? studio.state?.lines ?? [];
+    const lines = this.lines ?? this.known;
     byId<HTMLElement>("lines_row").hidden = !this.on;
+    byId<HTMLElement>("metres_row").hidden = this.axis !== "m";
+    if (studio.state?.measured && document.activeElement !== this.metres) this.metres.value = String(studio.state.measured[4]);
     byId<HTMLButtonElement>("lines_clear").disabled = !lines.length;
     this.drawn.replaceChildren();
     if (!photo || !this.on) return;

@@ -9,6 +9,9 @@ export type Pair = [number, number];
 /** Both ends of an edge in pixels, and its direction in the world: y upright, x and z the two level ones; h is the horizon. */
 export type DrawnLine = [number, number, number, number, "x" | "y" | "z" | "h"];
 
+/** Both ends of something upright on the ground, and how many metres high it is. */
+export type Measured = [number, number, number, number, number];
+
 /** An object that stands in the photograph. */
 export interface Placed {
   object: string;
@@ -20,6 +23,8 @@ export interface Placed {
 /** The state as the server keeps it; null leaves a thing to the command's own default. Object, place, height and turn are the chosen one's. */
 export interface State {
   photo: string | null;
+  clip: string | null;
+  track: string | null;
   slice: number | null;
   matte: string | null;
   object: string | null;
@@ -32,7 +37,9 @@ export interface State {
   before: Placed[];
   after: Placed[];
   pitch_deg: number | null;
+  roll_deg: number | null;
   camera_height_m: number | null;
+  measured: Measured | null;
   focal_length_mm: number | null;
   sensor_width_mm: number | null;
   f_number: number | null;
@@ -41,6 +48,7 @@ export interface State {
   sun_deg: Pair | null;
   shadow: number | null;
   exposure: number;
+  warmth_k: number | null;
   matched: boolean;
   plain: boolean;
 }
@@ -57,6 +65,7 @@ export interface Photo {
   camera_height_m: number | null;
   world_from_camera: Matrix3 | null;
   pitch_deg: number | null;
+  roll_deg: number | null;
   lens_f_number: number | null;
   /** How far the lens opens; null: as far as one likes. */
   widest_f_number?: number | null;
@@ -96,6 +105,8 @@ export interface Told {
   camera: { told: string; file?: string } | null;
   command: string | null;
   photo: Photo | null;
+  /** Of a clip: the command that films it, and where the chosen object's foot is seen in its frames. */
+  clip: { name: string; command: string | null; path_px: Pair[] } | null;
 }
 
 export type Box = [number, number, number, number];
@@ -203,7 +214,7 @@ export class Studio extends EventTarget {
       if (!Object.keys(this.local).length) return;
       this.sending = this.local;
       this.local = {};
-      const told = await this.post("/state", { changes: this.sending });
+      const told = await this.post("/state", { changes: this.sending, metres_typed: this.metresTyped });
       this.sending = {};
       if (told) this.take(told);
       else this.dispatchEvent(new Event("state"));
@@ -300,10 +311,10 @@ export class Studio extends EventTarget {
     if (change === this.changes) await this.ask(false, change);
   }
 
-  /** The part of the finished picture around a pixel, as the loupe shows it; null where another one was asked for since. */
-  async region(x_px: number, y_px: number, side_px: number): Promise<ImageBitmap | null> {
+  /** The part of the finished picture, or of the photograph as it is, around a pixel; null where another one was asked for since. */
+  async region(x_px: number, y_px: number, side_px: number, before = false): Promise<ImageBitmap | null> {
     const region = [x_px, y_px, side_px, this.shown?.coc_px[1] ?? 0];
-    const message = { changes: { ...this.sending, ...this.local }, pixels: this.pixels, page: pageName, region };
+    const message = { changes: { ...this.sending, ...this.local }, pixels: this.pixels, page: before ? `${pageName}b` : pageName, region, before };
     const answer = await fetch("/preview", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(message) });
     if (answer.status !== 200) return null;
     const body = await answer.arrayBuffer();

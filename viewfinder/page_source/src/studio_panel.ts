@@ -3,9 +3,12 @@ import { groundOf } from "./studio_ground";
 import { byId, type Pair, type Placed, type Save, scaledHeight, type State, studio } from "./studio_model";
 
 const F_NUMBERS = [1, 1.2, 1.4, 1.8, 2, 2.2, 2.4, 2.8, 3.2, 3.5, 4, 4.5, 5, 5.6, 6.3, 7.1, 8, 9, 10, 11, 13, 14, 16, 18, 20, 22, 25, 29, 32];
-const LONG_FORMATS: Record<string, string> = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers" };
+const LONG_FORMATS: Record<string, string> = { png: "PNG, 16 bit", jpeg: "JPEG", tiff: "TIFF, 16 bit", exr: "EXR, layers", clip: "Clip, MP4" };
 /** As the server guesses where only the exposure tells of the sun. */
 const DEFAULT_SUN: Pair = [-125, 50];
+
+/** Daylight of 6504 K in millionths of 1 / K, by which equal steps look alike. */
+const DAYLIGHT_MIRED = 1e6 / 6504;
 
 interface Slider {
   id: string;
@@ -36,8 +39,15 @@ const SLIDERS: Slider[] = [
     write: (v) => ({ exposure: Number((2 ** v).toPrecision(4)) }),
     shown: (v) => `${v > 0 ? "+" : ""}${v.toFixed(1)} stops`,
   },
+  {
+    id: "warmth",
+    read: (s) => (s.warmth_k ? Math.round(DAYLIGHT_MIRED - 1e6 / s.warmth_k) : 0),
+    write: (v) => ({ warmth_k: v === 0 ? null : Math.round(1e6 / (DAYLIGHT_MIRED - v)) }),
+    shown: (v) => (v === 0 ? "as guessed" : `${v > 0 ? "warmer" : "cooler"} by ${Math.abs(v)}`),
+  },
   { id: "shadow", read: (s) => s.shadow ?? 1, write: (v) => ({ shadow: v === 1 ? null : v }), shown: (v) => `${Math.round(100 * v)} %` },
   { id: "pitch", read: (s) => s.pitch_deg ?? studio.told?.photo?.pitch_deg ?? 0, write: (pitch_deg) => keepingSizes({ pitch_deg }), shown: (v) => degrees(v) },
+  { id: "roll", read: (s) => s.roll_deg ?? studio.told?.photo?.roll_deg ?? 0, write: (roll_deg) => keepingSizes({ roll_deg }), shown: (v) => degrees(v) },
 ];
 
 /** Where the sun is, or would be: as told, as the file tells, or somewhere. */
@@ -49,7 +59,7 @@ const sun = (sun_deg: Pair): Partial<State> => ({ sun_deg, plain: false });
 
 const NUMBERS: { id: string; name: keyof State; also?: Partial<State> }[] = [
   { id: "focus", name: "focus_m", also: { focus_at_px: null } },
-  { id: "camera_height", name: "camera_height_m" },
+  { id: "camera_height", name: "camera_height_m", also: { measured: null } },
   { id: "focal_length", name: "focal_length_mm" },
   { id: "sensor_width", name: "sensor_width_mm" },
 ];
@@ -68,7 +78,7 @@ export class Panel {
     const react = (id: string, changes: () => Partial<State>): void => byId(id).addEventListener("click", () => void studio.commit(changes()));
     react("focus_auto", () => ({ focus_m: null, focus_at_px: null }));
     react("f_number_auto", () => ({ f_number: null }));
-    react("camera_found", () => ({ camera: studio.told?.camera?.file ?? null, pitch_deg: null }));
+    react("camera_found", () => ({ camera: studio.told?.camera?.file ?? null, pitch_deg: null, roll_deg: null }));
     byId("object").addEventListener("change", (event) => {
       const object = (event.target as HTMLSelectElement).value;
       if (object) void studio.commit({ object, height: null });
@@ -209,6 +219,8 @@ export class Panel {
     byId<HTMLButtonElement>("camera_found").disabled = told.camera?.file === undefined;
     byId<HTMLInputElement>("plain").disabled = Boolean(told.photo && !told.photo.has_depth && !told.state.plain);
     const photo = told.photo;
+    // How a clip's camera was held, and how much light its ground loses, its track and its scene say.
+    document.querySelectorAll<HTMLElement>(".of_still").forEach((each) => (each.hidden = told.clip !== null));
     byId<HTMLElement>("slice_row").hidden = photo?.slices === undefined;
     document.querySelectorAll<HTMLElement>(".of_one").forEach((each) => (each.hidden = photo?.slices !== undefined));
     if (photo?.slices !== undefined) {
@@ -234,7 +246,9 @@ export class Panel {
       lenses.append(lensChoice("", "as the photograph tells", null), ...told.lenses.map((each, i) => lensChoice(each.path, each.name, i)));
     }
     const formats = byId<HTMLElement>("formats");
-    if (!formats.childElementCount) {
+    if (formats.dataset.shown !== String(told.formats)) {
+      formats.dataset.shown = String(told.formats);
+      formats.replaceChildren();
       for (const format of told.formats) {
         const button = document.createElement("button");
         button.textContent = LONG_FORMATS[format] ?? format;
@@ -281,9 +295,15 @@ export class Panel {
     lamp.setAttribute("cx", String(reach * Math.sin((turn * Math.PI) / 180)));
     lamp.setAttribute("cy", String(-reach * Math.cos((turn * Math.PI) / 180)));
     byId("dome").classList.toggle("off", state.sun_deg === null);
-    byId("command").textContent = (studio.isChanging ? studio.shown?.command : studio.told?.command) ?? "Place an object first.";
+    byId("command").textContent = this.commands((studio.isChanging ? studio.shown?.command : studio.told?.command) ?? null);
     document.querySelectorAll<HTMLButtonElement>("#formats button").forEach((each) => (each.disabled = !studio.isComplete));
     byId("focus_told").textContent = focusTold(state);
+  }
+
+  /** The command of the picture, and before it that of the whole clip. */
+  private commands(picture: string | null): string {
+    const clip = studio.told?.clip && !studio.isChanging ? studio.told.clip.command : null;
+    return [...(clip ? [clip] : []), picture ?? "Place an object first."].join("\n\n");
   }
 
   private fill(id: string, text: string): void {
@@ -296,7 +316,7 @@ export class Panel {
     byId("guessed").replaceChildren(
       ...[...groundTold(), ...shown.guessed, ...shown.warnings].map((sentence) => Object.assign(document.createElement("li"), { textContent: sentence })),
     );
-    if (studio.isChanging) byId("command").textContent = shown.command ?? "";
+    if (studio.isChanging) byId("command").textContent = this.commands(shown.command);
     if (studio.state) byId("focus_told").textContent = focusTold(studio.state);
   }
 }
@@ -316,7 +336,8 @@ function keepingSizes(changes: Partial<State>): Partial<State> {
 
 /** What the number of the height counts. */
 function heightNote(state: State): string {
-  const guessed = state.camera_height_m && !studio.told?.photo?.has_depth ? ` for a camera ${state.camera_height_m} m above the ground (see below)` : "";
+  const by = studio.told?.clip ? ", by the track" : state.measured ? ", by the known height" : " (see below)";
+  const guessed = state.camera_height_m && !studio.told?.photo?.has_depth ? ` for a camera ${state.camera_height_m} m above the ground${by}` : "";
   return `Metres${guessed}, or pixels such as 120px. Wheel, pinch, + and - scale it.`;
 }
 
@@ -325,6 +346,7 @@ function groundTold(): string[] {
   const [told, state] = [studio.told, studio.state];
   if (!told?.photo || told.photo.has_depth || !state?.camera_height_m) return [];
   const tilt = state.camera === null && state.pitch_deg !== null ? [`The camera looks down by ${state.pitch_deg}°, which little in the picture tells: see Camera and ground, or draw Lines.`] : [];
+  if (state.measured) return tilt;
   return [...tilt, `The camera is ${state.camera_height_m} m above the ground, or the table that it stands on; all metres hang on that.`];
 }
 

@@ -1,14 +1,16 @@
-// The picture: fitted to the window, with the ground over it, and everything that hands do on it.
+// The picture with the ground over it, and everything that hands do on it.
 import { listen } from "./gestures";
 import { Brush } from "./studio_brush";
 import { Lines, Shadow } from "./studio_lines";
 import { groundOf } from "./studio_ground";
 import { type Box, byId, type Pair, scaledHeight, studio } from "./studio_model";
+import { Loupe, View } from "./studio_view";
 
 const NUDGES_REST_MS = 500;
-const LOUPE_PX = 240;
 const DRAWN_AGAIN_MS = 900;
-const LOOKS_MS = 150;
+/** So far beside its box a mouse, and two fingers, still take the object. */
+const BESIDE_PX = 12;
+const FINGERS_BESIDE_PX = 48;
 
 /** Degrees from -180 to 180. */
 export const within180 = (turn_deg: number): number => ((((turn_deg + 180) % 360) + 360) % 360) - 180;
@@ -18,7 +20,8 @@ export class PictureStage {
   private readonly picture = byId<HTMLCanvasElement>("picture");
   private readonly before = byId<HTMLImageElement>("before");
   private readonly ground = byId<SVGSVGElement>("ground");
-  private readonly loupe = byId<HTMLCanvasElement>("loupe");
+  private readonly view = new View();
+  private readonly loupe = new Loupe();
   private readonly brush = new Brush();
   private readonly lines = new Lines();
   private readonly shadow = new Shadow();
@@ -26,39 +29,41 @@ export class PictureStage {
   private hint = "";
   private from: Pair | null = null;
   private moved: Pair = [0, 0];
+  private panning = false;
+  /** Whether the fingers that are down shape the object; null before they pinch. */
+  private shaping: boolean | null = null;
   private later: ReturnType<typeof setTimeout> | undefined;
-  private looking: ReturnType<typeof setTimeout> | undefined;
   private quiet: ReturnType<typeof setTimeout> | undefined;
 
   constructor() {
     new ResizeObserver(() => this.fit()).observe(byId("room"));
     studio.addEventListener("told", () => this.fit());
     studio.addEventListener("state", () => this.mark());
+    studio.addEventListener("view", () => this.mark());
     studio.addEventListener("picture", (event) => this.show((event as CustomEvent<ImageBitmap>).detail));
     this.gestures();
     this.keys();
     this.buttons();
   }
 
-  /** Make the picture as large as the window allows, and load the photograph when it is another one. */
+  /** Lay the picture out in the window, and load the photograph when it is another one. */
   private fit(): void {
     const photo = studio.told?.photo ?? null;
     this.stage.hidden = !photo;
     byId<HTMLElement>("welcome").hidden = Boolean(photo);
     if (!photo) return;
-    const room = byId<HTMLElement>("room").getBoundingClientRect();
-    const scale = Math.min(room.width / photo.width_px, room.height / photo.height_px);
-    this.stage.style.width = `${photo.width_px * scale}px`;
-    this.stage.style.height = `${photo.height_px * scale}px`;
-    studio.pixels = Math.max(4e4, photo.width_px * photo.height_px * (scale * devicePixelRatio) ** 2);
-    const name = `${photo.name} ${studio.told?.state.photo} ${photo.slice ?? ""} ${photo.width_px}`;
+    const of = `${photo.name} ${studio.told?.state.photo} ${photo.width_px}`;
+    const name = `${of} ${photo.slice ?? ""}`;
     if (name !== this.photoName) {
+      // Slices of one stack are compared at the same place.
+      if (this.photoName.startsWith(`${of} `)) this.view.lookAnew();
+      else this.view.reset();
       this.photoName = name;
       this.hint = "";
       this.before.src = `/photo?of=${encodeURIComponent(name)}`;
       this.before.decode().then(() => studio.isComplete || this.showPhotograph()).catch(() => undefined);
     }
-    this.mark();
+    this.view.fit();
   }
 
   /** What is to be done next, or what the studio does. */
@@ -103,7 +108,10 @@ export class PictureStage {
         const radius_m = box ? ground.length_m(each.at_px, 0.5 * (box[2] - box[0]) * photo.width_px) : ground.cell_m / 2;
         this.path(number === state.before.length ? "foot" : "foot other", ground.circle(each.at_px, radius_m));
       });
-      this.words(`one square: ${ground.cell_m} m`, photo.width_px * 0.015, photo.height_px * 0.985, photo.width_px / this.stage.clientWidth);
+      const seen = studio.isChanging ? [] : studio.told?.clip?.path_px ?? [];
+      if (seen.length) this.path("track", seen.map(([x, y], i) => `${i ? "L" : "M"}${x} ${y}`).join(""));
+      const [left, , right, bottom] = this.view.inSight;
+      this.words(`one square: ${ground.cell_m} m`, left + 0.015 * (right - left), bottom - 0.015 * (right - left), this.px);
     }
     if (photo && !studio.isComplete && this.before.complete && this.before.naturalWidth) this.showPhotograph();
     const box = byId<HTMLElement>("box");
@@ -175,14 +183,29 @@ export class PictureStage {
     return true;
   }
 
+  /** The button of the tool that waits for a hand on the picture. */
+  private get tool(): string | null {
+    return this.brush.on ? "brush" : this.lines.on ? "draw_lines" : this.shadow.on ? "sun_by" : this.stage.classList.contains("focusing") ? "focus_here" : null;
+  }
+
+  /** Whether a point of the window lies on the chosen object, or so near beside it. */
+  private isBy(x: number, y: number, beside_px: number): boolean {
+    const box = studio.isComplete ? this.boxOf(studio.state!.before.length) : null;
+    const stage = this.stage.getBoundingClientRect();
+    const [u, v, across, down] = [(x - stage.left) / stage.width, (y - stage.top) / stage.height, beside_px / stage.width, beside_px / stage.height];
+    return box !== null && u >= box[0] - across && u <= box[2] + across && v >= box[1] - down && v <= box[3] + down;
+  }
+
   private gestures(): void {
+    this.stage.addEventListener("pointerdown", (event) => event.isPrimary && (this.shaping = null), true);
     listen(this.stage, {
       tap: (x, y) => this.tapped(x, y),
       twice: (x, y) => this.tapped(x, y),
       dragStart: (x, y) => {
         if (this.brush.on) return this.brush.start(this.pixel(x, y));
         if (this.lines.on) return this.lines.start(this.pixel(x, y), this.px);
-        if (this.loupe.hidden) this.chose(x, y);
+        if (!this.loupe.on) this.chose(x, y);
+        this.panning = this.view.isEnlarged && !this.loupe.on && (this.shadow.on || !this.isBy(x, y, BESIDE_PX));
         this.from = studio.state?.at_px ?? this.inside(this.pixel(x, y));
         this.moved = [0, 0];
         this.stage.classList.add("dragging");
@@ -190,8 +213,9 @@ export class PictureStage {
       drag: (x, y, dx, dy) => {
         if (this.brush.on) return this.brush.move(this.pixel(x, y));
         if (this.lines.on) return this.lines.move(this.pixel(x, y));
+        if (this.panning) return this.view.by(1, x, y, dx, dy);
         // Under the loupe a finger looks, and moves nothing.
-        if (!this.from || !studio.state?.object || !this.loupe.hidden || this.shadow.on) return;
+        if (!this.from || !studio.state?.object || this.loupe.on || this.shadow.on) return;
         this.moved = [this.moved[0] + dx * this.px, this.moved[1] + dy * this.px];
         studio.change({ at_px: this.inside([this.from[0] + this.moved[0], this.from[1] + this.moved[1]]) });
       },
@@ -199,10 +223,17 @@ export class PictureStage {
         if (this.brush.on) return pinched ? this.brush.drop() : void this.brush.end();
         if (this.lines.on) return this.lines.stop(this.px, pinched);
         this.from = null;
+        this.panning = false;
         this.stage.classList.remove("dragging");
         void studio.commit();
       },
-      pinch: (factor, _x, _y, _dx, _dy, turn_deg) => (this.brush.on ? this.brush.scale(factor) : this.lines.on || this.shadow.on || this.shape(factor, turn_deg)),
+      // Two fingers on the object scale and turn it; elsewhere, while a tool waits, and in the enlarged picture they zoom that.
+      pinch: (factor, x, y, dx, dy, turn_deg) => {
+        this.shaping ??= this.tool === null && !this.view.isEnlarged && this.isBy(x, y, FINGERS_BESIDE_PX);
+        return this.shaping ? this.shape(factor, turn_deg) : this.view.by(factor, x, y, dx, dy);
+      },
+      wheel: (factor, turn_deg) => (this.brush.on ? this.brush.scale(factor) : this.lines.on || this.shadow.on || this.shape(factor, turn_deg)),
+      zoom: (factor, x, y, dx, dy) => this.view.by(factor, x, y, dx, dy),
     });
   }
 
@@ -220,6 +251,7 @@ export class PictureStage {
     if (!studio.state?.object) return studio.say("choose an object first: in the list at the right, or drop a GLB file");
     const ground = groundOf(studio.told.photo, studio.state);
     if (!ground || ground.isInSight) return void studio.commit({ at_px: this.inside(this.pixel(x, y)) });
+    if (studio.told.clip) return studio.say("the first frame shows no ground of the track's world: begin the clip where it does");
     const at_px = this.pixel(x, y);
     void studio.commit({ at_px, camera: null, pitch_deg: ground.usualTilt_deg(at_px) });
     this.hint = "the camera looks up, so that no ground is in sight: another tilt is taken, see Camera and ground";
@@ -266,7 +298,9 @@ export class PictureStage {
       const shapes: Record<string, [number, number]> = { "+": [1.05, 0], "=": [1.05, 0], "-": [1 / 1.05, 0], "[": [1, -step], "]": [1, step], "{": [1, -10], "}": [1, 10] };
       const [move, shape] = [moves[event.key], shapes[event.key]];
       if (move) {
-        studio.change({ at_px: this.inside([x + step * move[0], y + step * move[1]]) });
+        const at_px = this.inside([x + step * move[0], y + step * move[1]]);
+        studio.change({ at_px });
+        this.view.reveal(at_px);
         this.commitLater();
       } else if (shape) this.shape(...shape);
       else if (event.key === "Delete" || event.key === "Backspace") studio.remove();
@@ -274,8 +308,9 @@ export class PictureStage {
       event.preventDefault();
     });
     document.addEventListener("keydown", (event) => {
-      const tool = this.brush.on ? "brush" : this.lines.on ? "draw_lines" : this.shadow.on ? "sun_by" : this.stage.classList.contains("focusing") ? "focus_here" : null;
-      if (event.key === "Escape" && tool) byId<HTMLElement>(tool).click();
+      // What waits is left first, then the loupe, then the enlarged picture.
+      const left = this.tool ?? (this.loupe.on ? "magnify" : this.view.isEnlarged ? "zoom" : null);
+      if (event.key === "Escape" && left) byId<HTMLElement>(left).click();
       if (!(event.ctrlKey || event.metaKey) || (event.target as Element).matches?.("input[type=text], input[type=number]")) return;
       const key = event.key.toLowerCase();
       if (key !== "z" && key !== "y") return;
@@ -304,44 +339,17 @@ export class PictureStage {
       this.stage.classList.toggle("focusing", on);
       studio.say(on ? "click what is to be in focus: the object, or a place on the ground" : "", on);
     });
-    pressed("magnify", (on) => {
-      this.loupe.hidden = !on;
-      this.loupe.style.left = "-9999px";  // until a pointer shows where
-    });
     this.stage.addEventListener("pointermove", (event) => {
-      if (!this.loupe.hidden) this.magnify(event);
       if (this.brush.on && studio.told?.photo) this.brush.hover(this.pixel(event.clientX, event.clientY));
     });
     const hold = byId<HTMLElement>("hold_before");
     const show = (on: boolean): void => {
       this.before.hidden = !on && byId("brush_hide").getAttribute("aria-pressed") !== "true";
+      studio.dispatchEvent(new Event("before"));
     };
     hold.addEventListener("pointerdown", () => show(true));
     for (const end of ["pointerup", "pointercancel", "pointerleave", "blur"]) hold.addEventListener(end, () => show(false));
     hold.addEventListener("keydown", (event) => (event.key === " " || event.key === "Enter") && show(true));
     hold.addEventListener("keyup", () => show(false));
-  }
-
-  /** Show what lies under the pointer with one pixel of the photograph to one of the screen: the preview, then the finished picture. */
-  private magnify(event: PointerEvent): void {
-    const box = this.stage.getBoundingClientRect();
-    const [x, y] = [event.clientX - box.left, event.clientY - box.top];
-    const photo = studio.told!.photo!;
-    const side = LOUPE_PX * devicePixelRatio;
-    this.loupe.width = this.loupe.height = side;
-    const cut = (side * this.picture.width) / photo.width_px;
-    const [left, top] = [(x / box.width) * this.picture.width - cut / 2, (y / box.height) * this.picture.height - cut / 2];
-    this.loupe.getContext("2d")!.drawImage(this.picture, left, top, cut, cut, 0, 0, side, side);
-    const within = (value: number, most: number): number => Math.min(Math.max(0, most - LOUPE_PX), Math.max(0, value));
-    Object.assign(this.loupe.style, { left: `${within(x + 20, box.width)}px`, top: `${within(y - LOUPE_PX - 20, box.height)}px` });
-    clearTimeout(this.looking);
-    this.looking = setTimeout(() => void this.look(this.pixel(event.clientX, event.clientY), side), LOOKS_MS);
-  }
-
-  private async look([x_px, y_px]: Pair, side: number): Promise<void> {
-    const timer = this.looking;
-    const bitmap = studio.isComplete ? await studio.region(x_px, y_px, side).catch(() => null) : null;
-    if (bitmap && timer === this.looking && !this.loupe.hidden) this.loupe.getContext("2d")!.drawImage(bitmap, 0, 0, side, side);
-    if (bitmap) this.loupe.dataset.looked = String(Number(this.loupe.dataset.looked ?? 0) + 1);
   }
 }
