@@ -32,7 +32,7 @@ from mrbokeh.layering.hidden_background import split_edges
 from mrbokeh.layering.highlights import find_highlights
 from mrbokeh.layering.padded_layers import PaddedLayer, Pixels, coc_px_of, pad_layer
 from mrbokeh.layering.psf_over_field import FIELD_CELLS, AperturePsf, Frame, KernelSum, PsfField
-from mrbokeh.layering.pupil_views import Cut, Rims, can_see_through
+from mrbokeh.layering.pupil_views import Cut, Rims
 from mrbokeh.layering.slices import Channels, Slicing, composited
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
@@ -74,7 +74,7 @@ def render_layers(layers: Sequence[Layer], lens: Lens, kernel_sum: KernelSum | P
         groups = _groups([pad_layer(layer, each, margin, pool) for layer, each in zip(layers, coc_px, strict=True)])
         cuts = [_cut(group, layering, pool) for group in groups]
         rims = _rims(cuts, psf, frame) if layering.sees_rims and layering.fill else None
-        lights = rims.take_lights() if rims else []
+        lights = rims.take_lights() if rims and isinstance(psf, AperturePsf) else []  # a bank has kernels of its own
         found: tuple[Channels, Channels] | None = None
         for cut in reversed(cuts):
             front = composited(cut.surfaces, slicing, by_depth=not cut.is_opaque)
@@ -94,10 +94,11 @@ def _cut(group: Sequence[PaddedLayer], layering: Layering, pool: Executor) -> Cu
 
 
 def _rims(cuts: Sequence[Cut], psf: PsfField, frame: Frame) -> Rims | None:
-    """Return the rims of a scene without holes, if it has any and the lens has one opening for all that it sees."""
-    if not (isinstance(psf, AperturePsf) and psf.motion is None and can_see_through(psf.aperture) and cuts[-1].is_opaque):
+    """Return the rims of a scene without holes, if it has any and rays through the lens can be followed."""
+    opening = psf.opening
+    if opening is None or not cuts[-1].is_opaque:
         return None
-    rims = Rims.of(cuts, psf.aperture, frame)
+    rims = Rims.of(cuts, opening, frame)
     return rims if rims.tiles.any() else None
 
 

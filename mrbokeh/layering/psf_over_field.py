@@ -154,6 +154,11 @@ class PsfField(Protocol):
     @property
     def coverages(self) -> int: ...
 
+    @property
+    def opening(self) -> Aperture | None:
+        """Return the opening through which single rays are followed; None where none stands for all colours and sides of the focus."""
+        ...
+
     def drawn_px(self, coc_px: Plane) -> Plane:
         """Return the signed diameters by which kernels are chosen for circles of confusion, in the same order."""
         ...
@@ -203,6 +208,11 @@ class AperturePsf:
     @property
     def coverages(self) -> int:
         return 3 if self.aperture.is_chromatic else 1
+
+    @property
+    def opening(self) -> Aperture | None:
+        is_one = self.motion is None and not self.aperture.is_chromatic and self.aperture.spherical_aberration == 0.0
+        return self.aperture if is_one else None
 
     def drawn_px(self, coc_px: Plane) -> Plane:
         return drawn_diameters_px(coc_px, self.aperture)

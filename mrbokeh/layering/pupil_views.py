@@ -73,11 +73,6 @@ class Cut(NamedTuple):
         return [self.surfaces[1], self.surfaces[-1]] if self.is_opaque else []
 
 
-def can_see_through(aperture: Aperture) -> bool:
-    """Return whether a pupil is one opening for all colours and both sides of the focus; it may vary over the frame."""
-    return not aperture.is_chromatic and aperture.spherical_aberration == 0.0
-
-
 @dataclass(frozen=True)
 class Rims:
     """Rims of a scene without holes as the pupil sees them.
@@ -105,11 +100,11 @@ class Rims:
             flat, dark = layer.values.reshape(-1, layer.values.shape[2]), np.empty((len(places), 3), np.float32)
             darken(dark, places, flat, lit.reshape(-1), width, float(LIGHT_OVER_SURROUNDINGS))
             rgb = flat[places, :3] - dark
-            kept = rgb.max(axis=1, initial=0.0) > 0
-            found.append(_Lights(places[kept], rgb[kept], layer.coc_px.reshape(-1)[places[kept]]))
-            at = np.searchsorted(surface.places, places[kept])
-            there = (at < len(surface.places)) & (surface.places[np.minimum(at, len(surface.places) - 1)] == places[kept])
-            surface.values[at[there], :3] = dark[kept][there]
+            _, of_surface, of_lights = np.intersect1d(surface.places, places, assume_unique=True, return_indices=True)
+            kept = rgb[of_lights].max(axis=1, initial=0.0) > 0
+            of_surface, of_lights = of_surface[kept], of_lights[kept]
+            surface.values[of_surface, :3] = dark[of_lights]
+            found.append(_Lights(places[of_lights], rgb[of_lights], surface.coc_px[of_surface]))
         return found
 
     def _reach_rims(self, places: Int64[np.ndarray, " lights"], coc_px: Sizes, width: int) -> Bool[np.ndarray, " lights"]:

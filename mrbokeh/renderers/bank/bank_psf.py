@@ -18,6 +18,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.layering.motion import MOTION, farthest_px, motion_channels, motion_of, moved
 from mrbokeh.layering.padded_layers import Part
 from mrbokeh.layering.psf_over_field import Channels, Frame, Plane
+from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.drawn_diameters import drawn_diameters_px
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.psf_bank import Axis
@@ -61,6 +62,12 @@ class BankPsf:
     @property
     def coverages(self) -> int:
         return self.tables.bank.channels
+
+    @property
+    def opening(self) -> Aperture | None:
+        from mrbokeh.renderers.bank.bank_lens import opening_of
+
+        return None if self.motion is not None else opening_of(self.tables.bank)
 
     def drawn_px(self, coc_px: Plane) -> Plane:
         """Return drawn diameters: kernels of banks hold the pixel's area as those of openings do.
