@@ -1,4 +1,4 @@
-"""What slices cannot know at rims: which part of the pupil is taken.
+"""Corrections at rims, where slices do not know which part of the pupil is taken.
 
 Layers that lie over one another are blurred by themselves, then the front hides as much of what is behind as it covers. That is right
 only where both take parts of the pupil that have nothing to do with each other: beside a rim in front the free part of the pupil may see

@@ -65,9 +65,7 @@ class BankPsf:
 
     @property
     def opening(self) -> Aperture | None:
-        from mrbokeh.renderers.bank.bank_lens import opening_of
-
-        return None if self.motion is not None else opening_of(self.tables.bank)
+        return None if self.farthest_px > 0 else opening_of(self.tables.bank)
 
     def drawn_px(self, coc_px: Plane) -> Plane:
         """Return drawn diameters: kernels of banks hold the pixel's area as those of openings do.
