@@ -33,7 +33,6 @@ from mrbokeh.compositing.near_and_far import (
     TOLERANCE,
     Highlights,
     NearAndFar,
-    continued,
     cut_in_two,
     nearer_than,
     reach_px,
@@ -44,6 +43,7 @@ from mrbokeh.compositing.near_and_far import (
 from mrbokeh.compositing.plate import Inserted, Plate, same_size
 from mrbokeh.compositing.pupil_shares import PupilMeans, Rays
 from mrbokeh.images.layer import Layer, clear, flatten
+from mrbokeh.layering.hidden_background import continued
 from mrbokeh.layering.highlights import find_highlights
 from mrbokeh.optics.pupil_points import pupil_points
 from mrbokeh.renderers.base import Renderer

@@ -15,8 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
 
-from mrbokeh.compositing.near_and_far import continued, cut_in_two, reach_px, without_edge
+from mrbokeh.compositing.near_and_far import cut_in_two, reach_px, without_edge
 from mrbokeh.compositing.plate import Plate
+from mrbokeh.layering.hidden_background import continued
 from mrbokeh.layering.highlights import find_highlights
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.system.resources import in_bands, workers

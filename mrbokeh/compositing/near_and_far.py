@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float32, Int64
 
 from mrbokeh.compositing.plate import Plate
 from mrbokeh.images.layer import Layer, flatten
-from mrbokeh.layering.hidden_background import split_edges
+from mrbokeh.layering.hidden_background import continued, split_edges
 from mrbokeh.layering.highlights import find_highlights, without_highlights
 from mrbokeh.layering.padded_layers import PaddedLayer
 from mrbokeh.optics.lens import Lens
@@ -79,24 +79,6 @@ def with_told_depth(plate: Plate, layers: Sequence[Layer]) -> Plate:
 def nearer_than(depth_m: Plane, virtual_depth_m: Plane, tolerance: float) -> Mask:
     """Return the pixels whose photographed surface lies before the virtual one by more than a share `tolerance` of its depth."""
     return np.isfinite(virtual_depth_m) & (depth_m * np.float32(1.0 + tolerance) < virtual_depth_m)
-
-
-def continued(values: np.ndarray, known: Mask) -> np.ndarray:
-    """Values (H, W) or (H, W, C) of the nearest pixel where they are known; as they are where none is."""
-    if known.all() or not known.any():
-        return values
-    return values.reshape(-1, *values.shape[2:])[nearest_places(known)]
-
-
-def nearest_places(known: Mask) -> Int64[np.ndarray, "height width"]:
-    """Per pixel the place (row times width plus column) of the nearest known one; some pixel must be known."""
-    from cv2 import DIST_L2, DIST_LABEL_PIXEL, DIST_MASK_5, distanceTransformWithLabels
-
-    _, labels = distanceTransformWithLabels((~known).astype(np.uint8), DIST_L2, DIST_MASK_5, labelType=DIST_LABEL_PIXEL)
-    place_of = np.zeros(int(labels.max()) + 1, np.int64)
-    places = np.flatnonzero(known)
-    place_of[labels.reshape(-1)[places]] = places
-    return place_of[labels]
 
 
 def cut_in_two(sharp_rgb: Picture, depth_m: Plane, near: Mask, reach_px: float, tolerance: float) -> NearAndFar:

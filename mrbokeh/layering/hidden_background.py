@@ -11,7 +11,7 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Int, Int32
+from jaxtyping import Bool, Float32, Int, Int32, Int64
 
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.highlights import mark_highlights
@@ -115,6 +115,24 @@ def _unmix(values: Values, edges: _Edges, rims: Places, behind: Pixels) -> None:
     of_behind = np.searchsorted(behind.places, rims)
     unmix_rims(front, front_coc_px, behind.values, rims, of_behind, values, edges.coc_px, edges.lit, STEP_PX)
     flat_values[rims], flat_coc_px[rims] = front, front_coc_px
+
+
+def continued(values: np.ndarray, known: Mask) -> np.ndarray:
+    """Values (H, W) or (H, W, C) of the nearest pixel where they are known; as they are where none is."""
+    if known.all() or not known.any():
+        return values
+    return values.reshape(-1, *values.shape[2:])[nearest_places(known)]
+
+
+def nearest_places(known: Mask) -> Int64[np.ndarray, "height width"]:
+    """Per pixel the place (row times width plus column) of the nearest known one; some pixel must be known."""
+    from cv2 import DIST_L2, DIST_LABEL_PIXEL, DIST_MASK_5, distanceTransformWithLabels
+
+    _, labels = distanceTransformWithLabels((~known).astype(np.uint8), DIST_L2, DIST_MASK_5, labelType=DIST_LABEL_PIXEL)
+    place_of = np.zeros(int(labels.max()) + 1, np.int64)
+    places = np.flatnonzero(known)
+    place_of[labels.reshape(-1)[places]] = places
+    return place_of[labels]
 
 
 def layer_from_view(

@@ -5,7 +5,7 @@ Shared by all renderers that sum kernels; they differ in the `KernelSum` alone (
 Circles of confusion are diameters at which kernels are drawn (mrbokeh.optics.drawn_diameters) from here on.
 1. Every layer is continued beyond the frame by the largest blur: the border of an opaque one outwards, one with holes not at all.
 2. Layers are rendered one by one and laid over one another, but an opaque layer together with what is behind it, and
-   layers that interleave in depth together.
+   layers that interleave in depth together; an opaque one is parted before and behind those that it interleaves with.
 3. Pixels are sorted into slices of equal steps of the signed circle of confusion, hard: a pixel shared between slices
    would let light through an opaque surface. Within a slice each pixel keeps its own circle of confusion.
 4. Front to back, each slice takes what is still free of the pupil at every pixel, at most its own coverage. Slices of
@@ -21,14 +21,14 @@ Circles of confusion are diameters at which kernels are drawn (mrbokeh.optics.dr
    (mrbokeh.layering.psf_over_field), so it is not made up for here, and what is behind does not shine through.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mrbokeh.images.layer import Layer
-from mrbokeh.layering.hidden_background import split_edges
+from mrbokeh.layering.hidden_background import Mask, continued, split_edges
 from mrbokeh.layering.highlights import find_highlights
 from mrbokeh.layering.padded_layers import PaddedLayer, Pixels, coc_px_of, pad_layer
 from mrbokeh.layering.psf_over_field import FIELD_CELLS, AperturePsf, Frame, KernelSum, PsfField
@@ -72,7 +72,7 @@ def render_layers(layers: Sequence[Layer], lens: Lens, kernel_sum: KernelSum | P
     with ThreadPoolExecutor(cores()) as pool:
         slicing = Slicing(psf=psf, slices=layering.slices, frame=frame, pool=pool, memory=_KEPT)
         groups = _groups([pad_layer(layer, each, margin, pool) for layer, each in zip(layers, coc_px, strict=True)])
-        cuts = [_cut(group, layering, pool) for group in groups]
+        cuts = [cut for group in groups for cut in _cuts(group, layering, pool)]
         rims = _rims(cuts, psf, frame) if layering.sees_rims and layering.fill else None
         lights = rims.take_lights() if rims and isinstance(psf, AperturePsf) else []  # a bank has kernels of its own
         found: tuple[Channels, Channels] | None = None
@@ -87,10 +87,33 @@ def render_layers(layers: Sequence[Layer], lens: Lens, kernel_sum: KernelSum | P
     return _as_layer(*found, layers)
 
 
-def _cut(group: Sequence[PaddedLayer], layering: Layering, pool: Executor) -> Cut:
+def _cuts(group: Sequence[PaddedLayer], layering: Layering, pool: Executor) -> Iterator[Cut]:
+    """Yield what is laid over one another of layers that must be rendered together, front first."""
     lights = [find_highlights(layer.values) for layer in group] if layering.sees_rims else []
-    pixels = _with_hidden(group, pool) if layering.fill and group[0].is_opaque else [Pixels.covered(layer) for layer in group]
-    return Cut(group, pixels, lights)
+    if layering.fill and group[0].is_opaque:
+        yield Cut(group, _with_hidden(group, pool), lights)
+    elif layering.fill and layering.sees_rims and group[-1].is_opaque:
+        yield from _parted(group, lights, pool)
+    else:
+        yield Cut(group, [Pixels.covered(layer) for layer in group], lights)
+
+
+def _parted(group: Sequence[PaddedLayer], lights: Sequence[Mask], pool: Executor) -> Iterator[Cut]:
+    """Yield what of an opaque picture is nearer than the layers listed before it, those layers, and the rest of the picture."""
+    *before, picture = group
+    virtual_px = np.full(picture.coc_px.shape, np.inf, np.float32)
+    for layer in before:
+        virtual_px = np.where(layer.values[..., 3] > 0, np.minimum(virtual_px, layer.coc_px), virtual_px)
+    virtual_px = continued(virtual_px, np.isfinite(virtual_px))
+    front, behind = split_edges(picture, pool)
+    values, coc_px = front.values.reshape(picture.values.shape), front.coc_px.reshape(picture.coc_px.shape)
+    is_near = coc_px < virtual_px - _ONE_SURFACE_PX
+    if is_near.any():
+        near = PaddedLayer(np.where(is_near[..., None], values, np.float32(0.0)), coc_px, False)
+        yield Cut([near], [Pixels.covered(near)], [lights[-1] & is_near])
+    yield Cut(before, [Pixels.covered(layer) for layer in before], lights[:-1])
+    far = PaddedLayer(np.where(is_near[..., None], np.float32(0.0), values), coc_px, True)
+    yield Cut([far], [Pixels.of(far), behind], [lights[-1] & ~is_near])
 
 
 def _rims(cuts: Sequence[Cut], psf: PsfField, frame: Frame) -> Rims | None:

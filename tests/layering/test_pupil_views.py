@@ -85,6 +85,18 @@ def test_one_colour_behind_and_one_surface_alone_stay_as_slices_have_them() -> N
         np.testing.assert_allclose(row_of(RIMS, layers), row_of(SLICES, layers), atol=2e-6)
 
 
+def test_a_layer_between_near_and_far_of_one_picture_is_as_if_all_three_were_given() -> None:
+    """A red card listed first, and a picture of a black post before it and an even wall behind it, whose hidden part is no guess."""
+    post, behind = card(-14.0, 20), wall(10.0, 0)
+    red = card(-5.0, EDGE_PX)
+    red.rgb[..., 0] = 0.8 * red.alpha
+    picture = opaque(behind.rgb * (1.0 - post.alpha[..., None]), np.where(post.alpha > 0, post.depth_m, behind.depth_m))
+    given = RIMS.render([post, red, behind], LENS).rgb
+    np.testing.assert_allclose(RIMS.render([red, picture], LENS).rgb, given, atol=0.01)
+    # Without parting light of the wall shows through beside the post.
+    assert np.abs(SLICES.render([red, picture], LENS).rgb - given).max() > 0.1
+
+
 def test_sums_over_the_pupil_are_those_of_plain_loops() -> None:
     generator = np.random.default_rng(3)
     rows, columns, around, count = 9, 11, 6, 40

@@ -11,13 +11,13 @@ import numpy as np
 
 from datasets_scripts.made_sets.truth_set import lens_shape
 from mrbokeh.compositing.between import Between
-from mrbokeh.compositing.near_and_far import continued
 from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.compositing.plate import Inserted, Plate, plate_of
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import read_image, read_layer
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer
+from mrbokeh.layering.hidden_background import continued
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
