@@ -11,7 +11,7 @@ Lights are too bright for that. Those whose blur reaches a rim are taken out bef
 blur one sees along single rays whether something nearer is in the way: a lamp behind a twig is cut by it as by a knife.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -77,17 +77,20 @@ class Cut(NamedTuple):
 class Rims:
     """Rims of a scene without holes as the pupil sees them.
 
-    tiles: marked where light from beside or behind a rim may arrive. frame: placement of arrays with their margin.
+    tiles: marked where light from beside or behind a rim may arrive; layer_tiles: the same for borders of layers alone. frame: placement
+    of arrays with their margin.
     """
 
     cuts: Sequence[Cut]
     aperture: Aperture
     frame: Frame
     tiles: Mask
+    layer_tiles: Mask
 
     @classmethod
     def of(cls, cuts: Sequence[Cut], aperture: Aperture, frame: Frame) -> "Rims":
-        return cls(cuts, aperture, frame, _tiles(cuts, aperture, frame))
+        of_layers = _tiles(_rims_of_layers(cuts), aperture, frame)
+        return cls(cuts, aperture, frame, of_layers | _tiles(_rims_of_picture(cuts), aperture, frame), of_layers)
 
     def take_lights(self) -> "list[_Lights]":
         """Take lights whose blur reaches a rim out of the surfaces, which keep what is around them in their place."""
@@ -139,7 +142,7 @@ class Rims:
         surfaces = [(each, group) for group, cut in enumerate(self.cuts) for each in cut.surfaces if len(each.places)]
         groups = np.array([group for _, group in surfaces])
         views = _Views([each for each, _ in surfaces], groups, self.aperture, self.frame)
-        list(pool.map(lambda block: views.correct(colour, self.tiles, block), _blocks(self.tiles, self.frame)))
+        list(pool.map(lambda block: views.correct(colour, self.layer_tiles, block), _blocks(self.layer_tiles, self.frame)))
 
 
 @dataclass(frozen=True)
@@ -151,31 +154,33 @@ class _Lights:
     coc_px: Float32[np.ndarray, " lights"]
 
 
-def _tiles(cuts: Sequence[Cut], aperture: Aperture, frame: Frame) -> Mask:
+def _tiles(rims: Iterable[tuple[Places, Sizes]], aperture: Aperture, frame: Frame) -> Mask:
     """Mark the tiles of the picture that light from beside or behind a rim may reach."""
     from mrbokeh.layering._pupil_views_numba import mark_reach
 
     tiles = np.zeros((-(-frame.height_px // _TILE_PX), -(-frame.width_px // _TILE_PX)), np.bool_)
-    for places, coc_px in _rims(cuts):
+    for places, coc_px in rims:
         reach_px = np.ceil(0.5 * aperture.unit_radius * coc_px).astype(np.int32) + _BESIDE_PX
         mark_reach(tiles, _TILE_PX, frame.width_px - 2 * frame.left_px, -frame.left_px, places, reach_px)
     return tiles
 
 
-def _rims(cuts: Sequence[Cut]) -> Iterator[tuple[Places, Sizes]]:
-    """Yield places beside which something hides something else, and the larger circle of confusion of both (without sign)."""
+def _rims_of_picture(cuts: Sequence[Cut]) -> Iterator[tuple[Places, Sizes]]:
+    """Yield places at which a picture hides itself, and the larger circle of confusion of both surfaces (without sign)."""
+    for cut in cuts:
+        for behind in cut.hidden:
+            yield behind.places, np.maximum(np.abs(behind.coc_px), np.abs(cut.surfaces[0].coc_px[behind.places]))
+
+
+def _rims_of_layers(cuts: Sequence[Cut]) -> Iterator[tuple[Places, Sizes]]:
+    """Yield places at the borders of layers with holes, and the larger circle of confusion of the layer and the picture."""
     from cv2 import erode
 
     opaque_px = next(cut.surfaces[0].coc_px for cut in cuts if cut.is_opaque)
-    for cut in cuts:
-        if cut.is_opaque:
-            for behind in cut.hidden:
-                yield behind.places, np.maximum(np.abs(behind.coc_px), np.abs(opaque_px[behind.places]))
-        for layer in cut.layers:
-            if not layer.is_opaque:
-                covered = (layer.values[..., 3] > 0).astype(np.uint8)
-                places = np.flatnonzero((covered > 0) & (np.asarray(erode(covered, np.ones((3, 3), np.uint8))) == 0)).astype(np.int32)
-                yield places, np.maximum(np.abs(layer.coc_px.reshape(-1)[places]), np.abs(opaque_px[places]))
+    for layer in (layer for cut in cuts for layer in cut.layers if not layer.is_opaque):
+        covered = (layer.values[..., 3] > 0).astype(np.uint8)
+        places = np.flatnonzero((covered > 0) & (np.asarray(erode(covered, np.ones((3, 3), np.uint8))) == 0)).astype(np.int32)
+        yield places, np.maximum(np.abs(layer.coc_px.reshape(-1)[places]), np.abs(opaque_px[places]))
 
 
 def _blocks(tiles: Mask, frame: Frame) -> Iterator[tuple[int, int, int, int]]:

@@ -76,6 +76,13 @@ async def dragged(page: Page, start: tuple[float, float], way: tuple[float, floa
     await page.send("Input.dispatchMouseEvent", type="mouseReleased", x=points[-1][0], y=points[-1][1], button="left", clickCount=1)
 
 
+on_desk_and_slowly_on_phones = pytest.mark.parametrize(
+    "size_px",
+    [DESK, pytest.param(UPRIGHT, marks=pytest.mark.slow), pytest.param(LEVEL, marks=pytest.mark.slow)],
+    ids=["desk", "upright", "level"],
+)
+
+
 @pytest.mark.parametrize("size_px", [DESK, UPRIGHT, LEVEL], ids=["desk", "upright", "level"])
 async def test_an_object_is_placed_dragged_turned_focused_on_undone_and_saved(tmp_path: Path, size_px: tuple[int, int]) -> None:
     async with opened(tmp_path, size_px) as (page, made):
@@ -437,7 +444,7 @@ async def test_lines_are_drawn_corrected_and_removed(tmp_path: Path, size_px: tu
         assert page.errors == []
 
 
-@pytest.mark.parametrize("size_px", [DESK, UPRIGHT, LEVEL], ids=["desk", "upright", "level"])
+@on_desk_and_slowly_on_phones
 async def test_somebody_of_known_height_gives_the_ground_its_metres(tmp_path: Path, size_px: tuple[int, int]) -> None:
     """A foot a third of the picture below the level horizon and a head a ninth below it: the camera is 1.5 times as high as that."""
     async with opened(tmp_path, size_px) as (page, made):
@@ -507,7 +514,7 @@ async def test_objects_keep_their_size_in_the_picture_when_the_ground_moves(tmp_
         assert made.desk.state.height == "0.5" and page.errors == []
 
 
-@pytest.mark.parametrize("size_px", [DESK, UPRIGHT, LEVEL], ids=["desk", "upright", "level"])
+@on_desk_and_slowly_on_phones
 async def test_a_turned_camera_is_levelled(tmp_path: Path, size_px: tuple[int, int]) -> None:
     """The horizon rises to the right by the angle that the camera is turned clockwise; the tilt by the slider leaves that as it is."""
     async with opened(tmp_path, size_px) as (page, made):
@@ -532,7 +539,7 @@ async def test_a_turned_camera_is_levelled(tmp_path: Path, size_px: tuple[int, i
         assert made.desk.state.roll_deg == 8.0 and page.errors == []
 
 
-@pytest.mark.parametrize("size_px", [DESK, UPRIGHT, LEVEL], ids=["desk", "upright", "level"])
+@on_desk_and_slowly_on_phones
 async def test_the_objects_light_gets_warmer_at_once_and_the_ground_keeps_its_colour(tmp_path: Path, size_px: tuple[int, int]) -> None:
     """By 75 millionths of 1 / K warmer: white then has 1.32 times as much red and 0.64 times as much blue."""
     seen = """(() => {{
@@ -601,7 +608,7 @@ async def test_light_lens_and_before_are_shown(tmp_path: Path) -> None:
         assert page.errors == []
 
 
-@pytest.mark.parametrize("size_px", [DESK, UPRIGHT, LEVEL], ids=["desk", "upright", "level"])
+@on_desk_and_slowly_on_phones
 async def test_a_clip_shows_its_track_and_is_filmed(tmp_path: Path, size_px: tuple[int, int]) -> None:
     """The path of the object's foot through the frames follows where it stands; saved is what `mrbokeh video` makes of it."""
     clip = write_live_clip(tmp_path, WIDTH, HEIGHT, 3)
