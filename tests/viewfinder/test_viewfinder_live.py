@@ -225,7 +225,7 @@ async def test_a_capture_composites_to_what_the_stream_showed(clip: LiveClip, tm
     # Around the object there are also the softer edge of a drawing at half of the pixels that was moved, and half of the chroma.
     camera = clip.camera(sequence)
     assert psnr_db(codes, streamed_bgr, ~away_from_card(camera)) > 29.0
-    # In its middle it is the same light: the curve of sRGB in place of the clip's would be six codes off in green. Of a few codes of red and
+    # In its middle it is the same light: the curve of sRGB in place of the clip's would be six codes off in green. Of few codes of red and
     # blue a stream that had to drop pictures keeps less.
     middle, streamed_middle = middle_of_card(codes, camera), middle_of_card(streamed_bgr, camera)
     np.testing.assert_allclose(middle[1], streamed_middle[1], atol=3.0)
