@@ -195,6 +195,8 @@ def take_back(
 @njit(cache=True, nogil=True)
 def add_cut_lights(
     out: np.ndarray,
+    top: int,
+    bottom: int,
     margin: int,
     places: np.ndarray,
     rgb: np.ndarray,
@@ -205,15 +207,15 @@ def add_cut_lights(
     occluder_alpha: np.ndarray,
     nearest_px: float,
 ) -> None:
-    """Add lights of one size to a picture (H, W, 3 or more), as far as what is nearer leaves the way free.
+    """Add lights of one size to rows top to bottom of a picture (H, W, 3 or more), as far as what is nearer leaves the way free.
 
     places, rgb, coc_px: of the lights, in the frame with its margin; kernel: of that size, sum 1. occluder_px, occluder_alpha:
     (surfaces, rows, columns) circles of confusion and coverage in the frame with its margin, the nearest of them at nearest_px.
     """
-    height, width, around, half = out.shape[0], out.shape[1], occluder_px.shape[2], len(kernel) // 2
+    width, around, half = out.shape[1], occluder_px.shape[2], len(kernel) // 2
     for i in range(len(places)):
         row, column, half_px = places[i] // around, places[i] % around, 0.5 * coc_px[i]
-        for y in range(max(row - margin - half, 0), min(row - margin + half + 1, height)):
+        for y in range(max(row - margin - half, top), min(row - margin + half + 1, bottom)):
             for x in range(max(column - margin - half, 0), min(column - margin + half + 1, width)):
                 share = kernel[y - row + margin + half, x - column + margin + half]
                 if share <= 0.0:

@@ -82,7 +82,7 @@ def render_layers(layers: Sequence[Layer], lens: Lens, kernel_sum: KernelSum | P
             found = front if found is None else _over(*front, *found)
         if rims and found is not None:
             rims.correct(found[0], pool)
-            rims.put_lights(found[0], lights)
+            rims.put_lights(found[0], lights, pool)
     assert found is not None, "there is a layer"
     return _as_layer(*found, layers)
 

@@ -25,6 +25,7 @@ from mrbokeh.layering.padded_layers import PaddedLayer, Pixels
 from mrbokeh.layering.psf_over_field import FIELD_CELLS, Frame
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.pupil_points import pupil_points, transmission
+from mrbokeh.system.resources import in_bands
 
 if TYPE_CHECKING:
     from mrbokeh.layering._pupil_views_numba import Window
@@ -33,7 +34,9 @@ _LEAST_VIEWS, _MOST_VIEWS, _PX_PER_VIEW = 24, 96, 6.0
 _TILE_PX, _BLOCK_ROWS, _BLOCK_COLUMNS = 16, 96, 192
 _BESIDE_PX = 2
 _NOISE = 0.8
-_SIZES_PER_PX = 64
+_SIZES_PER_PX, _STEPS = 64, 512.0
+_FAINT = 0.02
+_BAND_ROWS = 64
 _GOLDEN = np.float32(0.5 * (5.0**0.5 - 1.0))
 
 Mask = Bool[np.ndarray, "_ _"]
@@ -104,11 +107,16 @@ class Rims:
             darken(dark, places, flat, lit.reshape(-1), width, float(LIGHT_OVER_SURROUNDINGS))
             rgb = flat[places, :3] - dark
             _, of_surface, of_lights = np.intersect1d(surface.places, places, assume_unique=True, return_indices=True)
-            kept = rgb[of_lights].max(axis=1, initial=0.0) > 0
+            kept = self._shows(rgb[of_lights], surface.coc_px[of_surface])
             of_surface, of_lights = of_surface[kept], of_lights[kept]
             surface.values[of_surface, :3] = dark[of_lights]
             found.append(_Lights(places[of_lights], rgb[of_lights], surface.coc_px[of_surface]))
         return found
+
+    def _shows(self, rgb: Float32[np.ndarray, "lights 3"], coc_px: Sizes) -> Bool[np.ndarray, " lights"]:
+        """Return which lights can be seen once they are spread: brighter, where they arrive, than a small share of the picture's light."""
+        spread = rgb.max(axis=1, initial=0.0) / np.maximum(0.25 * np.pi * coc_px**2, 1.0)
+        return spread > _FAINT * float(self.cuts[-1].layers[0].values[..., :3].mean())
 
     def _reach_rims(self, places: Int64[np.ndarray, " lights"], coc_px: Sizes, width: int) -> Bool[np.ndarray, " lights"]:
         from cv2 import integral
@@ -121,7 +129,7 @@ class Rims:
         left, right = (np.clip(each // _TILE_PX, 0, columns) for each in (column - reach, column + reach + _TILE_PX))
         return counts[bottom, right] - counts[top, right] - counts[bottom, left] + counts[top, left] > 0
 
-    def put_lights(self, colour: Colour, lights: "Sequence[_Lights]") -> None:
+    def put_lights(self, colour: Colour, lights: "Sequence[_Lights]", pool: Executor) -> None:
         """Add lights where they arrive past all that is nearer."""
         from mrbokeh.layering._pupil_views_numba import add_cut_lights
 
@@ -132,8 +140,9 @@ class Rims:
         nearest_px, radius = float(occluder_px.min()), self.aperture.unit_radius
         for each in lights:
             for which, kernel in _kernels(each.places, each.coc_px, self.aperture, self.frame):
-                lit = each.places[which], each.rgb[which], each.coc_px[which]
-                add_cut_lights(colour, -self.frame.left_px, *lit, kernel, radius, occluder_px, alpha, nearest_px)
+                lit = each.places[which], each.rgb[which], each.coc_px[which], kernel, radius, occluder_px, alpha, nearest_px
+                work = lambda first, end: add_cut_lights(colour, first, end, -self.frame.left_px, *lit)  # noqa: B023, E731
+                in_bands(pool, len(colour), _BAND_ROWS, work)
 
     def correct(self, colour: Colour, pool: Executor) -> None:
         """Take back, where cuts were laid over one another, how far light and what hides it go together over the pupil."""
@@ -199,7 +208,8 @@ def _kernels(
     places: Int64[np.ndarray, " lights"], coc_px: Float32[np.ndarray, " lights"], aperture: Aperture, frame: Frame
 ) -> Iterator[tuple[Int64[np.ndarray, " _"], np.ndarray]]:
     """Yield indices of lights that are spread alike, and their kernel."""
-    sizes = np.rint(coc_px * _SIZES_PER_PX).astype(np.int64)
+    steps_px = np.exp2(np.ceil(np.log2(np.maximum(np.abs(coc_px) / _STEPS, 1.0 / _SIZES_PER_PX))))
+    sizes = np.rint(np.rint(coc_px / steps_px) * steps_px * _SIZES_PER_PX).astype(np.int64)
     width = frame.width_px - 2 * frame.left_px
     cells = _cells_of(places // width + frame.top_px, places % width + frame.left_px, aperture, frame)
     for cell, size in np.unique(np.stack([cells, sizes], axis=1), axis=0) if len(places) else ():
