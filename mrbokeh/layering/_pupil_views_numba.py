@@ -195,8 +195,7 @@ def take_back(
 @njit(cache=True, nogil=True)
 def add_cut_lights(
     out: np.ndarray,
-    top: int,
-    bottom: int,
+    lines: tuple[int, int],
     margin: int,
     places: np.ndarray,
     rgb: np.ndarray,
@@ -207,7 +206,7 @@ def add_cut_lights(
     occluder_alpha: np.ndarray,
     nearest_px: float,
 ) -> None:
-    """Add lights of one size to rows top to bottom of a picture (H, W, 3 or more), as far as what is nearer leaves the way free.
+    """Add lights of one size to rows (first, end) of a picture (H, W, 3 or more), as far as what is nearer leaves the way free.
 
     places, rgb, coc_px: of the lights, in the frame with its margin; kernel: of that size, sum 1. occluder_px, occluder_alpha:
     (surfaces, rows, columns) circles of confusion and coverage in the frame with its margin, the nearest of them at nearest_px.
@@ -215,7 +214,7 @@ def add_cut_lights(
     width, around, half = out.shape[1], occluder_px.shape[2], len(kernel) // 2
     for i in range(len(places)):
         row, column, half_px = places[i] // around, places[i] % around, 0.5 * coc_px[i]
-        for y in range(max(row - margin - half, top), min(row - margin + half + 1, bottom)):
+        for y in range(max(row - margin - half, lines[0]), min(row - margin + half + 1, lines[1])):
             for x in range(max(column - margin - half, 0), min(column - margin + half + 1, width)):
                 share = kernel[y - row + margin + half, x - column + margin + half]
                 if share <= 0.0:

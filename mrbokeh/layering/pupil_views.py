@@ -141,7 +141,7 @@ class Rims:
         for each in lights:
             for which, kernel in _kernels(each.places, each.coc_px, self.aperture, self.frame):
                 lit = each.places[which], each.rgb[which], each.coc_px[which], kernel, radius, occluder_px, alpha, nearest_px
-                work = lambda first, end: add_cut_lights(colour, first, end, -self.frame.left_px, *lit)  # noqa: B023, E731
+                work = lambda first, end: add_cut_lights(colour, (first, end), -self.frame.left_px, *lit)  # noqa: B023, E731
                 in_bands(pool, len(colour), _BAND_ROWS, work)
 
     def correct(self, colour: Colour, pool: Executor) -> None:
