@@ -38,6 +38,14 @@ class Window(NamedTuple):
     top_px: int
 
 
+class Occluders(NamedTuple):
+    """Surfaces in the frame with its margin: (surfaces, rows, columns) circles of confusion and coverage, and the least of the former."""
+
+    coc_px: np.ndarray
+    alpha: np.ndarray
+    nearest_px: float
+
+
 @njit(cache=True, nogil=True)
 def mark_reach(tiles: np.ndarray, tile_px: int, width: int, margin: int, places: np.ndarray, reach_px: np.ndarray) -> None:
     """Mark the tiles that lie within reach (a square) of any of these places of a frame with a margin (row times width plus column)."""
@@ -202,16 +210,13 @@ def add_cut_lights(
     coc_px: np.ndarray,
     kernel: np.ndarray,
     unit_radius: float,
-    occluder_px: np.ndarray,
-    occluder_alpha: np.ndarray,
-    nearest_px: float,
+    before: Occluders,
 ) -> None:
     """Add lights of one size to rows (first, end) of a picture (H, W, 3 or more), as far as what is nearer leaves the way free.
 
-    places, rgb, coc_px: of the lights, in the frame with its margin; kernel: of that size, sum 1. occluder_px, occluder_alpha:
-    (surfaces, rows, columns) circles of confusion and coverage in the frame with its margin, the nearest of them at nearest_px.
+    places, rgb, coc_px: of the lights, in the frame with its margin; kernel: of that size, sum 1. before: all that may lie in the way.
     """
-    width, around, half = out.shape[1], occluder_px.shape[2], len(kernel) // 2
+    width, around, half = out.shape[1], before.coc_px.shape[2], len(kernel) // 2
     for i in range(len(places)):
         row, column, half_px = places[i] // around, places[i] % around, 0.5 * coc_px[i]
         for y in range(max(row - margin - half, lines[0]), min(row - margin + half + 1, lines[1])):
@@ -229,17 +234,16 @@ def add_cut_lights(
                         if beyond > 1.0:
                             u, v = u / beyond, v / beyond
                     x_px, y_px = column + 0.5 + u * half_px, row + 0.5 + v * half_px
-                    free += _free(occluder_px, occluder_alpha, x_px, y_px, u, v, coc_px[i], nearest_px)
+                    free += _free(before, x_px, y_px, u, v, coc_px[i])
                 free *= np.float32(0.25 * share)
                 for c in range(3):
                     out[y, x, c] += free * rgb[i, c]
 
 
 @njit(cache=True, nogil=True, fastmath=True)
-def _free(
-    coc_px: np.ndarray, alpha: np.ndarray, x_px: float, y_px: float, u: float, v: float, light_px: float, nearest_px: float
-) -> np.float32:
+def _free(before: Occluders, x_px: float, y_px: float, u: float, v: float, light_px: float) -> np.float32:
     """Return how much of a ray to (x_px, y_px) through (u, v) gets past all that is nearer than a light, walked from the nearest on."""
+    coc_px, alpha, nearest_px = before
     surfaces, rows, columns = coc_px.shape
     steps = int(np.ceil(max(abs(u), abs(v)) * (light_px - nearest_px) * 0.5)) + 1
     step_px, free, last_px = (light_px - nearest_px) / steps, np.float32(1.0), _FAR

@@ -131,16 +131,16 @@ class Rims:
 
     def put_lights(self, colour: Colour, lights: "Sequence[_Lights]", pool: Executor) -> None:
         """Add lights where they arrive past all that is nearer."""
-        from mrbokeh.layering._pupil_views_numba import add_cut_lights
+        from mrbokeh.layering._pupil_views_numba import Occluders, add_cut_lights
 
         if not any(len(each.places) for each in lights):
             return
         layers = [layer for cut in self.cuts for layer, _, _ in cut.pairs]
-        occluder_px, alpha = np.stack([each.coc_px for each in layers]), np.stack([each.values[..., 3] for each in layers])
-        nearest_px, radius = float(occluder_px.min()), self.aperture.unit_radius
+        coc_px, alpha = np.stack([each.coc_px for each in layers]), np.stack([each.values[..., 3] for each in layers])
+        before, radius = Occluders(coc_px=coc_px, alpha=alpha, nearest_px=float(coc_px.min())), self.aperture.unit_radius
         for each in lights:
             for which, kernel in _kernels(each.places, each.coc_px, self.aperture, self.frame):
-                lit = each.places[which], each.rgb[which], each.coc_px[which], kernel, radius, occluder_px, alpha, nearest_px
+                lit = each.places[which], each.rgb[which], each.coc_px[which], kernel, radius, before
                 work = lambda first, end: add_cut_lights(colour, (first, end), -self.frame.left_px, *lit)  # noqa: B023, E731
                 in_bands(pool, len(colour), _BAND_ROWS, work)
 
