@@ -18,6 +18,8 @@ BEFORE_PX = np.int32(4096)
 _LEAST = np.float32(1e-6)
 _LIT = np.float32(0.004)
 _MUCH = np.float32(0.1)
+_APART = np.float32(0.7548776662466927)
+"""Between the thresholds of groups, so that soft coverage of one has nothing to do with that of another (one over the plastic number)."""
 
 
 class Window(NamedTuple):
@@ -158,20 +160,19 @@ def _view(
     x_px, halves_px, alpha = window.x_px, window.half_px, window.alpha
     for surface in range(len(window.starts)):
         near, numbers = nearest[groups[surface]], which[groups[surface]]
+        least = (threshold + np.float32(groups[surface]) * _APART) % np.float32(1.0)
         for line in range(first, end):
             y_px = np.float32(line + window.top_px) + np.float32(0.5) + BEFORE_PX
             for i in range(window.starts[surface, line], window.starts[surface, line + 1]):
                 half_px = halves_px[i]
                 row = np.uint32(np.int32(y_px + v * half_px) - BEFORE_PX)
                 column = np.uint32(np.int32(x_px[i] + u * half_px) - BEFORE_PX)
-                if row < np.uint32(rows) and column < np.uint32(columns) and half_px < near[row, column] and alpha[i] > threshold:
+                if row < np.uint32(rows) and column < np.uint32(columns) and half_px < near[row, column] and alpha[i] > least:
                     near[row, column], numbers[row, column] = half_px, i
 
 
 @njit(cache=True, nogil=True)
-def take_back(
-    colour: np.ndarray, sums: np.ndarray, tiles: np.ndarray, tile_px: int, top: int, left: int, points: int, noise: float
-) -> None:
+def take_back(colour: np.ndarray, sums: np.ndarray, tiles: np.ndarray, tile_px: int, top: int, left: int, noise: float) -> None:
     """Subtract from colour (H, W, 3 or more), in marked tiles of a block, how far groups and what they hide go together (`correlate`).
 
     It counts by its square over that and the square of what chance makes of so few points.
@@ -193,7 +194,7 @@ def take_back(
                     mean = found[2 + c] / found[0]
                     change[c] = found[5 + c] / found[0] - hidden * mean
                     square, spread = square + change[c] * change[c], spread - mean * mean
-                chance = noise * hidden * (np.float32(1.0) - hidden) * max(spread, np.float32(0.0)) / points
+                chance = noise * hidden * (np.float32(1.0) - hidden) * max(spread, np.float32(0.0)) / found[0]
                 counts = free * square / max(square + chance, _LEAST * _LEAST)
                 for c in range(3):
                     colour[y, x, c] = max(colour[y, x, c] - counts * change[c], np.float32(0.0))

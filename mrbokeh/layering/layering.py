@@ -5,7 +5,7 @@ Shared by all renderers that sum kernels; they differ in the `KernelSum` alone (
 Circles of confusion are diameters at which kernels are drawn (mrbokeh.optics.drawn_diameters) from here on.
 1. Every layer is continued beyond the frame by the largest blur: the border of an opaque one outwards, one with holes not at all.
 2. Layers are rendered one by one and laid over one another, but an opaque layer together with what is behind it, and
-   layers that interleave in depth together; an opaque one is parted before and behind those that it interleaves with.
+   layers that interleave in depth together; an opaque one is parted before and behind a single one listed before it.
 3. Pixels are sorted into slices of equal steps of the signed circle of confusion, hard: a pixel shared between slices
    would let light through an opaque surface. Within a slice each pixel keeps its own circle of confusion.
 4. Front to back, each slice takes what is still free of the pupil at every pixel, at most its own coverage. Slices of
@@ -92,26 +92,24 @@ def _cuts(group: Sequence[PaddedLayer], layering: Layering, pool: Executor) -> I
     lights = [find_highlights(layer.values) for layer in group] if layering.sees_rims else []
     if layering.fill and group[0].is_opaque:
         yield Cut(group, _with_hidden(group, pool), lights)
-    elif layering.fill and layering.sees_rims and group[-1].is_opaque:
+    elif layering.fill and layering.sees_rims and len(group) == 2 and group[1].is_opaque:
         yield from _parted(group, lights, pool)
     else:
         yield Cut(group, [Pixels.covered(layer) for layer in group], lights)
 
 
 def _parted(group: Sequence[PaddedLayer], lights: Sequence[Mask], pool: Executor) -> Iterator[Cut]:
-    """Yield what of an opaque picture is nearer than the layers listed before it, those layers, and the rest of the picture."""
-    *before, picture = group
-    virtual_px = np.full(picture.coc_px.shape, np.inf, np.float32)
-    for layer in before:
-        virtual_px = np.where(layer.values[..., 3] > 0, np.minimum(virtual_px, layer.coc_px), virtual_px)
-    virtual_px = continued(virtual_px, np.isfinite(virtual_px))
+    """Yield what of an opaque picture is nearer than a layer listed before it, that layer, and the rest of the picture."""
+    before, picture = group
+    covered = before.values[..., 3] > 0
+    virtual_px = continued(before.coc_px, covered)
     front, behind = split_edges(picture, pool)
     values, coc_px = front.values.reshape(picture.values.shape), front.coc_px.reshape(picture.coc_px.shape)
     is_near = coc_px < virtual_px - _ONE_SURFACE_PX
     if is_near.any():
         near = PaddedLayer(np.where(is_near[..., None], values, np.float32(0.0)), coc_px, False)
         yield Cut([near], [Pixels.covered(near)], [lights[-1] & is_near])
-    yield Cut(before, [Pixels.covered(layer) for layer in before], lights[:-1])
+    yield Cut([before], [Pixels.covered(before)], lights[:1])
     far = PaddedLayer(np.where(is_near[..., None], np.float32(0.0), values), coc_px, True)
     yield Cut([far], [Pixels.of(far), behind], [lights[-1] & ~is_near])
 

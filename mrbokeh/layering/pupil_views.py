@@ -73,7 +73,8 @@ class Cut(NamedTuple):
     @property
     def hidden(self) -> list[Pixels]:
         """Surfaces behind the rims of an opaque layer."""
-        return [self.surfaces[1], self.surfaces[-1]] if self.is_opaque else []
+        last = [self.surfaces[-1]] if len(self.surfaces) > 2 else []
+        return [self.surfaces[1], *last] if self.is_opaque else []
 
 
 @dataclass(frozen=True)
@@ -97,26 +98,34 @@ class Rims:
 
     def take_lights(self) -> "list[_Lights]":
         """Take lights whose blur reaches a rim out of the surfaces, which keep what is around them in their place."""
+        found = []
+        for surface, of_surface, dark in self._darkened():
+            rgb, coc_px = surface.values[of_surface, :3] - dark, surface.coc_px[of_surface]
+            kept = self._shows(rgb, coc_px)
+            surface.values[of_surface[kept], :3] = dark[kept]
+            found.append(_Lights(surface.places[of_surface[kept]].astype(np.int64), rgb[kept], coc_px[kept]))
+        return found
+
+    def _darkened(self) -> "Iterator[tuple[Pixels, Int64[np.ndarray, ' lights'], Float32[np.ndarray, 'lights 3']]]":
+        """Yield surfaces, which of their pixels are lights whose blur reaches a rim, and what these would be without their light."""
         from mrbokeh.layering._pupil_views_numba import darken
 
-        found = []
         for layer, surface, lit in (pair for cut in self.cuts for pair in cut.pairs):
             width, places = layer.coc_px.shape[1], np.flatnonzero(lit)
             places = places[self._reach_rims(places, layer.coc_px.reshape(-1)[places], width)]
-            flat, dark = layer.values.reshape(-1, layer.values.shape[2]), np.empty((len(places), 3), np.float32)
+            if len(places) == 0 or len(surface.places) == 0:
+                continue
+            at = np.minimum(np.searchsorted(surface.places, places), len(surface.places) - 1)
+            there = surface.places[at] == places
+            places, dark = places[there], np.empty((int(there.sum()), 3), np.float32)
+            flat = layer.values.reshape(-1, layer.values.shape[2])
             darken(dark, places, flat, lit.reshape(-1), width, float(LIGHT_OVER_SURROUNDINGS))
-            rgb = flat[places, :3] - dark
-            _, of_surface, of_lights = np.intersect1d(surface.places, places, assume_unique=True, return_indices=True)
-            kept = self._shows(rgb[of_lights], surface.coc_px[of_surface])
-            of_surface, of_lights = of_surface[kept], of_lights[kept]
-            surface.values[of_surface, :3] = dark[of_lights]
-            found.append(_Lights(places[of_lights], rgb[of_lights], surface.coc_px[of_surface]))
-        return found
+            yield surface, at[there], dark
 
     def _shows(self, rgb: Float32[np.ndarray, "lights 3"], coc_px: Sizes) -> Bool[np.ndarray, " lights"]:
         """Return which lights can be seen once they are spread: brighter, where they arrive, than a small share of the picture's light."""
         spread = rgb.max(axis=1, initial=0.0) / np.maximum(0.25 * np.pi * coc_px**2, 1.0)
-        return spread > _FAINT * float(self.cuts[-1].layers[0].values[..., :3].mean())
+        return spread > _FAINT * sum(float(layer.values[..., :3].mean()) for cut in self.cuts for layer in cut.layers)
 
     def _reach_rims(self, places: Int64[np.ndarray, " lights"], coc_px: Sizes, width: int) -> Bool[np.ndarray, " lights"]:
         from cv2 import integral
@@ -148,6 +157,8 @@ class Rims:
         """Take back, where cuts were laid over one another, how far light and what hides it go together over the pupil."""
         if len(self.cuts) == 1:
             return
+        for surface, of_surface, dark in self._darkened():  # a single point that meets a light tells nothing
+            surface.values[of_surface, :3] = dark
         surfaces = [(each, group) for group, cut in enumerate(self.cuts) for each in cut.surfaces if len(each.places)]
         groups = np.array([group for _, group in surfaces])
         views = _Views([each for each, _ in surfaces], groups, self.aperture, self.frame)
@@ -273,7 +284,7 @@ class _Views:
         sums = np.zeros((*shape, count - 1, 9), np.float32)
         nearest, which = np.empty((count, *shape), np.float32), np.empty((count, *shape), np.int32)
         correlate(sums, self._window(block), self.groups, self._pupil, cells, self._weights, nearest, which)
-        take_back(colour, sums, tiles, _TILE_PX, top, left, len(self._pupil), _NOISE)
+        take_back(colour, sums, tiles, _TILE_PX, top, left, _NOISE)
 
     def _window(self, block: tuple[int, int, int, int]) -> "Window":
         """Collect the pixels of all surfaces that any view may show in a block."""

@@ -85,6 +85,15 @@ def test_one_colour_behind_and_one_surface_alone_stay_as_slices_have_them() -> N
         np.testing.assert_allclose(row_of(RIMS, layers), row_of(SLICES, layers), atol=2e-6)
 
 
+def test_two_panes_dim_one_after_the_other() -> None:
+    """Two layers of half coverage let a quarter through: their soft pixels must not be there for the same points of the pupil."""
+    panes = [card(coc_px, WIDTH) for coc_px in (-4.0, -1.5)]
+    for pane in panes:
+        pane.alpha[:] = 0.5
+    seen = RIMS.render([*panes, wall(3.0, 0)], LENS).rgb[8:-8, 30:-30]
+    np.testing.assert_allclose(seen, 0.25, atol=0.01)
+
+
 def test_a_layer_between_near_and_far_of_one_picture_is_as_if_all_three_were_given() -> None:
     """A red card listed first, and a picture of a black post before it and an even wall behind it, whose hidden part is no guess."""
     post, behind = card(-14.0, 20), wall(10.0, 0)

@@ -15,6 +15,7 @@ from mrbokeh.renderers.bank.blending import BlendedTables
 from mrbokeh.renderers.bank.lattice import BankLattice
 from mrbokeh.system.errors import InputError
 
+_LOSSLESS = 0.99
 _DRAWN_PX = 48.0  # a kernel of this size shows its shape; larger ones take longer to draw around
 
 
@@ -43,6 +44,12 @@ def opening_of(bank: PsfBank) -> Aperture:
         return fit_polygons(kernel, diameter_px).aperture
     except InputError:
         return Aperture.disc()
+
+
+@lru_cache(maxsize=8)
+def is_lossless(bank: PsfBank) -> bool:
+    """Return whether no kernel of a bank loses more than a hundredth of its light."""
+    return min(float(kernel.sum(axis=(0, 1)).min()) for kernel in bank.kernels) > _LOSSLESS
 
 
 @lru_cache(maxsize=8)

@@ -22,7 +22,7 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.drawn_diameters import drawn_diameters_px
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.psf_bank import Axis
-from mrbokeh.renderers.bank.bank_lens import opening_of, stated_lens
+from mrbokeh.renderers.bank.bank_lens import is_lossless, opening_of, stated_lens
 from mrbokeh.renderers.bank.tables import BankTables, Place
 from mrbokeh.system.errors import InputError
 
@@ -65,7 +65,8 @@ class BankPsf:
 
     @property
     def opening(self) -> Aperture | None:
-        return None if self.farthest_px > 0 else opening_of(self.tables.bank)
+        is_one = self.farthest_px == 0 and self.coverages == 1 and not self.tables.needed
+        return opening_of(self.tables.bank) if is_one and is_lossless(self.tables.bank) else None
 
     def drawn_px(self, coc_px: Plane) -> Plane:
         """Return drawn diameters: kernels of banks hold the pixel's area as those of openings do.
