@@ -131,8 +131,9 @@ async def serving_site(site: Served, host: str, port: int, tls: Tls | None = Non
 
     With TLS the address has a name that the certificate covers; that it leads to this machine is the user's care.
     """
-    patience = {"keepalive_timeout": PATIENCE_S, "lingering_time": PATIENCE_S}
-    runner = web.AppRunner(site.application(), shutdown_timeout=_SHUTDOWN_S, access_log=None, **patience)
+    runner = web.AppRunner(
+        site.application(), shutdown_timeout=_SHUTDOWN_S, access_log=None, keepalive_timeout=PATIENCE_S, lingering_time=PATIENCE_S
+    )
     with quiet_log():
         await runner.setup()
         assert runner.server is not None, "set up"
