@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float32, Int64
 from mrbokeh.compositing.near_and_far import NearAndFar
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.highlights import without_highlights
-from mrbokeh.layering.psf_over_field import FIELD_CELLS, Frame
+from mrbokeh.layering.psf_over_field import Frame, field_cells_of, opening_of_cell
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.pupil_points import pupil_points
@@ -104,15 +104,7 @@ class Rays:
     def cells(self, places: Places) -> Iterator[tuple[Places, Aperture]]:
         """Indices of the places that see one opening, and that opening."""
         aperture, (height, width) = self.lens.aperture, self.virtual.alpha.shape
-        if len(places) == 0:
-            return
-        if not aperture.varies_over_field:
-            yield np.arange(len(places)), aperture.seen(1)
-            return
-        columns, rows = FIELD_CELLS
-        cell = (places // width * rows // height) * columns + places % width * columns // width
         frame = Frame(width, height)
-        for number in np.unique(cell):
-            row, column = divmod(int(number), columns)
-            field_xy = frame.field_at((column + 0.5) * width / columns, (row + 0.5) * height / rows)
-            yield np.flatnonzero(cell == number), aperture.seen(1, field_xy)
+        cells = field_cells_of(places // width, places % width, aperture, frame)
+        for cell in np.unique(cells):
+            yield np.flatnonzero(cells == cell), opening_of_cell(aperture, int(cell), frame)

@@ -8,7 +8,7 @@ elsewhere may be wide where an opening's are points, hold motion themselves, or 
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Protocol, runtime_checkable
 
@@ -57,6 +57,25 @@ class Frame:
         half_diagonal_px = 0.5 * float(np.hypot(self.width_px, self.height_px))
         right_px, down_px = x_px + self.left_px - 0.5 * self.width_px, y_px + self.top_px - 0.5 * self.height_px
         return right_px / half_diagonal_px, down_px / half_diagonal_px
+
+
+def field_cells_of(rows: np.ndarray, columns: np.ndarray, aperture: Aperture, frame: Frame) -> np.ndarray:
+    """Return the field cell of places of the picture, counted row by row; 0 where the opening is the same all over it."""
+    if not aperture.varies_over_field:
+        return np.zeros(np.broadcast(rows, columns).shape, np.int64)
+    across, down = FIELD_CELLS
+    cell_row = np.clip(rows * down // frame.height_px, 0, down - 1)
+    return cell_row * across + np.clip(columns * across // frame.width_px, 0, across - 1)
+
+
+def opening_of_cell(aperture: Aperture, cell: int, frame: Frame) -> Aperture:
+    """Return the opening that a field cell sees."""
+    if not aperture.varies_over_field:
+        return aperture.seen(1)
+    (row, column), picture = divmod(cell, FIELD_CELLS[0]), replace(frame, left_px=0, top_px=0)
+    return aperture.seen(
+        1, picture.field_at((column + 0.5) * frame.width_px / FIELD_CELLS[0], (row + 0.5) * frame.height_px / FIELD_CELLS[1])
+    )
 
 
 def reach_px(aperture: Aperture, largest_coc_px: float) -> int:

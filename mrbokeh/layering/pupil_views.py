@@ -13,7 +13,7 @@ blur one sees along single rays whether something nearer is in the way: a lamp b
 
 from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -22,7 +22,7 @@ from jaxtyping import Bool, Float32, Int32, Int64
 
 from mrbokeh.layering.highlights import LIGHT_OVER_SURROUNDINGS
 from mrbokeh.layering.padded_layers import PaddedLayer, Pixels
-from mrbokeh.layering.psf_over_field import FIELD_CELLS, Frame
+from mrbokeh.layering.psf_over_field import FIELD_CELLS, Frame, field_cells_of, opening_of_cell
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.pupil_points import pupil_points, transmission
 from mrbokeh.system.resources import in_bands
@@ -222,29 +222,10 @@ def _kernels(
     steps_px = np.exp2(np.ceil(np.log2(np.maximum(np.abs(coc_px) / _STEPS, 1.0 / _SIZES_PER_PX))))
     sizes = np.rint(np.rint(coc_px / steps_px) * steps_px * _SIZES_PER_PX).astype(np.int64)
     width = frame.width_px - 2 * frame.left_px
-    cells = _cells_of(places // width + frame.top_px, places % width + frame.left_px, aperture, frame)
+    cells = field_cells_of(places // width + frame.top_px, places % width + frame.left_px, aperture, frame)
     for cell, size in np.unique(np.stack([cells, sizes], axis=1), axis=0) if len(places) else ():
-        opening = _opening(aperture, int(cell), frame)
+        opening = opening_of_cell(aperture, int(cell), frame)
         yield np.flatnonzero((cells == cell) & (sizes == size)), opening.rasterize(float(size) / _SIZES_PER_PX).kernel
-
-
-def _cells_of(rows: np.ndarray, columns: np.ndarray, aperture: Aperture, frame: Frame) -> np.ndarray:
-    """Return the field cell of places of the picture, counted row by row; 0 where the opening is the same all over it."""
-    if not aperture.varies_over_field:
-        return np.zeros(np.broadcast(rows, columns).shape, np.int64)
-    across, down = FIELD_CELLS
-    cell_row = np.clip(rows * down // frame.height_px, 0, down - 1)
-    return cell_row * across + np.clip(columns * across // frame.width_px, 0, across - 1)
-
-
-def _opening(aperture: Aperture, cell: int, frame: Frame) -> Aperture:
-    """Return the opening that a field cell sees."""
-    if not aperture.varies_over_field:
-        return aperture.seen(1)
-    (row, column), picture = divmod(cell, FIELD_CELLS[0]), replace(frame, left_px=0, top_px=0)
-    return aperture.seen(
-        1, picture.field_at((column + 0.5) * frame.width_px / FIELD_CELLS[0], (row + 0.5) * frame.height_px / FIELD_CELLS[1])
-    )
 
 
 @dataclass(frozen=True)
@@ -268,7 +249,7 @@ class _Views:
     def _weights(self) -> Float32[np.ndarray, "cells points"]:
         xy = self._pupil[:, :2].astype(np.float64)
         cells = FIELD_CELLS[0] * FIELD_CELLS[1] if self.aperture.varies_over_field else 1
-        return np.stack([transmission(_opening(self.aperture, cell, self.frame), xy) for cell in range(cells)]).astype(np.float32)
+        return np.stack([transmission(opening_of_cell(self.aperture, cell, self.frame), xy) for cell in range(cells)]).astype(np.float32)
 
     @cached_property
     def _reach_px(self) -> int:
@@ -279,7 +260,7 @@ class _Views:
         from mrbokeh.layering._pupil_views_numba import correlate, take_back
 
         top, bottom, left, right = block
-        cells = _cells_of(np.arange(top, bottom)[:, None], np.arange(left, right)[None], self.aperture, self.frame)
+        cells = field_cells_of(np.arange(top, bottom)[:, None], np.arange(left, right)[None], self.aperture, self.frame)
         count, shape = int(self.groups[-1]) + 1, (bottom - top, right - left)
         sums = np.zeros((*shape, count - 1, 9), np.float32)
         nearest, which = np.empty((count, *shape), np.float32), np.empty((count, *shape), np.int32)
