@@ -29,9 +29,9 @@ def depth_command(
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="find depth again where it is there already")] = False,
 ) -> None:
-    from capture.dense.dense_depth import DenseSettings
     from capture.dense.scene_depth import SceneDepthSettings, deepen_scene
     from capture.merging.retouch import retouched_stacks, retouches_text, stacks_before
+    from mrbokeh.depth.views.dense_depth import DenseSettings
     from mrbokeh.figures.stack_pictures import SHEET_NAME
     from mrbokeh.system.console import kept_when_interrupted
 

@@ -13,21 +13,23 @@ machine; they cover the code around it.
 import ctypes
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
-from capture.dense.dense_depth import DenseDepth, DenseSettings, dense_depth
-from capture.dense.depth_priors import DepthPriors, FocusVote, SparseDepths, focus_vote_of_map, near_highlights
-from capture.dense.sweep_view import FirstPictures, SweepView, nearest_views
 from capture.merging.merged_pictures import write_readable_pictures
 from capture.merging.preferred_side import PREFERRED
 from capture.merging.retouch import RETOUCHES
 from capture.merging.second_pass import DEPTH_SOURCE, SliceOptics, first_pass_path, keep_first_pass, second_pass
 from capture.poses.colmap_job import JOB_NAME, MODEL_FOLDER, RECONSTRUCTION_FOLDER, job_from_json
-from capture.poses.sparse_model import Distortion, SparseModel, SparseView, read_sparse_model, undistorted_px
+from capture.poses.sparse_model import SparseModel, SparseView, read_sparse_model
+from mrbokeh.depth.views.dense_depth import DenseDepth, DenseSettings, dense_depth
+from mrbokeh.depth.views.depth_priors import DepthPriors, FocusVote, SparseDepths, focus_vote_of_map, near_highlights
+from mrbokeh.depth.views.sweep_view import SweepView, neighbour_vote, structure_of
+from mrbokeh.distortion.radial import Distortion, undistorted_px
 from mrbokeh.figures.stack_pictures import write_merge_sheet
 from mrbokeh.images.camera_rgb import read_camera_rgb
 from mrbokeh.images.exr_io import read_exr
@@ -140,6 +142,34 @@ Rgb = Float32[np.ndarray, "height width 3"]
 _DOUBTED, _TRUSTED = 0.3, 0.6
 _SEAM_PX = 1.5
 _FEWEST_POINTS = 20
+_HELD = 8
+
+
+class FirstPictures:
+    """First-pass pictures of a scene's stacks, by the name of their view. A few structures are cached."""
+
+    def __init__(self, stacks: dict[str, FocalStack]) -> None:
+        self.stacks = stacks
+        self.view = lru_cache(_HELD)(self._view)
+
+    def rgb(self, name: str) -> Float32[np.ndarray, "height width 3"]:
+        """Return linear Rec.709."""
+        stack = self.stacks[name]
+        return stack.to_rec709(read_camera_rgb(first_pass_path(stack, stack.all_in_focus_path)))
+
+    def _view(self, view_name: str) -> Float32[np.ndarray, "height width"]:
+        return structure_of(self.rgb(view_name))
+
+
+def nearest_views(model: SparseModel, name: str, count: int) -> list[SparseView]:
+    """Return at most `count` other views that tell most about the depth of one, best first."""
+    reference, mine = model.view(name), model.points_of(name)
+    votes = []
+    for view in model.views:
+        common = model.points[np.intersect1d(mine, model.points_of(view))] if view.name != name else np.zeros((0, 3))
+        votes.append(neighbour_vote(common, reference.centre, view.centre))
+    order = sorted(range(len(votes)), key=lambda index: -votes[index])
+    return [model.views[index] for index in order[:count] if votes[index] > 0.0]
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 from jaxtyping import Float64, Int64
 
-from capture.poses.sparse_model import Distortion, SparseModel, SparseView, undistorted_px
+from capture.poses.sparse_model import SparseModel, SparseView
+from mrbokeh.distortion.radial import Distortion, undistorted_px
 from mrbokeh.optics.camera import Camera
 from mrbokeh.tracking.camera_track.track import camera_between
 from mrbokeh.tracking.charuco.detector import Grey, flow

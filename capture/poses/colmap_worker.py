@@ -22,7 +22,8 @@ from jaxtyping import Float
 from capture.poses.cauchy_loss import CAUCHY_95, MEDIAN_OF_RAYLEIGH
 from capture.poses.colmap_job import DATABASE_NAME, JOB_NAME, MODEL_FOLDER, ColmapJob, ColmapPicture, job_from_json
 from capture.poses.colmap_matches import match_statistics
-from capture.poses.sparse_model import Distortion, SparseModel, SparseView, write_sparse_model
+from capture.poses.sparse_model import SparseModel, SparseView, write_sparse_model
+from mrbokeh.distortion.radial import Distortion
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.atomic_files import read_json
 

@@ -11,8 +11,9 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
 from capture.poses.cauchy_loss import MEDIAN_OF_RAYLEIGH
-from capture.poses.sparse_model import SparseModel, SparseView, undistorted_px
+from capture.poses.sparse_model import SparseModel, SparseView
 from capture.scale.answer import ScaleAnswer
+from mrbokeh.distortion.radial import undistorted_px
 from mrbokeh.optics.lens import MM_PER_M
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, read_board

@@ -138,7 +138,7 @@ def test_heavy_libraries_live_where_they_belong(library: str, homes: set[str]) -
         "mrbokeh.renderers.layered_reconstruction.torch_reconstruction",
         "mrbokeh.system.torch_device",
         "mrbokeh.psf_models.torch_tracing",
-        "capture.dense.torch_plane_sweep",
+        "mrbokeh.depth.views.torch_plane_sweep",
     )
     assert {user.split(".")[0] for user in users - asking if not (library == "torch" and user.startswith(twins))} <= homes
 

@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float, UInt16
 from scipy.ndimage import map_coordinates
 
-from capture.dense.guided_depth import Costs, Guide, Mask, Penalties, Plane
-from capture.dense.plane_sweep import Matching
-from capture.dense.sweep_view import SweepView
-from capture.poses.sparse_model import distorted_px, undistorted_px
+from mrbokeh.depth.views.guided_depth import Costs, Guide, Mask, Penalties, Plane
+from mrbokeh.depth.views.plane_sweep import Matching
+from mrbokeh.depth.views.sweep_view import SweepView
+from mrbokeh.distortion.radial import distorted_px, undistorted_px
 
 DIRECTIONS = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1))
 Score = Float[np.ndarray, "height width"]

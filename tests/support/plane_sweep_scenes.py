@@ -4,10 +4,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from capture.dense.sweep_view import SweepView, structure_of
 from datasets_scripts.scenes.textures import mottled
 from datasets_scripts.tracers.thin_lens import trace_pinhole
 from datasets_scripts.tracers.traced_scene import Quad, Scene, emissive_quad, plain_texture
+from mrbokeh.depth.views.sweep_view import SweepView, structure_of
 from mrbokeh.optics.camera import Camera
 
 WIDTH_PX, HEIGHT_PX, FOCAL_PX = 160, 112, 170.0

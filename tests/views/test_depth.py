@@ -9,15 +9,14 @@ import pytest
 
 from capture.cli import app
 from capture.dataset.stack_writer import require_usable
-from capture.dense.dense_depth import DenseDepth
-from capture.dense.scene_depth import DEPTH_SOURCE, PatchMatchScene, SceneDepthSettings, deepen_scene
-from capture.dense.sweep_view import nearest_views
+from capture.dense.scene_depth import DEPTH_SOURCE, PatchMatchScene, SceneDepthSettings, deepen_scene, nearest_views
 from capture.merging.merge import merge_scene
 from capture.poses.colmap_job import ColmapJob, ColmapPicture, job_to_json
 from capture.poses.sparse_model import SparseModel, SparseView, read_sparse_model, write_sparse_model
 from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.stack_ingest import Development
 from mrbokeh.demo.plan import DATA, VIEWS
+from mrbokeh.depth.views.dense_depth import DenseDepth
 from mrbokeh.images.image_io import read_image
 from mrbokeh.optics.camera import Camera
 from mrbokeh.stacks.focal_stack import find_focal_stacks, read_focal_stack

@@ -25,7 +25,8 @@ from capture.poses.colmap_job import (
     write_stack_pictures,
 )
 from capture.poses.colmap_matches import failure_message, median_parallax_deg, weak_model_message
-from capture.poses.sparse_model import SparseModel, SparseView, distorted_px, read_sparse_model, undistorted_px, write_sparse_model
+from capture.poses.sparse_model import SparseModel, SparseView, read_sparse_model, write_sparse_model
+from mrbokeh.distortion.radial import distorted_px, undistorted_px
 from mrbokeh.images.image_io import write_image
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens

@@ -6,9 +6,9 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from capture.dense.plane_sweep import plane_sweep
-from capture.dense.sweep_view import SweepView
-from capture.dense.torch_plane_sweep import plane_sweep_on
+from mrbokeh.depth.views.plane_sweep import plane_sweep
+from mrbokeh.depth.views.sweep_view import SweepView
+from mrbokeh.depth.views.torch_plane_sweep import plane_sweep_on
 from mrbokeh.optics.camera import Camera
 from tests.bench.device.rows import Row, Run
 

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
 
-from capture.dense.sweep_view import SweepView, neighbour_from_reference, rays_of
-from capture.poses.sparse_model import distorted_px
+from mrbokeh.depth.views.sweep_view import SweepView, neighbour_from_reference, rays_of
+from mrbokeh.distortion.radial import distorted_px
 
 Plane = Float32[np.ndarray, "height width"]
 Mask = Bool[np.ndarray, "height width"]

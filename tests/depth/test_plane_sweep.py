@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from capture.dense.plane_sweep import (
+from mrbokeh.depth.views.plane_sweep import (
     UNSEEN,
     WORST_COST,
     Matching,
@@ -18,7 +18,7 @@ from capture.dense.plane_sweep import (
     plane_sweep,
     refine,
 )
-from capture.dense.sweep_view import BRIGHTEST, SweepView, structure_of
+from mrbokeh.depth.views.sweep_view import BRIGHTEST, SweepView, structure_of
 from mrbokeh.optics.camera import Camera
 from tests.support.dense_references import scores_of_surface
 from tests.support.plane_sweep_scenes import FOCAL_PX, card, traced, wall
@@ -134,7 +134,7 @@ def test_a_distorted_picture_needs_its_distortion() -> None:
 
 def _bent(view: SweepView, k1: float) -> np.ndarray:
     """The picture that a lens with k1 takes instead: at a distorted place what the pinhole has at the undistorted one."""
-    from capture.poses.sparse_model import undistorted_px
+    from mrbokeh.distortion.radial import undistorted_px
 
     x, y = np.moveaxis(undistorted_px(view.camera, (k1, 0.0), view.camera.pixel_centres_px()) - 0.5, -1, 0).astype(np.float32)
     return cv2.remap(view.structure, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)

@@ -5,16 +5,16 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from capture.dense.dense_depth import DenseSettings, dense_depth
-from capture.dense.plane_sweep import Matching, plane_sweep
-from capture.dense.sweep_view import SweepView
+from mrbokeh.depth.views.dense_depth import DenseSettings, dense_depth
+from mrbokeh.depth.views.plane_sweep import Matching, plane_sweep
+from mrbokeh.depth.views.sweep_view import SweepView
 from tests.support.plane_sweep_scenes import card, traced, wall
 from tests.support.refusals import refused
 from tests.views.test_plane_sweep import turned_view
 
 torch = pytest.importorskip("torch")
 
-from capture.dense.torch_plane_sweep import plane_sweep_on  # noqa: E402
+from mrbokeh.depth.views.torch_plane_sweep import plane_sweep_on  # noqa: E402
 from tests.support.torch_device import NAME  # noqa: E402
 
 

@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8
 
-from capture.dense.depth_priors import Consistency, DepthPriors, FocusVote, add_focus_votes, agreement, consistency
-from capture.dense.guided_depth import Penalties, label_planes, near_steps, weighted_medians
-from capture.dense.plane_sweep import Costs, Matching, Refined, by_parallax, dioptre_planes, pixels_per_dioptre, plane_sweep, refine
-from capture.dense.sweep_view import BRIGHTEST, SweepView
 from mrbokeh.depth.depth_filters import interpolate
+from mrbokeh.depth.views.depth_priors import Consistency, DepthPriors, FocusVote, add_focus_votes, agreement, consistency
+from mrbokeh.depth.views.guided_depth import Penalties, label_planes, near_steps, weighted_medians
+from mrbokeh.depth.views.plane_sweep import Costs, Matching, Refined, by_parallax, dioptre_planes, pixels_per_dioptre, plane_sweep, refine
+from mrbokeh.depth.views.sweep_view import BRIGHTEST, SweepView
 
 Plane = Float32[np.ndarray, "height width"]
 
@@ -214,7 +214,7 @@ def _coarse(
 def _sweep_of(device: str | None) -> Callable[..., Costs]:
     if device is None:
         return plane_sweep
-    from capture.dense.torch_plane_sweep import plane_sweep_on
+    from mrbokeh.depth.views.torch_plane_sweep import plane_sweep_on
 
     return partial(plane_sweep_on, device)
 

@@ -7,8 +7,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from capture.dense._guided_numba import aggregate
-from capture.dense.dense_depth import (
+from capture.dense.scene_depth import on_original_pixels, patch_match_obstacle, patch_match_prior
+from mrbokeh.depth.depth_filters import interpolate, smooth
+from mrbokeh.depth.views._guided_numba import aggregate
+from mrbokeh.depth.views.dense_depth import (
     FILLED,
     FOCUS,
     SWEEP,
@@ -20,7 +22,7 @@ from capture.dense.dense_depth import (
     sweep_trust,
     with_consistency,
 )
-from capture.dense.depth_priors import (
+from mrbokeh.depth.views.depth_priors import (
     SHARE_OF_FOCUS,
     Consistency,
     DepthPriors,
@@ -33,15 +35,13 @@ from capture.dense.depth_priors import (
     focus_vote_of_map,
     near_highlights,
 )
-from capture.dense.guided_depth import (
+from mrbokeh.depth.views.guided_depth import (
     Penalties,
     label_planes,
     near_steps,
     weighted_medians,
 )
-from capture.dense.scene_depth import on_original_pixels, patch_match_obstacle, patch_match_prior
-from capture.dense.sweep_view import SweepView
-from mrbokeh.depth.depth_filters import interpolate, smooth
+from mrbokeh.depth.views.sweep_view import SweepView
 from mrbokeh.optics.camera import Camera
 from tests.support.dense_references import aggregate_reference, weighted_medians_reference
 from tests.support.plane_sweep_scenes import FOCAL_PX, HEIGHT_PX, WIDTH_PX, TracedViews, card, grey_card, traced, wall

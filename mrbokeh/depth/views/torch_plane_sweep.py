@@ -8,8 +8,8 @@ import torch.nn.functional as F
 from jaxtyping import Float, Float32, Float64
 from torch import Tensor
 
-from capture.dense.plane_sweep import UNSEEN, WORST_COST, Costs, Matching
-from capture.dense.sweep_view import Plane, SweepView, packed_view, rays_of
+from mrbokeh.depth.views.plane_sweep import UNSEEN, WORST_COST, Costs, Matching
+from mrbokeh.depth.views.sweep_view import Plane, SweepView, packed_view, rays_of
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.torch_device import device_named
 

@@ -1,24 +1,19 @@
-"""Viewpoints of a plane sweep: picture as structure, camera, and the numbers that the loops take; a scene's pictures and neighbours."""
+"""Viewpoints of a plane sweep: picture as structure, camera, the numbers that the loops take, and which neighbours tell most."""
 
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
-from capture.merging.second_pass import first_pass_path
-from capture.poses.sparse_model import Distortion, SparseModel, SparseView, undistorted_px
-from mrbokeh.images.camera_rgb import read_camera_rgb
+from mrbokeh.distortion.radial import Distortion, undistorted_px
 from mrbokeh.optics.camera import Camera
-from mrbokeh.stacks.focal_stack import FocalStack
 
 Plane = Float32[np.ndarray, "height width"]
 
 BRIGHTEST = 1.2
 _BAND_ROWS = 64
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
-_HELD = 8
 _BEST_ANGLE_RAD = np.deg2rad(8.0)
 
 
@@ -70,40 +65,14 @@ def packed_view(reference: SweepView, neighbour: SweepView) -> Float32[np.ndarra
     return np.array([*pose[:3, :3].ravel(), *pose[:3, 3], *camera.focal_px, *principal, *neighbour.distortion], np.float32)
 
 
-class FirstPictures:
-    """First-pass pictures of a scene's stacks, by the name of their view. A few structures are cached."""
+def neighbour_vote(points: Float[np.ndarray, "points 3"], first: Float[np.ndarray, "3"], second: Float[np.ndarray, "3"]) -> float:
+    """Return how much two cameras at these centres tell about the depth of points that both see.
 
-    def __init__(self, stacks: dict[str, FocalStack]) -> None:
-        self.stacks = stacks
-        self.view = lru_cache(_HELD)(self._view)
-
-    def rgb(self, name: str) -> Float32[np.ndarray, "height width 3"]:
-        """Return linear Rec.709."""
-        stack = self.stacks[name]
-        return stack.to_rec709(read_camera_rgb(first_pass_path(stack, stack.all_in_focus_path)))
-
-    def _view(self, view_name: str) -> Float32[np.ndarray, "height width"]:
-        return structure_of(self.rgb(view_name))
-
-
-def nearest_views(model: SparseModel, name: str, count: int) -> list[SparseView]:
-    """Return at most `count` other views that tell most about the depth of one, best first.
-
-    Each common point gives a vote that grows with the angle under which the two cameras see it up to 8 degrees and falls
-    beyond (as COLMAP and MVSNet choose their sources): less is too little parallax, more changes what is seen.
+    Each point gives a vote that grows with the angle under which the two cameras see it up to 8 degrees and falls beyond (as COLMAP
+    and MVSNet choose their sources): less is too little parallax, more changes what is seen.
     """
-    reference, mine = model.view(name), model.points_of(name)
-    votes = []
-    for view in model.views:
-        common = model.points[np.intersect1d(mine, model.points_of(view))] if view.name != name else np.zeros((0, 3))
-        votes.append(float(_vote(common, reference, view).sum()))
-    order = sorted(range(len(votes)), key=lambda index: -votes[index])
-    return [model.views[index] for index in order[:count] if votes[index] > 0.0]
-
-
-def _vote(points: np.ndarray, first: SparseView, second: SparseView) -> np.ndarray:
-    to_first, to_second = first.centre - points, second.centre - points
+    to_first, to_second = first - points, second - points
     lengths = np.linalg.norm(to_first, axis=1) * np.linalg.norm(to_second, axis=1)
     angle = np.arccos(np.clip((to_first * to_second).sum(axis=1) / np.maximum(lengths, 1e-12), -1.0, 1.0))
     ratio = angle / _BEST_ANGLE_RAD
-    return np.minimum(ratio, 1.0 / np.maximum(ratio, 1e-9))
+    return float(np.minimum(ratio, 1.0 / np.maximum(ratio, 1e-9)).sum())

@@ -1,0 +1,1 @@
+"""Depth of a place seen from several viewpoints with known cameras."""
