@@ -1,8 +1,9 @@
 """All checks over a shot, one picture at a time, each beside its picture of the plate: by number, by time in films, else by order."""
 
-from collections.abc import Iterator, Mapping
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import islice, zip_longest
+from itertools import zip_longest
 from pathlib import Path
 
 from mrbokeh.checks.checked_picture import SHARP, VIRTUAL, CheckedPicture, Shot, with_layers
@@ -18,13 +19,30 @@ Pair = tuple[CheckedPicture | str, CheckedPicture | None]
 _SAME_TIME_S = 2e-3
 
 
-def pairs(report: CheckReport, shot: Shot, plate: Shot | None, frames: tuple[int, int | None] = (0, None)) -> Iterator[Pair]:
+@dataclass(frozen=True)
+class Taken:
+    """Numbers of the plate's frames from which a shot was made, None all; first_number: of the first frame of a film."""
+
+    numbers: Sequence[int] | None = None
+    first_number: int = 0
+
+    def of(self, plate: Shot) -> Iterator[tuple[int, CheckedPicture]]:
+        """Yield the pictures taken, each with its place in the plate; nothing behind the last is read."""
+        wanted = None if self.numbers is None else set(self.numbers)
+        named = range(self.first_number, sys.maxsize) if plate.numbers is None else plate.numbers
+        for place, (number, picture) in enumerate(zip(named, plate.pictures(), strict=False)):
+            if wanted is None or number in wanted:
+                yield place, _readable(picture, plate)
+            if self.numbers is not None and number >= self.numbers[-1]:
+                return
+
+
+def pairs(report: CheckReport, shot: Shot, plate: Shot | None, taken: Taken) -> Iterator[Pair]:
     """Yield checked pictures with their plates, None if there is none. What the plate has and the shot lacks becomes a finding.
 
-    frames: of the plate, counted from 0, from which the shot was made (the second is left out). Raises InputError if a picture
-    of the plate cannot be read or is of another size.
+    Raises InputError if a picture of the plate cannot be read or is of another size.
     """
-    _note_missing(report, shot.path.name, [str(number) for number in sorted(_missing_numbers(shot, plate, frames))])
+    _note_missing(report, shot.path.name, [str(number) for number in sorted(_missing_numbers(shot, plate, taken))])
     if plate is None:
         paired: Iterator[Pair] = ((picture, None) for picture in shot.pictures())
     elif not plate.is_sequence and len(plate.numbers or ()) == 1:
@@ -33,18 +51,19 @@ def pairs(report: CheckReport, shot: Shot, plate: Shot | None, frames: tuple[int
     elif shot.numbers is not None and plate.numbers is not None:
         paired = _by_number(shot, plate)
     elif shot.numbers is None and plate.numbers is None:
-        paired = _by_time(report, shot, plate, frames)
+        paired = _by_time(report, shot, plate, taken)
     else:
-        paired = _by_order(report, shot, plate, frames)
+        paired = _by_order(report, shot, plate, taken)
     for picture, other in paired:
         _require_same_size(picture, other)
         yield picture, other
 
 
-def _missing_numbers(shot: Shot, plate: Shot | None, frames: tuple[int, int | None]) -> set[int]:
-    missing = set(shot.missing)
+def _missing_numbers(shot: Shot, plate: Shot | None, taken: Taken) -> set[int]:
+    missing = set(shot.missing) if taken.numbers is None else set(shot.missing) & set(taken.numbers)
     if plate is not None and plate.is_sequence == shot.is_sequence and shot.numbers is not None and len(plate.numbers or ()) > 1:
-        missing |= set((plate.numbers or ())[slice(*frames)]) - set(shot.numbers)
+        there = set(plate.numbers or ())
+        missing |= (there if taken.numbers is None else there & set(taken.numbers)) - set(shot.numbers)
     return missing
 
 
@@ -58,37 +77,37 @@ def _by_number(shot: Shot, plate: Shot) -> Iterator[Pair]:
         yield picture, _readable(other, plate) if number == wanted else None
 
 
-def _by_time(report: CheckReport, shot: Shot, plate: Shot, frames: tuple[int, int | None]) -> Iterator[Pair]:
+def _by_time(report: CheckReport, shot: Shot, plate: Shot, taken: Taken) -> Iterator[Pair]:
     """Pair by time: times of the shot count from the first frame taken of the plate, unless that is the plate's first."""
-    plates = (_readable(each, plate) for each in islice(plate.pictures(), *frames))
-    first = next(plates, None)
-    if first is None or first.time_s is None:
-        raise InputError(f"the plate {plate.path} has no frame {frames[0]}: give the range of its frames from which {shot.path} was made")
-    start_s, other, passed = first.time_s if frames[0] else 0.0, first, list[str]()
+    plates = taken.of(plate)
+    place, other = next(plates, (0, None))
+    if other is None or other.time_s is None:
+        raise InputError(f"the plate {plate.path} has none of the --frames: give the numbers of its frames from which {shot.path} was made")
+    start_s, passed = other.time_s if place else 0.0, list[str]()
     ended = False
     for picture in shot.pictures():
         time_s = start_s + (0.0 if isinstance(picture, str) or picture.time_s is None else picture.time_s)
         while not ended and (other.time_s or 0.0) < time_s - _SAME_TIME_S:
             passed.append(other.name)
             after = next(plates, None)
-            other, ended = (other, True) if after is None else (after, False)
+            other, ended = (other, True) if after is None else (after[1], False)
         if ended or (other.time_s or 0.0) > time_s + _SAME_TIME_S:
             yield picture, None
             continue
         yield picture, other
         after = next(plates, None)
-        other, ended = (other, True) if after is None else (after, False)
-    rest = [] if ended else [other.name, *(each.name for each in plates)]
+        other, ended = (other, True) if after is None else (after[1], False)
+    rest = [] if ended else [other.name, *(each.name for _, each in plates)]
     _note_missing(report, shot.path.name, [f"the plate's {each}" for each in (*passed, *rest)])
 
 
-def _by_order(report: CheckReport, shot: Shot, plate: Shot, frames: tuple[int, int | None]) -> Iterator[Pair]:
+def _by_order(report: CheckReport, shot: Shot, plate: Shot, taken: Taken) -> Iterator[Pair]:
     lacking = []
-    for picture, other in zip_longest(shot.pictures(), islice(plate.pictures(), *frames)):
+    for picture, other in zip_longest(shot.pictures(), (each for _, each in taken.of(plate))):
         if picture is not None:
-            yield picture, None if other is None else _readable(other, plate)
+            yield picture, other
         elif other is not None:
-            lacking.append(f"the plate's {_readable(other, plate).name}")
+            lacking.append(f"the plate's {other.name}")
     _note_missing(report, shot.path.name, lacking)
 
 
@@ -117,7 +136,7 @@ class CheckSettings:
     layers: files of layers by name (virtual, sharp), one for all pictures, or a folder with one for each.
     lens: as focused for the shot, to find the reach of a sharp layer. energy_tolerance: share of the light. flicker_limit: mean
     absolute difference beyond the plate's own. tolerance: how far a pixel may differ from the plate (sRGB code; in EXR share of the
-    light); None: what storing it explains. frames: of the plate, from which the shot was made.
+    light); None: what storing it explains. taken: frames of the plate, from which the shot was made.
     """
 
     layers: Mapping[str, Path] = field(default_factory=dict)
@@ -125,13 +144,13 @@ class CheckSettings:
     energy_tolerance: float = 0.01
     flicker_limit: float = 0.002
     tolerance: float | None = None
-    frames: tuple[int, int | None] = (0, None)
+    taken: Taken = field(default_factory=Taken)
 
 
 def check_shot(shot: Shot, plate: Shot | None, settings: CheckSettings) -> tuple[CheckReport, LeakMap]:
     """Check a shot. Raises InputError if no picture can be read, or the plate is of another size."""
     report, leaks, flicker = CheckReport(), LeakMap(settings.tolerance), FlickerScore()
-    passed = track(pairs(report, shot, plate, settings.frames), f"checking {shot.path.name}", len(shot.numbers or ()))
+    passed = track(pairs(report, shot, plate, settings.taken), f"checking {shot.path.name}", len(shot.numbers or ()))
     still = {name: read_layer(path) for name, path in settings.layers.items() if not path.is_dir()}
     for index, (picture, other) in enumerate(passed):
         if isinstance(picture, str):

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.checks.check_shot import CheckSettings, check_shot
+from mrbokeh.checks.check_shot import CheckSettings, Taken, check_shot
 from mrbokeh.checks.checked_picture import open_shot
 from mrbokeh.checks.picture_checks import CheckReport
 from mrbokeh.commands._option_groups import grouped
@@ -33,7 +33,10 @@ class SourceOptions:
         Path | None, typer.Option(help="The same before the blur, for the ledger of light, and with --lens for the reach.")
     ] = None
     lens: Annotated[Path | None, typer.Option(help="The lens as it was focused for OUT: how far light of --sharp may reach.")] = None
-    frames: Annotated[str, typer.Option(metavar="START:STOP", help="Frames of PLATE from which OUT was made; STOP is left out.")] = ":"
+    frames: Annotated[
+        str | None, typer.Option(metavar="NUMBERS", help="Frames of PLATE from which OUT was made: 1001-1050, 1001-1050x2, 1001,1020.")
+    ] = None
+    first_number: Annotated[int, typer.Option(help="Number of the first frame of a film, as `mrbokeh video` was told.")] = 0
 
     @property
     def files(self) -> tuple[Path | None, ...]:
@@ -99,16 +102,17 @@ def check(
 
 
 def _settings(made: SourceOptions, limits: LimitOptions) -> CheckSettings:
-    from mrbokeh.commands.video import parse_frames
     from mrbokeh.renderers.choose import read_lens
+    from mrbokeh.video.picture_source import parse_frames
 
+    numbers = None if made.frames is None else sorted({number for each in parse_frames(made.frames) for number in each})
     return CheckSettings(
         layers={name: path for name, path in (("virtual", made.virtual), ("sharp", made.sharp)) if path is not None},
         lens=None if made.lens is None else read_lens(made.lens),
         energy_tolerance=limits.energy_tolerance,
         flicker_limit=limits.flicker_limit,
         tolerance=limits.tolerance,
-        frames=parse_frames(made.frames),
+        taken=Taken(numbers, made.first_number),
     )
 
 

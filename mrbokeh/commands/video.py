@@ -39,7 +39,7 @@ from mrbokeh.system.resources import cores
 from mrbokeh.video.clip import has_alpha_apart
 from mrbokeh.video.encodings import with_alpha
 from mrbokeh.video.image_sequence import is_pattern
-from mrbokeh.video.picture_source import PictureSource, open_source, parse_rate
+from mrbokeh.video.picture_source import PictureSource, numbers_taken, open_source, parse_rate
 
 ClipArgument = Annotated[
     Path,
@@ -61,10 +61,12 @@ class ClipOptions(shared.NearOptions):
     """Options of the clip: which frames are taken, their numbers, and depth."""
 
     rate: Annotated[str | None, typer.Option(help="Frames per second of numbered pictures: 25, 23.976, 24000/1001.")] = None
-    frames: Annotated[str, typer.Option(metavar="START:STOP", help="Frames to take, counted from 0; STOP is left out.")] = ":"
+    frames: Annotated[
+        str | None, typer.Option(metavar="NUMBERS", help="Frames to take, by the numbers of the files: 1001-1050, 1001-1050x2, 1001,1020.")
+    ] = None
     first_number: Annotated[
         int | None,
-        typer.Option(help="What the clip's frame 0 is called in sequences, tracks and focus pulls; default: as its own files, or 0."),
+        typer.Option(help="Number of the clip's first frame, for --frames, sequences, tracks and focus pulls; default: its file's, or 0."),
     ] = None
     depth: Annotated[
         Path | None, typer.Option(metavar="DEPTH.exr", help="Depth of the filmed scene in metres, one file or depth.%04d.exr.")
@@ -131,6 +133,8 @@ class WorkOptions:
 
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     import numpy as np
 
     from mrbokeh.shots.layer_sources import SceneLayers
@@ -152,6 +156,9 @@ def recipe_of(
     _check_virtual(virtual, rendering)
     require_one_focus(focus=blur.focus, focus_at=blur.focus_at, focus_pull=blur.focus_pull)
     facts.on(None, lens_and_renderer(lens, blur.renderer)[1])  # refuses facts that a network cannot follow
+    pull = None if blur.focus_pull is None else FocusPulled.of(blur.focus_pull)
+    if pull is not None:
+        pull.require_reached(_numbers(source, taken))
     holding = SensorOrientation((source.info.width_px, source.info.height_px), source.info.quarter_turns)
     objects = virtual.object_names
     files = tuple(LayerFiles(path.resolve(), objects) for path in virtual.layer or ())
@@ -161,7 +168,7 @@ def recipe_of(
         renderer=_renderer(blur.renderer),
         mode=virtual.mode or (DEFAULT_MODE if taken.matte is None else "between"),
         camera=_camera(source, virtual),
-        focus=None if blur.focus_pull is None else FocusPulled.of(blur.focus_pull),
+        focus=pull,
         depth=_depth(taken),
         exact_depth=taken.exact_depth,
         matte=None if taken.matte is None else MatteFiles(taken.matte.resolve()),
@@ -190,8 +197,7 @@ def _depth(taken: ClipOptions) -> DepthFiles | None:
 
 def _first_depth_m(recipe: CompositeRecipe, source: PictureSource, taken: ClipOptions) -> "np.ndarray | None":
     """Return the depth of the first frame that is taken, on which --focus-at focuses for the whole clip."""
-    start, _ = parse_frames(taken.frames)
-    moment = Moment(recipe.first_number + start, 0.0, (source.info.width_px, source.info.height_px))
+    moment = Moment(_numbers(source, taken)[0], 0.0, (source.info.width_px, source.info.height_px))
     return None if recipe.depth is None else recipe.depth.opened(1).depth_m_at(moment)
 
 
@@ -208,26 +214,20 @@ def target_of(out: Path, source: PictureSource, recipe: CompositeRecipe, colour:
     return VideoTarget(path=out.resolve(), encoding=encoding, audio_from=sound, space=colour.of_result, even_rate=even_rate)
 
 
-def shot_of(source: PictureSource, recipe: CompositeRecipe, target: Target, frames: str, segment_s: float) -> Shot:
-    """Return the shot. frames: START:STOP as typed."""
-    (start, stop), count = parse_frames(frames), len(source.times_s)
-    if start >= count:
-        raise InputError(f"--frames {frames} leaves nothing of {source.path}: expected a range within its {count} frames")
-    last = min(count, count if stop is None else stop)
-    frames_of_segment = max(1, round(segment_s * source.info.frame_rate))
-    return Shot(source=source, recipe=recipe, target=target, start=start, stop=last, segment_frames=frames_of_segment)
+def shot_of(source: PictureSource, recipe: CompositeRecipe, target: Target, taken: ClipOptions, segment_s: float) -> Shot:
+    numbers, first = _numbers(source, taken), _first_number(source, taken)
+    return Shot(
+        source=source,
+        recipe=recipe,
+        target=target,
+        taken=[number - first for number in numbers],
+        segment_frames=max(1, round(segment_s * source.info.frame_rate)),
+    )
 
 
-def parse_frames(text: str) -> tuple[int, int | None]:
-    """Parse START:STOP, either of which may be missing, as (first frame, first one left out or None)."""
-    start, colon, stop = text.partition(":")
-    try:
-        parsed = int(start or 0), int(stop) if stop else None
-    except ValueError:
-        parsed = (-1, None)
-    if not colon or parsed[0] < 0 or (parsed[1] is not None and parsed[1] <= parsed[0]):
-        raise InputError(f"--frames: expected START:STOP with START below STOP, such as 0:50 or 100:, got {text!r}")
-    return parsed
+def _numbers(source: PictureSource, taken: ClipOptions) -> "Sequence[int]":
+    first = _first_number(source, taken)
+    return numbers_taken(taken.frames, range(first, first + len(source.times_s)), source.path)
 
 
 def _check_virtual(virtual: VirtualOptions, rendering: RenderingOptions) -> None:
@@ -260,10 +260,9 @@ def _camera(source: PictureSource, virtual: VirtualOptions) -> CameraFile | None
 def _look(look: LookGroup, source: PictureSource, taken: ClipOptions) -> ClipLook | None:
     if look.wanted == LookOptions(seed=look.seed):
         return None
-    start, _ = parse_frames(taken.frames)
-    return ClipLook(
-        options=look.wanted, clip=source.path, rate=taken.rate, start=start, first_number=_first_number(source, taken), space=source.space
-    )
+    first = _first_number(source, taken)
+    start = _numbers(source, taken)[0] - first
+    return ClipLook(options=look.wanted, clip=source.path, rate=taken.rate, start=start, first_number=first, space=source.space)
 
 
 def _first_number(source: PictureSource, taken: ClipOptions) -> int:
@@ -298,7 +297,7 @@ def video(
 
     Finished segments wait in OUT.parts: the same command goes on where it was interrupted.
 
-    Example: mrbokeh video clip.mp4 --layer lantern.exr --lens lens.json --out lantern_in_clip.mov --frames 0:50
+    Example: mrbokeh video clip.mp4 --layer lantern.exr --lens lens.json --out lantern_in_clip.mov --frames 0-49
 
     Example: mrbokeh video clip.mov --scene scene.toml --camera track.json --focus-pull 0:1.2,48:3.5 --lens lens.json --out out.mp4
     """
@@ -308,13 +307,13 @@ def video(
     if lens_and_renderer(lens, blur.renderer)[0] is None and not {"focal_length_mm", "f_number"} <= facts.given.keys():
         guess(f"no whole lens is stated, so that this one is taken: {recipe.stated_lens.described}")
     target = target_of(out, source, recipe, colour, result)
-    shot = shot_of(source, recipe, target, taken.frames, work.segment)
+    shot = shot_of(source, recipe, target, taken, work.segment)
     target.require_new(shot, result.overwrite or shot.was_begun)
     _try_first_frame(shot)
     if not result.virtual_only and (lost := _alpha_lost(clip, source, target)):
         warn(f"{clip} {lost}")
     note = _made(shot, _executor(work, len(shot.segments)), result.overwrite)
-    frames = shot.stop - shot.start
+    frames = len(shot.taken)
     told = f"wrote {out} ({source.info.width_px}x{source.info.height_px} px, {frames} frame{'' if frames == 1 else 's'}, {note})"
     tell(told, known=recipe.stated_lens.facts, frames=frames, size_px=(source.info.width_px, source.info.height_px))
 
@@ -337,11 +336,12 @@ def _executor(work: WorkOptions, segments: int) -> Executor:
 
 def _try_first_frame(shot: Shot) -> None:
     """Render the first frame, so that mistakes in files and options are told at once, and not by a worker."""
-    frame = next(shot.source.frames(shot.start, shot.start + 1))
-    shot.recipe.build(1).make(shot.start, frame.rgb, frame.time_s, frame.alpha)
+    first = shot.taken[0]
+    frame = next(shot.source.frames(first, first + 1))
+    shot.recipe.build(1).make(first, frame.rgb, frame.time_s, frame.alpha)
 
 
 def _made(shot: Shot, executor: Executor, overwrite: bool) -> str:
     with kept_when_interrupted(f"finished segments are kept in {shot.parts_path}"), progress_bars() as bars:
-        task = bars.add_task("compositing", total=shot.stop - shot.start)
+        task = bars.add_task("compositing", total=len(shot.taken))
         return render_shot(shot, executor, overwrite=overwrite, progress=lambda count: bars.advance(task, count))

@@ -24,6 +24,7 @@ from mrbokeh.shots.shot import FrameMaker, MakerRecipe, Picture, Segment, Shot
 from mrbokeh.system.errors import InputError, MissingExtraError
 from mrbokeh.system.resources import CallingThread, ahead, cores
 from mrbokeh.video.clip import Frame
+from mrbokeh.video.picture_source import frames_taken
 
 Make = Callable[[int, Frame], Picture]
 Write = Callable[[int, Frame, Picture], None]
@@ -59,18 +60,17 @@ def render_segment(task: SegmentTask, made: Callable[[], None] = lambda: None) -
         def make(index: int, frame: Frame) -> Picture:
             return maker.make(index, frame.rgb, frame.time_s, frame.alpha)
 
-        frames = shot.source.frames(segment.start, segment.stop, task.threads)
-        stream(frames, segment.start, make, write, overlap=task.threads != 1)
+        frames = zip(segment.taken, frames_taken(shot.source, segment.taken, task.threads), strict=True)
+        stream(frames, make, write, overlap=task.threads != 1)
     return segment.number
 
 
-def stream(frames: Iterator[Frame], first: int, make: Make, write: Write, *, overlap: bool = True) -> None:
-    """Decode, render and write frames in their order; the first has the number `first`.
+def stream(numbered: Iterator[tuple[int, Frame]], make: Make, write: Write, *, overlap: bool = True) -> None:
+    """Decode, render and write numbered frames in their order.
 
     Decoding and writing run beside the rendering, a few frames at a time. overlap: False does all in the calling thread, for a worker
     that has one core.
     """
-    numbered = enumerate(frames, first)
     with _one_thread(overlap) as decoding, _one_thread(overlap) as encoding:
         under_way: deque[Future[None]] = deque()
         for each in ahead(decoding, lambda _: next(numbered, None), repeat(None), AT_ONCE if overlap else 1):
@@ -175,7 +175,7 @@ class ProcessExecutor:
                 except BrokenProcessPool:
                     waiting = set()
         if len(numbers) < len(futures):
-            shown.settle(sum(task.segment.frame_count for task in futures.values() if task.segment.number in numbers))
+            shown.settle(sum(len(task.segment.taken) for task in futures.values() if task.segment.number in numbers))
         return numbers
 
 
@@ -259,7 +259,7 @@ class DaskExecutor:
         try:
             for future in as_completed(list(futures), loop=client.loop):
                 future.result()
-                progress(futures[future].segment.frame_count)
+                progress(len(futures[future].segment.taken))
         except KilledWorker as error:
             raise InputError(f"one segment killed the workers of {self.address} again and again (too little memory?): {error}") from None
         finally:

@@ -19,7 +19,7 @@ from mrbokeh.optics.camera import Camera, have_same_shape
 from mrbokeh.shots.inputs import CameraSource, DepthSource, Finisher, FocusSource, Kept, MatteSource, Moment
 from mrbokeh.system.atomic_files import read_json
 from mrbokeh.system.errors import InputError
-from mrbokeh.tracking.camera_track.focus_pull import parse_focus_keys, read_focus_pull
+from mrbokeh.tracking.camera_track.focus_pull import FocusPull, parse_focus_keys, read_focus_pull
 from mrbokeh.tracking.camera_track.formats import format_of_file, read_track
 from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame, TrackOptions
 from mrbokeh.video.clip import VideoInfo
@@ -85,7 +85,20 @@ class FocusPulled:
         return () if self.path is None else (self.path,)
 
     def opened(self, threads: int) -> FocusSource:  # noqa: ARG002
+        return self._pull
+
+    @property
+    def _pull(self) -> FocusPull:
         return parse_focus_keys(self.keys, "smooth") if self.path is None else read_focus_pull(self.path).smoothed()
+
+    def require_reached(self, numbers: Sequence[int]) -> None:
+        """Raise InputError if all keys of a pull lie before the frames, or all behind: the focus would stand still."""
+        first, last = self._pull.frames[0], self._pull.frames[-1]
+        if first < last and (last < numbers[0] or first > numbers[-1]):
+            raise InputError(
+                f"--focus-pull has its keys from frame {first:g} to {last:g}, but the frames taken are {numbers[0]}-{numbers[-1]}: "
+                f"count its keys as the files do, or say by --first-number what the clip's first frame is called"
+            )
 
 
 @dataclass(frozen=True)

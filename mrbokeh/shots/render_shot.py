@@ -36,6 +36,7 @@ from mrbokeh.system.channel import channel
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.encodings import encoding_for, encoding_name, with_alpha
 from mrbokeh.video.image_sequence import NumberedFiles, is_pattern, numbered
+from mrbokeh.video.picture_source import written_frames
 from mrbokeh.video.writer import PacketWriter, VideoWriter, packets_of
 
 _EXR = ".exr"
@@ -84,7 +85,7 @@ class SequenceTarget:
             raise InputError(
                 f"{self.path}: {self.space.name} is linear light, which integers cut off at 1: write .exr, or name a space with a curve"
             )
-        files = (self.file(index) for index in range(shot.start, shot.stop))
+        files = (self.file(index) for index in shot.taken)
         there = next((file for file in files if file.exists()), None)
         if there is not None and not overwrite:
             raise InputError(f"{there} exists already: give another name, or --overwrite to replace it")
@@ -95,10 +96,10 @@ class SequenceTarget:
     @contextmanager
     def writing(self, shot: Shot, segment: Segment, folder: Path) -> Iterator[PartSink]:  # noqa: ARG002
         yield _SequenceSink(self)
-        write_json(self.part(folder, segment), {"frames": [segment.start, segment.stop]})
+        write_json(self.part(folder, segment), {"frames": list(segment.taken)})
 
     def join(self, shot: Shot, folder: Path) -> str:  # noqa: ARG002
-        channel().outputs.extend(self.file(index) for index in range(shot.start, shot.stop))  # workers have channels of their own
+        channel().outputs.extend(self.file(index) for index in shot.taken)  # workers have channels of their own
         return "no audio"
 
     def file(self, index: int) -> Path:
@@ -178,7 +179,7 @@ class VideoTarget:
         name = encoding_name(self.path, self.encoding)
         settings: dict[str, Any] = {"encoding": name, "threads": _THREADS, "as_codes": self.space is not None}
         with VideoWriter(self.part(folder, segment), *self._format(shot), **settings) as writer:
-            yield _VideoSink(writer, self, shot.times_s(segment)[0], segment.start)
+            yield _VideoSink(writer, self, shot.times_s(segment)[0], segment.taken)
 
     def join(self, shot: Shot, folder: Path) -> str:
         reordered = max(packets_of(self.part(folder, segment))[1] for segment in shot.segments)
@@ -193,7 +194,7 @@ class VideoTarget:
         )
         with writer:
             for segment in shot.segments:
-                packets, count = packets_of(self.part(folder, segment))[0], segment.frame_count
+                packets, count = packets_of(self.part(folder, segment))[0], len(segment.taken)
                 if len(packets) != count:
                     raise InputError(f"{self.part(folder, segment)} holds {len(packets)} of {count} pictures: delete it and start again")
                 writer.append(*self._placed(packets, shot, segment))
@@ -203,7 +204,8 @@ class VideoTarget:
         """Return the packets of a part with the times at which they are shown; for an even rate some come twice and others never."""
         if self.even_rate is None:
             return packets, shot.times_s(segment)
-        first, last = segment.start - shot.start, segment.stop - shot.start
+        first = segment.number * shot.segment_frames
+        last = first + len(segment.taken)
         shown = enumerate(held_pictures(shot.all_times_s, self.even_rate))
         here = [(packets[picture - first], float(tick / self.even_rate)) for tick, picture in shown if first <= picture < last]
         return [packet for packet, _ in here], [time_s for _, time_s in here]
@@ -229,7 +231,7 @@ class _VideoSink:
     writer: VideoWriter
     target: VideoTarget
     begin_s: float
-    start: int
+    taken: Sequence[int]
 
     def write(self, picture: Picture, index: int, time_s: float) -> None:
         kept = picture.rgb if isinstance(picture, Rgba) and not self.writer.encoding.alpha else picture
@@ -237,7 +239,7 @@ class _VideoSink:
         if isinstance(stored, (Layer, Rgba)):
             stored = np.dstack([stored.rgb, stored.alpha])
         rate = self.target.even_rate
-        self.writer.write(stored, time_s - self.begin_s if rate is None else float((index - self.start) / rate))
+        self.writer.write(stored, time_s - self.begin_s if rate is None else float(self.taken.index(index) / rate))
 
 
 def render_shot(shot: Shot, executor: Executor, *, overwrite: bool = False, progress: Progress = lambda _: None) -> str:
@@ -249,7 +251,7 @@ def render_shot(shot: Shot, executor: Executor, *, overwrite: bool = False, prog
     shot.target.require_new(shot, overwrite or shot.was_begun)
     folder = PartsFolder.opened(shot, overwrite)
     missing = folder.missing
-    progress(sum(segment.frame_count for segment in shot.segments) - sum(segment.frame_count for segment in missing))
+    progress(len(shot.taken) - sum(len(segment.taken) for segment in missing))
     executor.run([SegmentTask(shot, segment, folder.path, executor.threads) for segment in missing], progress)
     note = shot.target.join(shot, folder.path)
     folder.remove()
@@ -283,7 +285,7 @@ class PartsFolder:
                 )
             if changed:
                 folder.remove()
-        write_json(manifest, {"settings": settings, "segments": [list(segment) for segment in shot.segments]})
+        write_json(manifest, {"settings": settings, "segments": [list(segment.taken) for segment in shot.segments]})
         return folder
 
     @property
@@ -309,7 +311,7 @@ def settings_of(shot: Shot) -> dict[str, str]:
         "version": __version__,
         "clip": _stamps([shot.source.path]),
         "input space": "" if shot.source.space is None else f"{shot.source.space} {_stamps(shot.source.space.files)}",
-        "frames": f"{shot.start}:{shot.stop} by {shot.segment_frames} at {shot.source.info.frame_rate}",
+        "frames": f"{written_frames(shot.taken)} by {shot.segment_frames} at {shot.source.info.frame_rate}",
         **of_recipe,
         "files": _stamps(recipe.files),
         **shot.target.settings,

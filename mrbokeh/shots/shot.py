@@ -1,5 +1,6 @@
 """Shot: a stretch of a clip, the recipe of its frames and their target; cut into segments that can be rendered independently."""
 
+from collections.abc import Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,19 +20,10 @@ MANIFEST = "manifest.json"
 
 
 class Segment(NamedTuple):
-    """Frames `start` to `stop` (excluded) of the clip; number: its place in the shot."""
+    """Frames of the clip, counted from its first, in their order; number: its place in the shot."""
 
     number: int
-    start: int
-    stop: int
-
-    @property
-    def frame_count(self) -> int:
-        return self.stop - self.start
-
-
-def segments_between(start: int, stop: int, frames: int) -> list[Segment]:
-    return [Segment(number, first, min(first + frames, stop)) for number, first in enumerate(range(start, stop, frames))]
+    taken: Sequence[int]
 
 
 @dataclass(frozen=True)
@@ -82,25 +74,25 @@ class MakerRecipe(Protocol):
 class Shot:
     """Stretch of a clip to render.
 
-    start, stop: the frames of the clip that are taken. segment_frames: number of frames of a segment, for any executor. All of it can
-    be pickled, and paths are absolute.
+    taken: the frames of the clip, counted from its first, in their order. segment_frames: number of frames of a segment, for any executor.
+    All of it can be pickled, and paths are absolute.
     """
 
     source: PictureSource
     recipe: MakerRecipe
     target: "Target"
-    start: int
-    stop: int
+    taken: Sequence[int]
     segment_frames: int
 
     @property
     def segments(self) -> list[Segment]:
-        return segments_between(self.start, self.stop, self.segment_frames)
+        begins = range(0, len(self.taken), self.segment_frames)
+        return [Segment(number, self.taken[first : first + self.segment_frames]) for number, first in enumerate(begins)]
 
     @property
     def begin_s(self) -> float:
         """The moment of the clip that is time 0 of the result: its own beginning, or that of the first frame taken."""
-        return float(self.source.times_s[self.start]) if self.start else 0.0
+        return float(self.source.times_s[self.taken[0]]) if self.taken[0] else 0.0
 
     @property
     def parts_path(self) -> Path:
@@ -114,12 +106,12 @@ class Shot:
 
     def times_s(self, segment: Segment) -> list[float]:
         """Return the times of a segment's frames in the result."""
-        return [float(time_s) - self.begin_s for time_s in self.source.times_s[segment.start : segment.stop]]
+        return [float(self.source.times_s[index]) - self.begin_s for index in segment.taken]
 
     @property
     def all_times_s(self) -> list[float]:
         """Times of all frames of the shot."""
-        return self.times_s(Segment(0, self.start, self.stop))
+        return self.times_s(Segment(0, self.taken))
 
 
 @runtime_checkable

@@ -3,7 +3,8 @@
 The frames of a video are counted once, from its packets and without decoding, and then read from anywhere.
 """
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -212,6 +213,53 @@ def open_source(clip: Path, rate: str | None = None, space: NamedSpace | None = 
             f"{clip}: the numbers of a video follow a curve, but {space.name} is linear: name the camera's own space (--input-space)"
         )
     return VideoSource.open(clip.resolve(), space)
+
+
+_FAR = 48
+
+
+def frames_taken(source: PictureSource, taken: Sequence[int], threads: int = 0) -> Iterator[Frame]:
+    """Yield frames of a source, counted from its first, in their order.
+
+    Videos are decoded through short gaps, for a new beginning costs up to a group of pictures; of numbered pictures no other is read.
+    """
+    farthest = _FAR if source.file_of(taken[0]) is None else 1
+    begins = [0, *(place for place in range(1, len(taken)) if taken[place] - taken[place - 1] > farthest)]
+    for begin, end in zip(begins, [*begins[1:], len(taken)], strict=True):
+        run = taken[begin:end]
+        wanted = set(run)
+        for index, frame in enumerate(source.frames(run[0], run[-1] + 1, threads), run[0]):
+            if index in wanted:
+                yield frame
+
+
+_FRAMES = re.compile(r"(-?\d+)(?:-(-?\d+)(?:x(\d+))?)?")
+
+
+def parse_frames(text: str) -> list[range]:
+    """Parse frame numbers as studios type them: 1001-1050, the last included, 1001-1050x2 for every second, 1001-1010,1020."""
+    found = [_FRAMES.fullmatch(each.strip()) for each in text.split(",")]
+    ranges = [range(int(each[1]), int(each[2] or each[1]) + 1, int(each[3] or 1) or -1) for each in found if each]
+    if len(ranges) < len(found) or not all(ranges):
+        gone = " (START:STOP, counted from 0, is no longer taken)" if ":" in text else ""
+        told = "numbers as the files have them, the last included: 1001-1050, 1001-1050x2 or 1001-1010,1020"
+        raise InputError(f"--frames: expected {told}, got {text!r}{gone}")
+    return ranges
+
+
+def numbers_taken(text: str | None, numbers: range, clip: Path) -> Sequence[int]:
+    """Return the frame numbers that --frames names, in order, each once; None takes all. numbers: those that the clip has."""
+    ranges = [numbers] if text is None else parse_frames(text)
+    if any(each[0] < numbers[0] or each[-1] > numbers[-1] for each in ranges):
+        raise InputError(f"--frames {text}: {clip} has the frames {numbers[0]}-{numbers[-1]}: take some of those")
+    return ranges[0] if len(ranges) == 1 else sorted({number for each in ranges for number in each})
+
+
+def written_frames(numbers: Sequence[int]) -> str:
+    """Return frame numbers as --frames takes them."""
+    begins = [each for place, each in enumerate(numbers) if place == 0 or each - numbers[place - 1] > 1]
+    ends = [each for place, each in enumerate(numbers) if place + 1 == len(numbers) or numbers[place + 1] - each > 1]
+    return ",".join(str(begin) if begin == end else f"{begin}-{end}" for begin, end in zip(begins, ends, strict=True))
 
 
 def parse_rate(text: str) -> Fraction:

@@ -100,7 +100,7 @@ def rate_of(clip: Path, recipe: MakerRecipe, executor: Executor, encoding: str =
     """(frames per second, largest memory in MB) of a whole run, from the start of the processes to the joined file."""
     out = clip.with_name(f"out.{'mp4' if encoding.startswith('h26') else 'mov'}")
     source = open_source(clip)
-    shot = Shot(source, recipe, VideoTarget(out, encoding), 0, len(source.times_s), round(SEGMENT_S * RATE))
+    shot = Shot(source, recipe, VideoTarget(out, encoding), range(len(source.times_s)), round(SEGMENT_S * RATE))
     with Memory() as memory:
         started_s = time.perf_counter()
         render_shot(shot, executor)

@@ -313,7 +313,7 @@ def test_films_are_paired_by_time(tmp_path: Path) -> None:
     found = report_of(holed, plate, 1, *known)
     assert [each["check"] for each in found["findings"]] == ["missing"] and "the plate's frame 4" in found["findings"][0]["text"]
     part = film(tmp_path / "part.mkv", made[3:7], [time_s - times[3] for time_s in times[3:7]])
-    report_of(part, plate, 0, "--frames", "3:7", *known)
+    report_of(part, plate, 0, "--frames", "3-6", *known)
     report_of(part, plate, 1, *known)
 
 

@@ -31,7 +31,7 @@ SHARP = "--rgb sharp.exr --depth sharp.exr --lens lens.json"
 BASES = {
     "render": f"{SHARP} --out out.exr",
     "composite": "photo.png --lens lens.json --depth sharp.exr --layer layer.exr --out out.exr",
-    "video": f"{LIVE}/clip.mp4 --layer wide.exr --lens lens.json --frames 0:1 --out out.mp4",
+    "video": f"{LIVE}/clip.mp4 --layer wide.exr --lens lens.json --frames 0 --out out.mp4",
     "transfer": "sharp.exr --depth sharp.exr --lens lens.json --out out.exr",
     "tilt-shift": "photo.png --out out.exr",
     "refocus": "stack --focus 1.5 --out refocused",

@@ -23,7 +23,7 @@ from mrbokeh.shots.render_shot import PartsFolder, SequenceTarget, VideoTarget, 
 from mrbokeh.shots.shot import FrameMaker, MakerRecipe, Shot, Target
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import probe, read_frames
-from mrbokeh.video.picture_source import open_source
+from mrbokeh.video.picture_source import frames_taken, open_source
 from mrbokeh.video.writer import VideoWriter
 from tests.support.refusals import refused
 from tests.support.shot_makers import Brighter, wait_for
@@ -53,7 +53,7 @@ def even_clip(folder: Path, size: tuple[int, int] = (256, 128)) -> Path:
 
 
 def shot_of(clip: Path, target: Target, recipe: MakerRecipe | None = None, frames: tuple[int, int] = (0, COUNT)) -> Shot:
-    return Shot(open_source(clip), recipe or Brighter(), target, *frames, PER_SEGMENT)
+    return Shot(open_source(clip), recipe or Brighter(), target, range(*frames), PER_SEGMENT)
 
 
 def packets_and_times(path: Path) -> tuple[list[bytes], list[Fraction]]:
@@ -66,7 +66,7 @@ def packets_and_times(path: Path) -> tuple[list[bytes], list[Fraction]]:
 def written_in_one_go(shot: Shot, path: Path, encoding: str) -> None:
     info, maker = shot.source.info, shot.recipe.build(1)
     with VideoWriter(path, info.width_px, info.height_px, info.frame_rate, info.time_base, encoding=encoding, threads=1) as writer:
-        for index, frame in enumerate(shot.source.frames(shot.start, shot.stop), shot.start):
+        for index, frame in zip(shot.taken, frames_taken(shot.source, shot.taken), strict=True):
             writer.write(maker.make(index, frame.rgb, frame.time_s), frame.time_s)
 
 
@@ -124,7 +124,7 @@ def test_every_frame_gets_its_own_number_and_time(tmp_path: Path, executor: Exec
 
 def test_sound_is_copied_where_segments_are_joined(tmp_path: Path, shared_data: Path) -> None:
     source = shared_data / "video" / "ducks_720p.mp4"
-    shot = Shot(open_source(source), Brighter(0.0), VideoTarget(tmp_path / "out.mp4", audio_from=source), 6, 14, 4)
+    shot = Shot(open_source(source), Brighter(0.0), VideoTarget(tmp_path / "out.mp4", audio_from=source), range(6, 14), 4)
     assert render_shot(shot, SerialExecutor()) == "audio copied (aac)"
     begin_s = float(shot.source.times_s[6])
     with av.open(str(source)) as container:
@@ -142,7 +142,7 @@ def test_sound_is_copied_where_segments_are_joined(tmp_path: Path, shared_data: 
 def test_a_real_clip_of_uneven_times_keeps_them(tmp_path: Path, shared_data: Path) -> None:
     """The iPhone's HEVC with a variable rate, into H.265 in parts."""
     clip = shared_data / "video" / "iphone_xr_chart.mov"
-    shot = Shot(open_source(clip), Brighter(0.0), VideoTarget(tmp_path / "out.mov", "h265-10bit", clip), 0, 5, 3)
+    shot = Shot(open_source(clip), Brighter(0.0), VideoTarget(tmp_path / "out.mov", "h265-10bit", clip), range(5), 3)
     assert render_shot(shot, SerialExecutor()) == "audio copied (pcm_s16le)"
     np.testing.assert_allclose([frame.time_s for frame in read_frames(tmp_path / "out.mov")], shot.source.times_s[:5], atol=1e-9)
     assert probe(tmp_path / "out.mov").color.transfer == 1
@@ -153,7 +153,9 @@ def test_numbered_pictures_in_and_out(tmp_path: Path, suffix: str) -> None:
     rng = np.random.default_rng(1)
     for number in range(1001, 1008):
         write_image(tmp_path / f"in.{number}{suffix}", rng.random((24, 32, 3), np.float32))
-    shot = Shot(open_source(tmp_path / f"in.%04d{suffix}", "24"), Brighter(), SequenceTarget(tmp_path / f"out.%04d{suffix}", 1001), 2, 7, 2)
+    shot = Shot(
+        open_source(tmp_path / f"in.%04d{suffix}", "24"), Brighter(), SequenceTarget(tmp_path / f"out.%04d{suffix}", 1001), range(2, 7), 2
+    )
     render_shot(shot, SerialExecutor())
     outs = sorted(file.name for file in tmp_path.glob("out.*"))
     assert outs == [f"out.{number}{suffix}" for number in range(1003, 1008)]

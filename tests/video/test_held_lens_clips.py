@@ -39,7 +39,7 @@ def blurred(folder: Path, clip: Path, quarters: int, lens: Lens, *more: str) -> 
     write_layer(folder / "layer.exr", light(quarters), half=False)
     write_lens(folder / "lens.json", lens)
     words = [clip, *more, "--layer", folder / "layer.exr", "--lens", folder / "lens.json", "--out", folder / "out.%d.exr"]
-    options = ["--virtual-only", "--frames", "0:1", "--workers", "1", "--renderer", "scatter", "--overwrite"]
+    options = ["--virtual-only", "--frames", "0", "--workers", "1", "--renderer", "scatter", "--overwrite"]
     printed_by(app, *words, *options)
     return read_layer(folder / "out.0.exr")
 

@@ -142,9 +142,9 @@ def test_workers_that_die_lose_no_alpha(tmp_path: Path, kind: str) -> None:
         SequenceTarget(tmp_path / f"{name}.%d.exr") if kind == "exr" else VideoTarget(tmp_path / f"{name}.mkv", "ffv1-alpha")
         for name in "ab"
     ]
-    render_shot(Shot(source, Brighter(), targets[0], 0, COUNT, 2), SerialExecutor())
+    render_shot(Shot(source, Brighter(), targets[0], range(COUNT), 2), SerialExecutor())
     killing.touch()
-    shot = Shot(source, Brighter(killing=killing), targets[1], 0, COUNT, 2)
+    shot = Shot(source, Brighter(killing=killing), targets[1], range(COUNT), 2)
     with pytest.raises(KeyboardInterrupt):
         render_shot(shot, ProcessExecutor(1), progress=_interrupting(3))
     assert shot.was_begun and not killing.exists()
@@ -177,7 +177,7 @@ def _interrupting(after: int) -> Callable[[int], None]:
 )
 def test_what_cannot_hold_alpha_is_told_and_black(settings: list[str], tmp_path: Path, out: str, more: tuple[str, ...], told: str) -> None:
     clip, _ = clip_of(tmp_path, "prores")
-    output = run(clip, *settings, *more, "--frames", "0:2", "--out", tmp_path / out)
+    output = run(clip, *settings, *more, "--frames", "0-1", "--out", tmp_path / out)
     warning = f"warning: {clip} has alpha, but {told}: what it does not cover is black in {out}"
     assert " ".join(output.split()).count(warning) == 1 and output.index("warning") < output.index("wrote")
     rgb = read_image(tmp_path / "out.0.jpg") if "%d" in out else next(read_frames(tmp_path / out)).rgb

@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.commands.video import parse_frames
 from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.compositing.plate import plate_of
 from mrbokeh.images.exr_io import ExrPart, write_exr
@@ -27,6 +26,7 @@ from mrbokeh.system.atomic_files import write_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.focus_pull import parse_focus_keys
 from mrbokeh.video.clip import read_frames
+from mrbokeh.video.picture_source import parse_frames
 from mrbokeh.video.writer import VideoWriter
 from tests.compositing.test_plate_look_options import photo_with_exif
 from tests.stacks.test_exr_layers_cryptomatte import beauty, crypto_channels, header
@@ -88,20 +88,47 @@ def test_every_frame_is_the_composite_of_the_library(clip: Path, settings: list[
 
 
 def test_a_range_of_frames_begins_at_time_zero(clip: Path, settings: list[str], tmp_path: Path) -> None:
-    run(clip, *settings, "--out", tmp_path / "out.mkv", "--frames", "4:9")
+    run(clip, *settings, "--out", tmp_path / "out.mkv", "--frames", "4-8")
     times_s = [frame.time_s for frame in read_frames(clip)]
     found_s = [frame.time_s for frame in read_frames(tmp_path / "out.mkv")]
     assert found_s == pytest.approx([time_s - times_s[4] for time_s in times_s[4:9]], abs=1e-9)
-    assert [parse_frames(text) for text in (":", "0:50", "10:", ":7")] == [(0, None), (0, 50), (10, None), (0, 7)]
-    for text in ("", "5", "7:7", "9:2", "-1:4", "a:b"):
-        refused("START:STOP", parse_frames, text)
+    with pytest.raises(InputError, match=r"1001-1050, 1001-1050x2 or 1001-1010,1020, got '4:9' \(START:STOP, counted from 0, is no longer"):
+        run(clip, *settings, "--out", tmp_path / "no.mkv", "--frames", "4:9")
+
+
+def test_frames_go_by_the_numbers_of_the_files(clip: Path, settings: list[str], tmp_path: Path) -> None:
+    """As studios count: the last is included, x2 takes every second; what is between is neither read nor written."""
+    taken = {text: [list(each) for each in parse_frames(text)] for text in ("1001-1003", "1001-1006x2", "1001-1002, 1007", "-2--1")}
+    assert list(taken.values()) == [[[1001, 1002, 1003]], [[1001, 1003, 1005]], [[1001, 1002], [1007]], [[-2, -1]]]
+    for text in ("", "7-5", "1-4x0", "a-b", "1-", "1,,2", "10-20x"):
+        refused("numbers as the files have them, the last included", parse_frames, text)
+    pictures = [frame.rgb for frame in read_frames(clip)]
+    for i, rgb in enumerate(pictures[:7]):
+        write_image(tmp_path / f"in.{1001 + i}.exr", rgb, half=False)
+    (tmp_path / "in.1002.exr").write_bytes(b"not EXR")
+    options = (tmp_path / "in.%04d.exr", "--rate", "24", *settings, "--focus-pull", "1001:2,1007:1", "--renderer", "scatter")
+    run(*options, "--segment", 0.05, "--frames", "1003-1007x2,1004,1003", "--out", tmp_path / "out.%04d.exr")
+    assert sorted(each.name for each in tmp_path.glob("out.*")) == [f"out.{number}.exr" for number in (1003, 1004, 1005, 1007)]
+    layer, lens = read_layer(tmp_path / "layer.exr"), LENS.focused_at(parse_focus_keys("1001:2,1007:1", "smooth").at(1005))
+    inserted = OverPhotograph().insert(plate_of(pictures[4], lens), [layer], ScatterReference())
+    np.testing.assert_allclose(read_image(tmp_path / "out.1005.exr"), inserted.rgb, atol=2**-11)
+    # A video shows the frames at their own times, those of a video are numbered from --first-number.
+    run(clip, *settings, "--first-number", "1001", "--frames", "1003-1007x2", "--out", tmp_path / "out.mkv")
+    times_s, shown = [frame.time_s for frame in read_frames(clip)], list(read_frames(tmp_path / "out.mkv"))
+    assert [each.time_s for each in shown] == pytest.approx([times_s[i] - times_s[2] for i in (2, 4, 6)], abs=1e-9)
+    for i, each in zip((2, 4, 6), shown, strict=True):
+        np.testing.assert_allclose(each.rgb[0], pictures[i][0], atol=STEP)
+    refused(r"--frames 1003-1013: \S+ has the frames 1001-1012", run, clip, *settings, "--first-number", 1001, "--frames", "1003-1013",
+            "--out", tmp_path / "no.mkv")  # fmt: skip
+    refused("keys from frame 0 to 9, but the frames taken are 1001-1007", run, *options[:3], *settings, "--focus-pull", "0:2,9:1",
+            "--out", tmp_path / "no.mkv")  # fmt: skip
 
 
 def test_a_bank_is_a_lens(clip: Path, settings: list[str], tmp_path: Path) -> None:
     """The same film as by the lens file, in workers too, which read the bank themselves."""
     bank = bank_folder(tmp_path / "bank", LENS)
-    run(clip, *settings, "--frames", "0:6", "--out", tmp_path / "by_file.mkv")
-    run(clip, *settings[:2], "--lens", bank, "--frames", "0:6", "--workers", "2", "--segment", "0.12", "--out", tmp_path / "by_bank.mkv")
+    run(clip, *settings, "--frames", "0-5", "--out", tmp_path / "by_file.mkv")
+    run(clip, *settings[:2], "--lens", bank, "--frames", "0-5", "--workers", "2", "--segment", "0.12", "--out", tmp_path / "by_bank.mkv")
     by_file, by_bank = (list(read_frames(tmp_path / f"by_{way}.mkv")) for way in ("file", "bank"))
     assert len(by_bank) == 6 and all(psnr(a.rgb, b.rgb) > 40.0 for a, b in zip(by_file, by_bank, strict=True))
 
@@ -112,7 +139,7 @@ def test_mistakes_end_in_a_sentence(clip: Path, settings: list[str], tmp_path: P
     lens, out = ("--lens", tmp_path / "lens.json"), ("--out", tmp_path / "out.mov")
     for words, sentence in (
         (("--layer", tmp_path / "small.exr", *lens, *out), r"small\.exr is 48x32 px but the clip is 96x64 px"),
-        ((*settings, *out, "--frames", "40:50"), "leaves nothing of"), ((*settings, "--out", clip), "is read and would be written over"),
+        ((*settings, *out, "--frames", "40-50"), r"has the frames 0-11"), ((*settings, "--out", clip), "is read and would be written over"),
         ((*settings, "--out", tmp_path / "there.mkv"), "exists already"), ((*settings, *out, "--renderer", "magic"), "expected a renderer"),
         ((*lens, *out), "nothing to put into the clip"),
     ):  # fmt: skip
@@ -218,7 +245,7 @@ def test_layers_and_depth_of_each_frame(clip: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(
             after.rgb, OverPhotograph().insert(plate_of(before.rgb, LENS), layers, ScatterReference()).rgb, atol=STEP
         )
-    run(clip, *options, "--depth", tmp_path / "depth.%04d.exr", "--mode", "front", "--out", tmp_path / "front.mkv", "--frames", "6:8")
+    run(clip, *options, "--depth", tmp_path / "depth.%04d.exr", "--mode", "front", "--out", tmp_path / "front.mkv", "--frames", "1007-1008")
     assert (next(read_frames(tmp_path / "front.mkv")).rgb != list(read_frames(clip))[6].rgb).any()
     with pytest.raises(InputError, match="1001 to 1012"):
         run(clip, "--lens", tmp_path / "lens.json", "--layer", tmp_path / "moving.%04d.exr", "--out", tmp_path / "no.mkv")
@@ -241,9 +268,9 @@ def test_a_scene_is_rendered_per_frame(tmp_path: Path) -> None:
 
 
 def test_the_virtual_layer_alone_and_pictures_out(clip: Path, settings: list[str], tmp_path: Path) -> None:
-    run(clip, *settings, "--virtual-only", "--out", tmp_path / "virtual.%03d.exr", "--frames", "2:5")
-    run(clip, *settings, "--virtual-only", "--out", tmp_path / "virtual.mov", "--frames", "2:5")
-    options = ("--out", tmp_path / "whole.%03d.png", "--frames", "2:5", "--segment", 0.04, "--workers", 2)
+    run(clip, *settings, "--virtual-only", "--out", tmp_path / "virtual.%03d.exr", "--frames", "2-4")
+    run(clip, *settings, "--virtual-only", "--out", tmp_path / "virtual.mov", "--frames", "2-4")
+    options = ("--out", tmp_path / "whole.%03d.png", "--frames", "2-4", "--segment", 0.04, "--workers", 2)
     told = json.loads(mrbokeh("video", clip, *settings, *options, "--json").stdout)
     assert told["outputs"] == [str(tmp_path / f"whole.{i:03d}.png") for i in (2, 3, 4)]
     assert sorted(file.name for file in tmp_path.glob("virtual.*")) == [*(f"virtual.{i:03d}.exr" for i in (2, 3, 4)), "virtual.mov"]
@@ -255,7 +282,7 @@ def test_the_virtual_layer_alone_and_pictures_out(clip: Path, settings: list[str
     # And numbered pictures in: the same composite of the same light.
     for i, picture in enumerate(read_frames(clip)):
         write_image(tmp_path / f"in.{i:03d}.exr", picture.rgb, half=False)
-    run(tmp_path / "in.%03d.exr", "--rate", "24", *settings, "--out", tmp_path / "again.%03d.png", "--frames", "2:5")
+    run(tmp_path / "in.%03d.exr", "--rate", "24", *settings, "--out", tmp_path / "again.%03d.png", "--frames", "2-4")
     np.testing.assert_allclose(read_image(tmp_path / "again.004.png"), read_image(tmp_path / "whole.004.png"), atol=2.5 / 65535)
     refused("give --rate", run, tmp_path / "in.%03d.exr", *settings, "--out", tmp_path / "no.mov")
     refused("is for videos", run, clip, *settings, "--encoding", "h264", "--out", tmp_path / "no.%03d.exr")
@@ -276,7 +303,7 @@ def test_exposures_that_pictures_state_are_matched_frame_by_frame(clip: Path, tm
         run(tmp_path / f"taken.%d.{suffix}", *options, "--out", tmp_path / f"{suffix}.%d.exr")
         found = [float(read_image(tmp_path / f"{suffix}.{i}.exr")[16, 24, 0]) for i in range(3)]
         assert found == pytest.approx([0.4, 0.2, 0.1], rel=2e-3)
-        run(tmp_path / f"taken.%d.{suffix}", *options, "--frames", "1:", "--out", tmp_path / f"{suffix}.later.%d.exr")
+        run(tmp_path / f"taken.%d.{suffix}", *options, "--frames", "1-2", "--out", tmp_path / f"{suffix}.later.%d.exr")
         assert float(read_image(tmp_path / f"{suffix}.later.2.exr")[16, 24, 0]) == pytest.approx(0.1, rel=2e-3)
     with pytest.raises(InputError, match=r"--match-exposure needs a photograph that states how it was taken .* give --plate-exposure"):
         run(clip, *options[2:], "--out", tmp_path / "no.mkv")
@@ -289,7 +316,7 @@ def test_the_exposure_of_a_video_is_stated_by_the_user(clip: Path, tmp_path: Pat
     write_layer(tmp_path / "grey.exr", Layer(np.full((64, 96, 3), 0.1, np.float32), alpha, 2 * alpha), half=False)
     panorama, lens = photo_with_exif(tmp_path / "panorama.jpg", 0.01), tmp_path / "lens.json"
     options = ["--lens", lens, "--layer", tmp_path / "grey.exr", "--match-exposure", panorama, "--plate-exposure"]
-    run(clip, *options, "1/50,400,2.8", "--frames", "0:3", "--out", tmp_path / "out.%d.exr")
+    run(clip, *options, "1/50,400,2.8", "--frames", "0-2", "--out", tmp_path / "out.%d.exr")
     assert [float(read_image(tmp_path / f"out.{i}.exr")[32, 48, 0]) for i in range(3)] == pytest.approx([0.4] * 3, rel=2e-3)
     with pytest.raises(InputError, match=r"expected an exposure as SECONDS,ISO,F-NUMBER, .* got '1/50,400'"):
         run(clip, *options, "1/50,400", "--out", tmp_path / "no.mkv")

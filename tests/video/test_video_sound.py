@@ -102,7 +102,7 @@ def test_sixteen_bits_at_48_khz_come_through_bit_for_bit_and_what_is_missing_is_
 def test_a_real_clip_of_uneven_times_goes_into_mxf_with_its_sound(tmp_path: Path, shared_data: Path) -> None:
     """The iPhone's HEVC: 6 pictures of about 27.6 a second, held and left out for 30; its mono sound lasts as long as they do."""
     clip = shared_data / "video" / "iphone_xr_chart.mov"
-    shot = Shot(open_source(clip), Brighter(0.0), VideoTarget(tmp_path / "out.mxf", None, clip, even_rate=Fraction(30)), 3, 9, 3)
+    shot = Shot(open_source(clip), Brighter(0.0), VideoTarget(tmp_path / "out.mxf", None, clip, even_rate=Fraction(30)), range(3, 9), 3)
     note = render_shot(shot, SerialExecutor())
     assert "(pcm_s16le, 48 kHz)" in note
     frames, times_s = list(read_frames(tmp_path / "out.mxf")), np.array(shot.all_times_s)
