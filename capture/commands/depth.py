@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from mrbokeh.system.channel import say, tell, warn
+from mrbokeh.system.errors import InputError
 
 HELP = "\n\n".join(
     (
@@ -13,14 +14,17 @@ HELP = "\n\n".join(
         "all-in-focus picture again with it: no rings around lights, for this depth does not come from blur.",
         "Needs `mrbokeh capture poses` and `scale`. The first picture and depth are kept in first_pass/; finished stacks are left "
         "alone unless --overwrite is given. Stacks without a pose keep their depth from focus.",
+        "Of plain photographs (the folder of `capture poses --images`), it writes depth/NAME.exr for each, in metres where the scale is "
+        "known; clips get theirs by `mrbokeh video --depth auto`.",
         "Example:  mrbokeh capture depth scene/",
+        "Example:  mrbokeh capture depth reconstruction/",
     )
 )
 
 
 def depth_command(
-    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="folder that `mrbokeh capture scale` worked on")],
-    neighbours: Annotated[int, typer.Option(min=1, help="how many other views each stack is compared with")] = 6,
+    scene: Annotated[Path, typer.Argument(metavar="SCENE", help="folder of `mrbokeh capture scale`, or of `capture poses --images`")],
+    neighbours: Annotated[int | None, typer.Option(min=1, help="how many other views each stack is compared with; default: 6")] = None,
     device: Annotated[
         str | None, typer.Option(metavar="cuda|cpu", help="of torch, for the plane sweep; without it compiled loops run")
     ] = None,
@@ -29,14 +33,20 @@ def depth_command(
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="find depth again where it is there already")] = False,
 ) -> None:
+    from capture.dense.picture_depth import is_reconstruction
     from capture.dense.scene_depth import SceneDepthSettings, deepen_scene
     from capture.merging.retouch import retouched_stacks, retouches_text, stacks_before
     from mrbokeh.depth.views.dense_depth import DenseSettings
     from mrbokeh.figures.stack_pictures import SHEET_NAME
     from mrbokeh.system.console import kept_when_interrupted
 
+    if is_reconstruction(scene):
+        if patch_match or neighbours is not None:
+            raise InputError(f"{scene} holds poses of plain pictures: --patch-match and --neighbours are for stacks, leave them out")
+        _pictures(scene, overwrite, device)
+        return
     retouched = retouched_stacks(stacks_before(scene))
-    settings = SceneDepthSettings(neighbours, overwrite, patch_match, DenseSettings(device=device))
+    settings = SceneDepthSettings(neighbours or 6, overwrite, patch_match, DenseSettings(device=device))
     with kept_when_interrupted(f"finished stacks are kept in {scene}", overwrite):
         result = deepen_scene(scene, settings)
     for stack in result.stacks:
@@ -48,3 +58,14 @@ def depth_command(
             )
     if result.left_out:
         say(f"without a pose or with guessed metres, depth from focus only: {', '.join(result.left_out)}")
+
+
+def _pictures(folder: Path, overwrite: bool, device: str | None) -> None:
+    """Find the depth of plain pictures."""
+    from capture.dense.picture_depth import deepen_pictures
+    from mrbokeh.system.console import kept_when_interrupted
+
+    with kept_when_interrupted(f"finished depth is kept in {folder}", overwrite):
+        done = deepen_pictures(folder, overwrite=overwrite, device=device)
+    unit = "metres" if done.metric else "the unit of the poses, whose metres nobody knows"
+    tell(f"{done.folder}: depth of {len(done.names)} pictures (Z in {unit}, confidence), and pictures of it", pictures=len(done.names))

@@ -5,6 +5,7 @@ Options alone say what the shot is: what makes its frames, where they go, and wh
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from time import monotonic
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -22,6 +23,7 @@ from mrbokeh.commands._insertion_options import (
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.compositing.choose import DEFAULT_MODE
 from mrbokeh.compositing.plate_look.finishing import LookOptions
+from mrbokeh.depth.views import DEPTH_NAME
 from mrbokeh.renderers.choose import BY_NAME, lens_and_renderer
 from mrbokeh.shots.composite_recipe import CompositeRecipe
 from mrbokeh.shots.executors import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
@@ -32,7 +34,7 @@ from mrbokeh.shots.render_shot import SequenceTarget, VideoTarget, render_shot
 from mrbokeh.shots.shot import SEGMENT_S, Shot, Target
 from mrbokeh.stacks.photograph import SensorOrientation, lens_for_orientation
 from mrbokeh.system.atomic_files import require_safe_outputs
-from mrbokeh.system.channel import guess, tell, warn
+from mrbokeh.system.channel import guess, say, tell, warn
 from mrbokeh.system.console import kept_when_interrupted, progress_bars
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import cores
@@ -69,7 +71,11 @@ class ClipOptions(shared.NearOptions):
         typer.Option(help="Number of the clip's first frame, for --frames, sequences, tracks and focus pulls; default: its file's, or 0."),
     ] = None
     depth: Annotated[
-        Path | None, typer.Option(metavar="DEPTH.exr", help="Depth of the filmed scene in metres, one file or depth.%04d.exr.")
+        Path | None,
+        typer.Option(
+            metavar="DEPTH.exr|auto",
+            help="Depth of the filmed scene in metres, one file or depth.%04d.exr. auto: found from the clip and its moving --camera.",
+        ),
     ] = None
     disparity: shared.DisparityOption = None
     exact_depth: shared.ExactDepthOption = False
@@ -135,8 +141,6 @@ class WorkOptions:
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    import numpy as np
-
     from mrbokeh.shots.layer_sources import SceneLayers
 
 
@@ -153,7 +157,7 @@ def recipe_of(
     virtual_only: bool,
 ) -> CompositeRecipe:
     """Return the recipe of every frame. Raises InputError if options do not go together."""
-    _check_virtual(virtual, rendering)
+    _check_virtual(virtual, rendering, finds_depth=is_auto(taken.depth))
     require_one_focus(focus=blur.focus, focus_at=blur.focus_at, focus_pull=blur.focus_pull)
     facts.on(None, lens_and_renderer(lens, blur.renderer)[1])  # refuses facts that a network cannot follow
     pull = None if blur.focus_pull is None else FocusPulled.of(blur.focus_pull)
@@ -169,7 +173,7 @@ def recipe_of(
         mode=virtual.mode or (DEFAULT_MODE if taken.matte is None else "between"),
         camera=_camera(source, virtual),
         focus=pull,
-        depth=_depth(taken),
+        depth=_depth(taken, virtual),
         exact_depth=taken.exact_depth,
         matte=None if taken.matte is None else MatteFiles(taken.matte.resolve()),
         near_m=taken.near_distance,
@@ -179,26 +183,57 @@ def recipe_of(
         holding=holding,
         facts=tuple((facts.given | ({} if blur.focus is None else {"focus_distance_m": blur.focus})).items()),
     )
-    if blur.focus_at is not None:
-        focused = focused_at_pixel(lens_for_orientation(recipe.stated_lens, holding), _first_depth_m(recipe, source, taken), blur.focus_at)
-        recipe = replace(recipe, facts=(*recipe.facts, ("focus_distance_m", focused.focus_distance_m)))
     lens_for_orientation(recipe.stated_lens, holding, source.path)  # tells once how the lens is turned, for every worker turns it alike
     return recipe
 
 
-def _depth(taken: ClipOptions) -> DepthFiles | None:
+def _depth(taken: ClipOptions, virtual: VirtualOptions) -> DepthFiles | None:
     near_far_m = near_far_of(taken.disparity, taken.depth)
     if taken.depth is None:
         return None
+    if is_auto(taken.depth):
+        if near_far_m is not None or virtual.camera is None:
+            raise InputError("--depth auto needs the track of the moving camera, --camera TRACK, and no --disparity")
+        return DepthFiles(_depth_folder(virtual.camera) / DEPTH_NAME, with_holes=True)
     # A filter over time takes numbers only.
     with_holes = not (taken.exact_depth or taken.steady_depth)
     return DepthFiles(taken.depth.resolve(), taken.steady_depth, near_far_m, with_holes=with_holes)
 
 
-def _first_depth_m(recipe: CompositeRecipe, source: PictureSource, taken: ClipOptions) -> "np.ndarray | None":
-    """Return the depth of the first frame that is taken, on which --focus-at focuses for the whole clip."""
-    moment = Moment(_numbers(source, taken)[0], 0.0, (source.info.width_px, source.info.height_px))
-    return None if recipe.depth is None else recipe.depth.opened(1).depth_m_at(moment)
+def is_auto(depth: Path | None) -> bool:
+    """Return whether depth is to be found from the clip itself."""
+    return depth is not None and str(depth) == "auto"
+
+
+def _depth_folder(camera: Path) -> Path:
+    """Return where the depth of a tracked clip is kept: beside the track."""
+    return camera.resolve().with_name(f"{camera.stem}_depth")
+
+
+def _found_depth(source: PictureSource, camera: Path, taken: "Sequence[int]", first_number: int) -> None:
+    """Find the depth of the frames that are taken, as far as it is not kept from an earlier run."""
+    from mrbokeh.depth.views.clip_depth import ClipDepth
+    from mrbokeh.tracking.camera_track.formats import read_track
+    from mrbokeh.tracking.camera_track.track import TrackOptions
+
+    size_px, folder = (source.info.width_px, source.info.height_px), _depth_folder(camera)
+    found = ClipDepth(source, read_track(camera, TrackOptions(size_px=size_px)), folder, first_number)
+    began_s = monotonic()
+    with kept_when_interrupted(f"finished depth is kept in {folder}"):
+        made = found.write(taken)
+    if made:
+        took_s = (monotonic() - began_s) / made
+        say(f"depth of {made} frames lies in {folder} ({took_s:.1f} s a frame); what moves by itself has that of what is behind it")
+
+
+def _focused_at(recipe: CompositeRecipe, shot: Shot, place: str) -> CompositeRecipe:
+    """Return the recipe focused for the whole clip on what the depth of the first frame that is taken has at a place."""
+    info = shot.source.info
+    moment = Moment(recipe.first_number + shot.taken[0], 0.0, (info.width_px, info.height_px))
+    depth_m = None if recipe.depth is None else recipe.depth.opened(1).depth_m_at(moment)
+    lens = recipe.stated_lens if recipe.holding is None else lens_for_orientation(recipe.stated_lens, recipe.holding)
+    focused = focused_at_pixel(lens, depth_m, place)
+    return replace(recipe, facts=(*recipe.facts, ("focus_distance_m", focused.focus_distance_m)))
 
 
 def target_of(out: Path, source: PictureSource, recipe: CompositeRecipe, colour: ColourOptions, result: ResultOptions) -> Target:
@@ -230,10 +265,10 @@ def _numbers(source: PictureSource, taken: ClipOptions) -> "Sequence[int]":
     return numbers_taken(taken.frames, range(first, first + len(source.times_s)), source.path)
 
 
-def _check_virtual(virtual: VirtualOptions, rendering: RenderingOptions) -> None:
+def _check_virtual(virtual: VirtualOptions, rendering: RenderingOptions, *, finds_depth: bool) -> None:
     if not virtual.layer and virtual.scene is None:
         raise InputError("nothing to put into the clip: give --layer RGBAZ.exr or --scene SCENE.toml")
-    for_scenes = (rendering.shutter, rendering.distortion, virtual.camera)
+    for_scenes = (rendering.shutter, rendering.distortion, None if finds_depth else virtual.camera)
     if virtual.scene is None and any(each is not None for each in for_scenes):
         raise InputError("--camera, --shutter and --distortion are for what --scene renders: layers in files have theirs in them")
 
@@ -301,7 +336,8 @@ def video(
 
     Example: mrbokeh video clip.mov --scene scene.toml --camera track.json --focus-pull 0:1.2,48:3.5 --lens lens.json --out out.mp4
     """
-    require_safe_outputs((out,), (clip, taken.depth, taken.matte, *virtual.files, rendering.distortion, lens), overwrite=True)
+    depth_files = () if is_auto(taken.depth) else (taken.depth,)
+    require_safe_outputs((out,), (clip, *depth_files, taken.matte, *virtual.files, rendering.distortion, lens), overwrite=True)
     source = open_source(clip, taken.rate, colour.of_plate)
     recipe = recipe_of(source, lens, facts, taken, virtual, rendering, look, blur, virtual_only=result.virtual_only)
     if lens_and_renderer(lens, blur.renderer)[0] is None and not {"focal_length_mm", "f_number"} <= facts.given.keys():
@@ -309,6 +345,10 @@ def video(
     target = target_of(out, source, recipe, colour, result)
     shot = shot_of(source, recipe, target, taken, work.segment)
     target.require_new(shot, result.overwrite or shot.was_begun)
+    if is_auto(taken.depth) and virtual.camera is not None:
+        _found_depth(source, virtual.camera, shot.taken, recipe.first_number)
+    if blur.focus_at is not None:
+        shot = replace(shot, recipe=_focused_at(recipe, shot, blur.focus_at))
     _try_first_frame(shot)
     if not result.virtual_only and (lost := _alpha_lost(clip, source, target)):
         warn(f"{clip} {lost}")

@@ -89,14 +89,18 @@ def _shown_alike(codes: Rgb8) -> Rgb:
 
 
 def depth_codes(stack: FocalStack) -> UInt8[np.ndarray, "height width 3"]:
-    """Return depth (dioptres, or the focus index) in sRGB colours from near (red) to far (blue), grey where it is a guess.
+    """Return depth (dioptres, or the focus index) as `nearness_codes`."""
+    depth, confidence = stack.depth_planes("Z" if stack.is_metric else "focus_index", "confidence")
+    return nearness_codes((1.0 / depth if stack.is_metric else -depth).astype(np.float32), confidence)
+
+
+def nearness_codes(nearness: Plane, confidence: Plane) -> UInt8[np.ndarray, "height width 3"]:
+    """Return nearness in sRGB colours from near (red) to far (blue), grey where it is a guess.
 
     The scale runs from the 1st to the 99th percentile of what is trusted, or of all where that is little.
     """
     import cv2
 
-    depth, confidence = stack.depth_planes("Z" if stack.is_metric else "focus_index", "confidence")
-    nearness: Plane = (1.0 / depth if stack.is_metric else -depth).astype(np.float32)
     trusted = nearness[confidence >= TRUSTED]
     low, high = np.percentile(trusted if trusted.size > _LEAST_TRUSTED * nearness.size else nearness, [1, 99])
     dark, bright = _COLOURS

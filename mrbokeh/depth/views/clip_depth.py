@@ -6,12 +6,14 @@ Keyframes are evenly spread over the motion of the camera; what is swept of them
 import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
+from mrbokeh.depth.views import DEPTH_NAME
 from mrbokeh.depth.views.still_scene import PosedPicture, StillScene, apart_in_widths
 from mrbokeh.depth.views.view_points import common_points, in_view
 from mrbokeh.distortion import LensDistortion
@@ -25,7 +27,6 @@ from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
 from mrbokeh.video.image_sequence import numbered
 from mrbokeh.video.picture_source import PictureSource
 
-NAME = "depth.%06d.exr"
 _RECORD = "depth.json"
 _VERSION = 1
 _FIRST_LOOK = 24
@@ -44,10 +45,10 @@ class ClipDepth:
 
     @property
     def pattern(self) -> Path:
-        return self.folder / NAME
+        return self.folder / DEPTH_NAME
 
-    def write(self, start: int, stop: int, device: str | None = None) -> int:
-        """Write the frames from start up to stop that are not there yet, and return how many those were.
+    def write(self, taken: Sequence[int], device: str | None = None) -> int:
+        """Write those of the frames (counted from 0) that are not there yet, and return how many those were.
 
         Files that another clip or track has left are replaced. Frames that the track lacks are left out. device: of torch, for sweeps.
         Raises InputError if the camera stays in one place.
@@ -56,7 +57,8 @@ class ClipDepth:
         if self.folder.is_dir() and self._recorded() != record:
             for stale in self.folder.glob("depth.*.exr"):
                 stale.unlink()
-        wanted = [index for index in self._tracked() if start <= index < stop and not self._file(index).exists()]
+        tracked = set(self._tracked())
+        wanted = [index for index in taken if index in tracked and not self._file(index).exists()]
         if not wanted:
             return 0
         scene = StillScene([picture.small() for picture in self._pictures(self._keyframes())], str(self.source.path), device)
@@ -124,7 +126,7 @@ class ClipDepth:
     def _motion(self, found: Sequence[int], depth: float) -> Float64[np.ndarray, " frames"]:
         """Return how far the picture has moved since the first of these frames, in its widths, at a depth."""
         cameras = [self._camera(index) for index in found]
-        steps = [apart_in_widths(one, other, depth) for one, other in zip(cameras, cameras[1:], strict=False)]
+        steps = [apart_in_widths(one, other, depth) for one, other in pairwise(cameras)]
         return np.concatenate([[0.0], np.cumsum(steps)])
 
 

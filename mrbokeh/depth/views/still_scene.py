@@ -1,7 +1,7 @@
 """StillScene: depth of every picture of a scene at rest, from its cameras alone.
 
 A few of the pictures (views) are swept against their neighbours, small and as pinholes; the depth of any picture is fused from the views
-around it, and brought to its own pixels along its own edges. What moves by itself gets the depth of what is around it.
+around it, and brought to its own pixels along its own edges. What moves by itself gets the depth of what is behind it.
 
 Lengths are those of the cameras, metres or not.
 """
@@ -40,7 +40,10 @@ _SURFACES_APART = 4.0
 
 @dataclass(frozen=True, eq=False)
 class PosedPicture:
-    """A picture whose camera is known. rgb: scene-linear. camera: its pinhole, of the picture's size. distortion: from pinhole to picture."""
+    """A picture whose camera is known.
+
+    rgb: scene-linear. camera: its pinhole, of the picture's size. distortion: from the pinhole to the picture.
+    """
 
     rgb: Rgb
     camera: Camera

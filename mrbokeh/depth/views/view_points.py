@@ -7,7 +7,8 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int
+from scipy.spatial import cKDTree
 
 from mrbokeh.depth.views.sweep_view import BRIGHTEST, SweepView, neighbour_vote
 from mrbokeh.optics.camera import Camera
@@ -21,20 +22,35 @@ _LARGEST_TURN_RAD = np.deg2rad(60.0)
 _RATIO = 0.8
 _OFF_PX = 1.0
 _LEAST_ANGLE_RAD = np.deg2rad(1.0)
+_PAIRS_TO_AGREE = 3
+_BESIDE, _LOOKED_AT = 0.02, 6
+"""Share of the distance to the nearest camera within which two points are one; how many neighbours of a point are looked at."""
 _OUTERMOST = 0.5
 _MARGIN = 0.1
 _FEWEST_IN_VIEW = 12
 
 
 def common_points(views: Sequence[SweepView]) -> Points:
-    """Return world points that at least two views see; views: pinholes (without distortion), whose sharpness may differ."""
-    sift = cv2.SIFT_create(_FEATURES)
+    """Return world points that at least two views see, and of three pairs of views or more two pairs; views: pinholes, of any sharpness."""
+    sift = cv2.SIFT.create(_FEATURES)
     features = [sift.detectAndCompute(_grey(view), None) for view in views]
-    found = [
-        _triangulated(views[one], views[other], *_matched(features[one], features[other]))
-        for one, other in _pairs([v.camera for v in views])
-    ]
-    return np.concatenate([np.zeros((0, 3)), *found])
+    cameras = [view.camera for view in views]
+    found = [_triangulated(views[one], views[other], *_matched(features[one], features[other])) for one, other in _pairs(cameras)]
+    points = np.concatenate([np.zeros((0, 3)), *found])
+    if len(found) < _PAIRS_TO_AGREE:
+        return points
+    pair = np.repeat(np.arange(len(found)), [len(each) for each in found])
+    return points[_repeated(points, pair, cameras)]
+
+
+def _repeated(points: Points, pair: Int[np.ndarray, " points"], cameras: Sequence[Camera]) -> Bool[np.ndarray, " points"]:
+    """Mark points beside which another pair of views has found one too: false matches lie anywhere along their rays."""
+    if not len(points):
+        return np.zeros(0, bool)
+    centres = np.stack([camera.world_from_camera[:3, 3] for camera in cameras])
+    reach = _BESIDE * cKDTree(centres).query(points)[0]
+    apart, which = cKDTree(points).query(points, k=min(_LOOKED_AT, len(points)))
+    return ((apart <= reach[:, None]) & (pair[which] != pair[:, None])).any(axis=1)
 
 
 def _grey(view: SweepView) -> np.ndarray:
