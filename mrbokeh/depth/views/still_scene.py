@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
+from mrbokeh.depth.depth_filters import interpolate
 from mrbokeh.depth.edge_votes import Guide
 from mrbokeh.depth.mended_depth import filled
 from mrbokeh.depth.views.dense_depth import DenseSettings, dense_depth
@@ -36,6 +37,7 @@ _FEWEST_POINTS = 50
 _EDGE_CONTRAST = 0.07
 _BEYOND_EDGE_PX, _BESIDE_EDGE_PX = 3, 24
 _SURFACES_APART = 4.0
+_SAY_OF_NEAREST, _SHARP_PX, _SMOOTH_PX, _EDGE_OF_COLOUR = np.float32(1e-3), 12.0, 40.0, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,8 +156,13 @@ def _without_holes(dioptre: Plane, guide: Guide, tolerance: float) -> Plane:
     reach = np.ones((2 * _BESIDE_EDGE_PX + 1,) * 2)
     behind = cv2.erode(np.where(known, dioptre, np.float32(np.inf)), reach)
     seeds = known & (dioptre - behind <= _SURFACES_APART * tolerance)
-    filling = filled((1.0 / np.where(seeds, dioptre, 1.0)).astype(np.float32), seeds, guide)
-    return np.where(known, dioptre, 1.0 / filling).astype(np.float32)
+    nearest = (1.0 / filled((1.0 / np.where(seeds, dioptre, 1.0)).astype(np.float32), seeds, guide)).astype(np.float32)
+    # Far from all that is known, the nearest in colour is a matter of chance: there it is smoothed.
+    away_px = cv2.distanceTransform((~known).astype(np.uint8), cv2.DIST_L2, 5)
+    sharp = np.exp(-away_px / _SHARP_PX).astype(np.float32)
+    weights = np.where(seeds, np.float32(1.0), np.maximum(sharp, _SAY_OF_NEAREST))
+    smooth = interpolate(nearest, weights, guide.root, _SMOOTH_PX**2, _EDGE_OF_COLOUR)
+    return np.where(known, dioptre, sharp * nearest + (1.0 - sharp) * smooth).astype(np.float32)
 
 
 def apart_in_widths(one: Camera, other: Camera, depth: float) -> float:
