@@ -43,6 +43,7 @@ EXTRA_OF_MODULE = {
     "onnx": "train",
     "onnxscript": "train",
     "aiohttp": "viewfinder",
+    "h5py": "hdf5",
 }
 
 
@@ -61,6 +62,7 @@ SUB_COMMANDS = {
     "refocus": SubCommand("mrbokeh.commands.refocus", "New slices of a focal stack, between and beyond the captured ones."),
     "transfer": SubCommand("mrbokeh.commands.transfer", "Put a lens on an all-in-focus photograph with a depth map."),
     "tilt-shift": SubCommand("mrbokeh.commands.tilt_shift", "Blur a photograph away from a line, as a tilted lens does."),
+    "dataset": SubCommand("mrbokeh.commands.dataset", "Focal stacks for research, computed from a folder of pictures with depth."),
     "check": SubCommand("mrbokeh.commands.check", "Find what is wrong in composites: NaN, leaks, lost light, flicker."),
     "track": SubCommand("mrbokeh.commands.track", "The camera of every frame of a clip, and its files."),
     "viewfinder": SubCommand("viewfinder.cli", "Stream a camera with virtual objects in it to a browser."),

@@ -5,10 +5,10 @@ true shape of the blur, errors of the all-in-focus picture) can be carried over 
 Section 5.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32
@@ -17,11 +17,13 @@ from mrbokeh.depth.depth_map import DepthMap, DepthSettings
 from mrbokeh.depth.open_depth import open_depth
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.color import linear_to_srgb
+from mrbokeh.images.image_io import write_image
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
+from mrbokeh.stacks.focus_places import index_between, slice_names
 from mrbokeh.stacks.guessed_metres import GUESSED
 from mrbokeh.stacks.photograph import Photograph, read_photograph
 from mrbokeh.system.errors import InputError
@@ -240,6 +242,30 @@ def _of_stack(stack: FocalStack, depth: Path | None, settings: DepthSettings) ->
     unit = "metres" if stack.metres_known else GUESSED
     found = DepthMap(stack.depth_m(), stack.depth_valid(), f"of the stack {stack.folder}, {unit}")
     return SharpPhotograph(Photograph(rgb), found, stack=stack)
+
+
+def write_made_stack(
+    folder: Path,
+    sharp: SharpPhotograph,
+    lens: Lens,
+    distances_m: Iterable[float],
+    blurred: Callable[[float], Rgb],
+    metadata: Mapping[str, Any],
+    *,
+    half: bool = False,
+) -> None:
+    """Write a focal stack of computed slices. blurred: the slice at a focus distance. metadata: of the stack. half: floats of slices."""
+    taken: list[float] = []
+    for number, distance_m in enumerate(distances_m):
+        write_image(folder / f".{number}.exr", blurred(distance_m), half=half)
+        taken.append(distance_m)
+    slices = tuple(map(Slice, slice_names(tuple(taken)), taken))
+    for number, each in enumerate(slices):
+        (folder / f".{number}.exr").rename(folder / each.path)
+    depth, index = sharp.depth, index_between(taken, sharp.depth.dioptres)
+    write_merged(folder, sharp.photograph.rgb, index, depth.valid.astype(np.float32), depth.depth_m)
+    made = FocalStack(folder, slices, lens.focused_at(taken[0]), registered=True, merged=True, metadata=dict(metadata))
+    write_focal_stack(made)
 
 
 def seen_like(lens: Lens, photograph: Photograph, photo: Path) -> Lens:

@@ -28,7 +28,6 @@ from mrbokeh.commands._option_groups import grouped
 from mrbokeh.depth.depth_map import DepthSettings, parse_known, parse_near_far, parse_stereo
 from mrbokeh.optics.lens import Lens
 from mrbokeh.refocus import SharpPhotograph
-from mrbokeh.stacks.focal_stack import FocalStack, Slice
 from mrbokeh.system.channel import tell, warn
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
@@ -256,24 +255,15 @@ def is_transferred(folder: Path) -> bool:
 
 
 def _write_stack(out: Path, sharp: SharpPhotograph, lens: Lens, distances_m: tuple[float, ...], blurred: Blurred) -> None:
-    from mrbokeh.images.image_io import write_image
-    from mrbokeh.stacks.focal_stack import write_focal_stack, write_merged
-    from mrbokeh.stacks.focus_places import index_between, slice_names
+    from mrbokeh.refocus import write_made_stack
     from mrbokeh.stacks.guessed_metres import inherited_facts
     from mrbokeh.system.atomic_files import atomic_folder
 
-    slices = tuple(map(Slice, slice_names(distances_m), distances_m))
-    depth = sharp.depth
-    index = index_between(distances_m, depth.dioptres)
     if out.is_dir() and is_transferred(out):
         shutil.rmtree(out)
+    metadata = {_MADE: sharp.depth.note} | ({} if sharp.stack is None else inherited_facts(sharp.stack, with_lens=False))
     with atomic_folder(out) as folder:
-        for each, distance_m in zip(slices, track(distances_m, "blurring"), strict=True):
-            write_image(folder / each.path, blurred(distance_m), half=False)
-        write_merged(folder, sharp.photograph.rgb, index, depth.valid.astype(np.float32), depth.depth_m)
-        metadata = {_MADE: depth.note} | ({} if sharp.stack is None else inherited_facts(sharp.stack, with_lens=False))
-        made = FocalStack(folder, slices, lens.focused_at(distances_m[0]), registered=True, merged=True, metadata=metadata)
-        write_focal_stack(made)
+        write_made_stack(folder, sharp, lens, track(distances_m, "blurring"), blurred, metadata)
 
 
 def write_sheet(path: Path, distances_m: Sequence[float], blurred: Blurred, sharp_rgb: Rgb) -> None:

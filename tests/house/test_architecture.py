@@ -14,7 +14,7 @@ LEVELS = (
     {"cli"},
     {"commands"},
     {"shots"},
-    {"compositing", "refocus", "demo"},
+    {"compositing", "refocus", "synthesis", "demo"},
     {"scene", "depth", "checks", "figures", "lens_measuring"},
     {"renderers", "stacks", "distortion"},
     {"layering", "psf_models", "tracking", "solving"},

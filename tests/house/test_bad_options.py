@@ -34,6 +34,7 @@ BASES = {
     "video": f"{LIVE}/clip.mp4 --layer wide.exr --lens lens.json --frames 0 --out out.mp4",
     "transfer": "sharp.exr --depth sharp.exr --lens lens.json --out out.exr",
     "tilt-shift": "photo.png --out out.exr",
+    "dataset synthesize": "stack --slices 2 --workers 1 --out set",
     "refocus": "stack --focus 1.5 --out refocused",
     "check": "photo.png",
     "lens new": "new.json --focal-length 50 --f-number 2 --focus 1",

@@ -26,6 +26,7 @@ COMMANDS = [
     ["train", "ablate"],
     ["lens"], ["lens", "new"], ["lens", "coc"], ["lens", "show"], ["lens", "psf"], ["lens", "export"],
     ["lens", "fit"], ["lens", "match"], ["render"], ["composite"], ["video"], ["refocus"], ["transfer"], ["tilt-shift"],
+    ["dataset"], ["dataset", "synthesize"],
     ["check"], ["blender-addon"], ["track"], ["track", "clip"], ["track", "convert"],
     ["capture", "matchmove"],
     ["viewfinder"], ["viewfinder", "board"], ["viewfinder", "calibrate-phone"], ["studio"], ["demo"], ["doctor"],
