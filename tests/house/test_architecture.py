@@ -13,8 +13,8 @@ from tests.house.test_style import FILES, PACKAGES, ROOT, nodes
 LEVELS = (
     {"cli"},
     {"commands"},
-    {"shots"},
-    {"compositing", "refocus", "synthesis", "demo"},
+    {"shots", "synthesis"},
+    {"compositing", "refocus", "demo"},
     {"scene", "depth", "checks", "figures", "lens_measuring"},
     {"renderers", "stacks", "distortion"},
     {"layering", "psf_models", "tracking", "solving"},
