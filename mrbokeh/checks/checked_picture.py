@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from mrbokeh.images.color import linear_to_srgb
-from mrbokeh.images.exr_io import ExrPart, read_exr
+from mrbokeh.images.exr_io import ExrPart, in_rec709, read_exr, stated_primaries
 from mrbokeh.images.image_io import INTEGER_SUFFIXES, LINEAR_SUFFIXES, read_image, read_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.images.picture_codec import stored_pixels
@@ -97,7 +97,7 @@ def read_picture(path: Path) -> CheckedPicture:
         rgb=layer.rgb,
         storage=Storage(True, _HALF_STEP if is_half else 0.0),
         alpha=layer.alpha if has_alpha else None,
-        layers=_layers(parts),
+        layers=_layers(parts, path),
         depth_m=layer.depth_m,
     )
 
@@ -123,20 +123,21 @@ def _integer_storage(path: Path) -> Storage:
     return Storage(False, _CODE_STEP_16 if pixels.dtype == np.uint16 else _CODE_STEP_8)
 
 
-def _layers(parts: list[ExrPart]) -> dict[str, Layer]:
+def _layers(parts: list[ExrPart], path: Path) -> dict[str, Layer]:
     """Return layers NAME.R, NAME.G, NAME.B with NAME.A and NAME.Z of any part, and parts of that name with R, G, B."""
+    primaries = stated_primaries(parts[0], parts)
     named = {name: part.channels for part in parts for name in (VIRTUAL, SHARP, SHADOW) if part.name == name and "R" in part.channels}
     for part in parts:
         for name in (VIRTUAL, SHARP, SHADOW):
             own = {key.removeprefix(f"{name}."): pixels for key, pixels in part.channels.items() if key.startswith(f"{name}.")}
             if own:
                 named[name] = own
-    return {name: _layer(channels) for name, channels in named.items()}
+    return {name: _layer(channels, primaries, path) for name, channels in named.items()}
 
 
-def _layer(channels: Mapping[str, np.ndarray]) -> Layer:
+def _layer(channels: Mapping[str, np.ndarray], primaries: tuple[float, ...] | None, path: Path) -> Layer:
     shape = next(iter(channels.values())).shape
-    rgb = np.stack([channels.get(c, np.zeros(shape)) for c in "RGB"], axis=2).astype(np.float32)
+    rgb = in_rec709(np.stack([channels.get(c, np.zeros(shape)) for c in "RGB"], axis=2).astype(np.float32), primaries, path)
     depth_m = channels.get("Z", np.full(shape, np.inf)).astype(np.float32)
     return Layer(rgb, channels.get("A", np.ones(shape)).astype(np.float32), depth_m)
 
