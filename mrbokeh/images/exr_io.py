@@ -66,6 +66,17 @@ def read_exr(path: Path | str, *, overscan: bool = False) -> list[ExrPart]:
     return parts
 
 
+def header_of(path: Path | str) -> dict[str, Any]:
+    """Return the header entries of the first part of an EXR file, without reading its pixels. Raises InputError where it is none."""
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            return dict(file.parts[0].header)
+    except (RuntimeError, OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read as EXR: {error}") from None
+
+
 def write_exr(path: Path | str, parts: Sequence[ExrPart] | ExrPart, *, compress: bool = True) -> None:
     """Write one or more parts with ZIP compression; float16 channels are stored as half, float32 as float.
 
