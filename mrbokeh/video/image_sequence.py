@@ -95,6 +95,9 @@ def require_missing_known(missing: str) -> None:
 def require_all_there(where: Path, there: Collection[int], wanted: Sequence[int]) -> None:
     """Raise InputError if numbers of files are missing among those wanted, which it names."""
     lacking = sorted(set(wanted) - set(there))
+    if len(lacking) == len(wanted) > 1:
+        has, taken = written_frames(sorted(there)), written_frames(lacking)
+        raise InputError(f"{where} has the frames {has}, none of those taken ({taken}): say --first-number, or take others by --frames")
     if lacking:
         told = written_frames(lacking[:_NAMED]) + (", ..." if len(lacking) > _NAMED else "")
         raise InputError(
