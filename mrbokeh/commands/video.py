@@ -29,6 +29,7 @@ from mrbokeh.shots.executors import DaskExecutor, Executor, ProcessExecutor, Ser
 from mrbokeh.shots.frame_sources import CameraFile, ClipLook, DepthFiles, FocusPulled, MatteFiles
 from mrbokeh.shots.inputs import Moment
 from mrbokeh.shots.layer_sources import LayerFiles, sources_by_depth, with_cryptomatte
+from mrbokeh.shots.proxies import proxy_recipe
 from mrbokeh.shots.render_shot import SequenceTarget, VideoTarget, render_shot
 from mrbokeh.shots.shot import SEGMENT_S, Shot, Target
 from mrbokeh.stacks.photograph import SensorOrientation, lens_for_orientation
@@ -41,6 +42,7 @@ from mrbokeh.video.clip import has_alpha_apart
 from mrbokeh.video.encodings import with_alpha
 from mrbokeh.video.image_sequence import STOP, ImageSequence, is_pattern, numbers_of, require_all_there, require_missing_known
 from mrbokeh.video.picture_source import PictureSource, numbers_taken, open_source, parse_rate
+from mrbokeh.video.proxy_source import ProxySource, parse_proxy
 
 ClipArgument = Annotated[
     Path,
@@ -128,6 +130,9 @@ class ResultOptions:
     virtual_only: Annotated[
         bool, typer.Option("--virtual-only", help="Write the blurred virtual layer with alpha: EXR files, .mov or .mkv.")
     ] = False
+    proxy: Annotated[
+        str | None, typer.Option(metavar="1/2", help="Make OUT in a part of the plate's width and height, all that is read shrunk alike.")
+    ] = None
     overwrite: shared.OverwriteOption = False
 
 
@@ -332,6 +337,9 @@ def video(
     recipe = recipe_of(source, lens, facts, taken, virtual, rendering, look, blur, virtual_only=result.virtual_only)
     if lens_and_renderer(lens, blur.renderer)[0] is None and not {"focal_length_mm", "f_number"} <= facts.given.keys():
         guess(f"no whole lens is stated, so that this one is taken: {recipe.stated_lens.described}")
+    scale = parse_proxy(result.proxy)
+    if scale < 1:
+        recipe, source = proxy_recipe(recipe, source.info, scale), ProxySource.of(source, scale)
     target = target_of(out, source, recipe, colour, result)
     shot = shot_of(source, recipe, target, taken, work.segment)
     target.require_new(shot, result.overwrite or shot.was_begun)

@@ -25,6 +25,7 @@ from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame, Track
 from mrbokeh.video.clip import VideoInfo
 from mrbokeh.video.image_sequence import STOP, held_number, is_pattern, numbered, numbers_of
 from mrbokeh.video.picture_source import PictureSource, open_source
+from mrbokeh.video.proxy_source import ProxySource
 
 Plane = Float32[np.ndarray, "height width"]
 _WARM_UP = 48
@@ -217,6 +218,7 @@ class ClipLook:
     first_number: int = 0
     space: NamedSpace | None = None
     missing: str = STOP
+    proxy: Fraction = Fraction(1)
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -224,7 +226,7 @@ class ClipLook:
         return tuple(path for path in (Path(text) for text in texts if text) if path.is_file())
 
     def opened(self, threads: int) -> Finisher:
-        source = open_source(self.clip, self.rate, self.space, self.missing)
+        source = ProxySource.of(open_source(self.clip, self.rate, self.space, self.missing), self.proxy)
         stop = min(self.start + 2, len(source.times_s))
         first, *rest = (frame.rgb for frame in source.frames(self.start, stop, threads))
         finishing = finishing_of(self.options, first, source.file_of(self.start), rest[0] if rest else None)

@@ -87,7 +87,8 @@ def sources_by_depth(files: Sequence[LayerFiles], others: Sequence[Description[L
 
 def with_cryptomatte(layers: Sequence[Description[LayerSource]]) -> tuple[Path, ...]:
     """Return the files, numbered or not, of flat layers whose first frame has a Cryptomatte."""
-    among = [other for each in layers for other in (each.others if isinstance(each, AmongDeep) else (each,))]
+    whole = [getattr(each, "whole", each) for each in layers]  # of a proxy
+    among = [other for each in whole for other in (each.others if isinstance(each, AmongDeep) else (each,))]
     paths = [each.path for each in among if isinstance(each, LayerFiles)]
     first = {path: next(iter(layer_sequence(path).paths.values())) for path in paths}
     return tuple(path for path in paths if any(name.startswith("cryptomatte/") for name in header_of(first[path])))

@@ -32,6 +32,7 @@ from mrbokeh.images.image_io import INTEGER_SUFFIXES
 from mrbokeh.images.layer import Layer
 from mrbokeh.shots.executors import Executor, Progress, SegmentTask
 from mrbokeh.shots.inputs import Kept
+from mrbokeh.shots.proxies import picked
 from mrbokeh.shots.shot import MANIFEST, PartSink, Picture, Rgba, Segment, Shot
 from mrbokeh.stacks.exr_layers.cryptomatte import cryptomatte_among
 from mrbokeh.stacks.exr_layers.sequence import ExrSequence
@@ -41,6 +42,7 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.video.encodings import encoding_for, encoding_name, with_alpha
 from mrbokeh.video.image_sequence import NumberedFiles, is_pattern, numbered, written_frames
 from mrbokeh.video.picture_source import PictureSource
+from mrbokeh.video.proxy_source import ProxySource
 from mrbokeh.video.writer import PacketWriter, StreamFacts, VideoWriter, packets_of
 
 _EXR = ".exr"
@@ -119,8 +121,11 @@ class SequenceTarget:
         return [each.path_of(number) for each in sequences if each.is_still or number in each.paths]
 
 
-def _cryptomatte_of(*names: str) -> ExrPart | None:
-    return cryptomatte_among([Path(name) for name in names])
+def _cryptomatte_of(width_px: int, height_px: int, *names: str) -> ExrPart | None:
+    found = cryptomatte_among([Path(name) for name in names])
+    if found is None:
+        return None
+    return replace(found, channels={name: picked(plane, (width_px, height_px)) for name, plane in found.channels.items()})
 
 
 @dataclass(frozen=True)
@@ -138,15 +143,17 @@ class _SequenceSink:
         part = exr_part(in_named_space(rgb, alpha, space), alpha, space)
         if isinstance(picture, Layer):
             part = replace(part, channels={**part.channels, "Z": picture.depth_m})
-        if (objects := self.objects(*map(str, self.target.renders_of(index)))) is not None:
+        if (objects := self.objects(rgb.shape[1], rgb.shape[0], *map(str, self.target.renders_of(index)))) is not None:
             part = replace(part, channels={**part.channels, **objects.channels}, attributes={**part.attributes, **objects.attributes})
         write_exr(path, self._carried(index).onto(part, space))
 
     def _carried(self, index: int) -> CarriedExr:
-        """Return what the plate has beside this frame, with its rate and timecode; a layer alone has no overscan."""
+        """Return what the plate has beside this frame, with its rate and timecode; layers alone and proxies have no overscan."""
         carried, timecode = CarriedExr.of(self.source.file_of(index), self.source.space), self.source.timecode_of(index)
         stated = {"framesPerSecond": self.source.info.frame_rate, "timeCode": None if timecode is None else timecode.to_exr()}
         attributes = {name: value for name, value in stated.items() if value is not None} | dict(carried.attributes)
+        if isinstance(self.source, ProxySource):
+            return CarriedExr(attributes)
         around = replace(carried, margins_px=(0, 0, 0, 0), rgb=None, alpha=None) if self.target.layers else carried
         return replace(around, attributes=attributes)
 
@@ -349,6 +356,7 @@ def settings_of(shot: Shot) -> dict[str, str]:
         "clip": _stamps([shot.source.path]),
         "input space": "" if shot.source.space is None else f"{shot.source.space} {_stamps(shot.source.space.files)}",
         "frames": f"{written_frames(shot.taken)} by {shot.segment_frames} at {shot.source.info.frame_rate}",
+        "size": f"{shot.source.info.width_px}x{shot.source.info.height_px}",
         **of_recipe,
         "files": _stamps(recipe.files),
         **shot.target.settings,
