@@ -346,7 +346,7 @@ def video(
     _try_first_frame(shot)
     if not result.virtual_only and (lost := _alpha_lost(clip, source, target)):
         warn(f"{clip} {lost}")
-    if is_pattern(out) and (carried := CarriedExr.of(source.file_of(shot.taken[0])).told(clip)):
+    if is_pattern(out) and scale == 1 and (carried := CarriedExr.of(source.file_of(shot.taken[0])).told(clip)):
         say(carried)
     note = _made(shot, _executor(work, len(shot.segments)), result.overwrite)
     frames = len(shot.taken)

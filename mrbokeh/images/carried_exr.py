@@ -1,4 +1,4 @@
-"""What the EXR of a plate has beside its picture, carried on to the EXR that is made of it: metadata, windows and overscan.
+"""CarriedExr: metadata, windows and overscan of a plate's EXR, carried on to the EXR that is made of it.
 
 Metadata are all header entries that say nothing about pixels or colour: time code, rate, pixel aspect, exposure, camera, name of the take.
 Virtual things are put into the display window. Overscan, which lies around it, stays the plate's.

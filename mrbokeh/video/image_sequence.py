@@ -63,7 +63,7 @@ class NumberedFiles:
 
     @property
     def files(self) -> list[Path]:
-        """Those that are there."""
+        """Files that are there."""
         return [self.file(index) for index in range(self.count) if self.first + index not in self.missing]
 
 

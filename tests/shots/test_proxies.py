@@ -50,7 +50,7 @@ def words(tmp_path: Path) -> list[object]:
 
 @pytest.mark.parametrize("given", ["nothing", "depth", "matte", "between"])
 def test_it_is_the_full_size_shrunk(tmp_path: Path, words: list[object], given: str) -> None:
-    """PSNR on the light, 0 to 1, found: 60 dB (depth) to 64; by a lens that blurs half as much, as one would that counts in pixels, less."""
+    """PSNR on the light, 0 to 1, found: 60 dB (depth) to 64; by a lens with half the blur, as if it counted in pixels, below 45."""
     depth = ("--depth", tmp_path / "z.%d.exr", "--exact-depth")
     more = {"nothing": (), "depth": depth, "matte": ("--matte", tmp_path / "matte.png"), "between": (*depth, "--mode", "between")}[given]
     run(*words, *more, "--out", tmp_path / "whole.%d.exr")
