@@ -157,7 +157,7 @@ class Held(CompositeRecipe):
         make = maker.make
 
         def held(index, *frame):
-            assert index < 6 or executors._board.stop.wait(60)
+            assert index < 6 or executors._stopping.wait(60)
             return make(index, *frame)
 
         maker.make = held
