@@ -13,9 +13,11 @@ at every segment.
 """
 
 import hashlib
+import secrets
 import shutil
+import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from fractions import Fraction
 from pathlib import Path
@@ -30,7 +32,8 @@ from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.images.exr_io import ExrPart, header_of, write_exr
 from mrbokeh.images.image_io import INTEGER_SUFFIXES
 from mrbokeh.images.layer import Layer
-from mrbokeh.shots.executors import Executor, Progress, SegmentTask
+from mrbokeh.shots.claims import claimed
+from mrbokeh.shots.executors import CLAIM, Executor, Progress, SegmentTask
 from mrbokeh.shots.inputs import Kept
 from mrbokeh.shots.proxies import picked
 from mrbokeh.shots.shot import MANIFEST, PartSink, Picture, Rgba, Segment, Shot
@@ -47,6 +50,7 @@ from mrbokeh.video.writer import PacketWriter, StreamFacts, VideoWriter, packets
 
 _EXR = ".exr"
 _THREADS = 1
+_POLL_S = 0.25
 
 
 def in_space(picture: Picture, space: NamedSpace | None) -> Picture:
@@ -78,6 +82,12 @@ class SequenceTarget:
     def settings(self) -> dict[str, str]:
         numbers = f"{self.first_number} layers={self.layers}"
         return {"container": self.path.name, "numbers": numbers, "output space": str(self.space or "")}
+
+    def parts_name(self, taken: Sequence[int]) -> str:
+        """Name the folder by the frames too, so that many may write parts of one sequence at once."""
+        first, last = self.first_number + taken[0], self.first_number + taken[-1]
+        some = "" if last - first + 1 == len(taken) else f".{len(taken)}"
+        return f"{self.path.name}.{first}-{last}{some}.parts"
 
     @property
     def lacks_alpha(self) -> str | None:
@@ -180,6 +190,9 @@ class VideoTarget:
             "output space": str(self.space or ""),
             "even rate": str(self.even_rate or ""),
         }
+
+    def parts_name(self, taken: Sequence[int]) -> str:  # noqa: ARG002
+        return f"{self.path.name}.parts"
 
     @property
     def lacks_alpha(self) -> str | None:
@@ -297,15 +310,20 @@ def render_shot(shot: Shot, executor: Executor, *, overwrite: bool = False, prog
     missing = folder.missing
     progress(len(shot.taken) - sum(len(segment.taken) for segment in missing))
     executor.run([SegmentTask(shot, segment, folder.path, executor.threads) for segment in missing], progress)
-    note = shot.target.join(shot, folder.path)
-    folder.remove()
-    return note
+    while folder.is_there:
+        with claimed(folder.path / f"join{CLAIM}") as is_ours:
+            if is_ours:
+                note = shot.target.join(shot, folder.path)
+                folder.remove()
+                return note
+        time.sleep(_POLL_S)
+    return "joined by another process"
 
 
 @dataclass(frozen=True, eq=False)
 class PartsFolder:
-    """Folder OUT.parts of finished segments, from the first segment until the result is whole; its manifest says what they were made
-    with.
+    """Folder OUT.parts of finished segments, of a sequence one for each range of frames, until the result is whole; its manifest says what
+    they were made with.
     """
 
     path: Path
@@ -339,10 +357,18 @@ class PartsFolder:
     @property
     def holds_parts(self) -> bool:
         """Whether finished parts are there: half files and signs of workers have other names."""
-        return any(each.stem.isdigit() for each in self.path.iterdir())
+        return any(each.stem.isdigit() and each.suffix != CLAIM for each in self.path.iterdir())
+
+    @property
+    def is_there(self) -> bool:
+        return (self.path / MANIFEST).is_file()
 
     def remove(self) -> None:
-        shutil.rmtree(self.path, ignore_errors=True)
+        """Remove the folder, for others at one blow: none may take a part of it for a missing one."""
+        aside = self.path.with_name(f".{self.path.name}.{secrets.token_hex(4)}")
+        with suppress(OSError):
+            self.path.rename(aside)
+        shutil.rmtree(aside, ignore_errors=True)
 
 
 def settings_of(shot: Shot) -> dict[str, str]:
