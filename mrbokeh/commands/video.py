@@ -220,7 +220,13 @@ def target_of(out: Path, source: PictureSource, recipe: CompositeRecipe, colour:
         for name, value in (("--encoding", result.encoding), ("--constant-rate", result.constant_rate)):
             if value is not None:
                 raise InputError(f"{name} {value} is for videos, but {out} are pictures: leave it out")
-        return SequenceTarget(out.resolve(), recipe.first_number, result.virtual_only, colour.of_result, with_cryptomatte(recipe.layers))
+        return SequenceTarget(
+            path=out.resolve(),
+            first_number=recipe.first_number,
+            layers=result.virtual_only,
+            space=colour.of_result,
+            renders=with_cryptomatte(recipe.layers),
+        )
     keeping = with_alpha(out) if result.virtual_only or source.info.has_alpha else None
     encoding = result.encoding or keeping or ("prores4444-alpha" if result.virtual_only else None)
     sound = None if is_pattern(source.path) else source.path
