@@ -28,6 +28,8 @@ from mrbokeh.system.errors import FAULT, INTERRUPTED, InputError, MissingExtraEr
 os.environ.setdefault("OPENCV_THREAD_POOL_ACTIVE_WAIT_WORKER", "0")
 
 EVERY = "Every command"
+SHARING = ("video",)
+"""Commands that may write one result together: they claim parts of it (`mrbokeh.shots.claims`)."""
 LATEST_S = 1.5
 """Time from Ctrl-C to the end of the process at the latest."""
 
@@ -132,7 +134,7 @@ def _heard(command: Any, path: str) -> None:
         with ExitStack() as held:
             if speaking.quiet:
                 held.enter_context(redirect_stderr(held.enter_context(open(os.devnull, "w"))))
-            held.enter_context(writing_alone(_written_to(given)))
+            held.enter_context(writing_alone(None if path in SHARING else _written_to(given)))
             callback(**given)
 
     command.callback = run

@@ -13,6 +13,7 @@ from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
+from mrbokeh.video.image_sequence import is_pattern, numbered
 
 Pair = tuple[CheckedPicture | str, CheckedPicture | None]
 
@@ -133,7 +134,7 @@ def _require_same_size(picture: CheckedPicture | str, plate: CheckedPicture | No
 class CheckSettings:
     """Settings of all checks.
 
-    layers: files of layers by name (virtual, sharp), one for all pictures, or a folder with one for each.
+    layers: files of layers by name (virtual, sharp), one for all pictures, or a folder or pattern with one for each.
     lens: as focused for the shot, to find the reach of a sharp layer. energy_tolerance: share of the light. flicker_limit: mean
     absolute difference beyond the plate's own. tolerance: how far a pixel may differ from the plate (sRGB code; in EXR share of the
     light); None: what storing it explains. taken: frames of the plate, from which the shot was made.
@@ -151,14 +152,15 @@ def check_shot(shot: Shot, plate: Shot | None, settings: CheckSettings) -> tuple
     """Check a shot. Raises InputError if no picture can be read, or the plate is of another size."""
     report, leaks, flicker = CheckReport(), LeakMap(settings.tolerance), FlickerScore()
     passed = track(pairs(report, shot, plate, settings.taken), f"checking {shot.path.name}", len(shot.numbers or ()))
-    still = {name: read_layer(path) for name, path in settings.layers.items() if not path.is_dir()}
+    still = {name: read_layer(path) for name, path in settings.layers.items() if not _is_many(path)}
     for index, (picture, other) in enumerate(passed):
         if isinstance(picture, str):
             report.findings.append(Finding(check="damaged", where=shot.path.name, text=picture, value=1.0, limit=0.0))
             flicker.skip()
             continue
         report.pictures += 1
-        complete = with_layers(picture, still | _layers(settings.layers, index))
+        number = index if shot.numbers is None else shot.numbers[index]
+        complete = with_layers(picture, still | _layers(settings.layers, index, number))
         _check_one(report, complete, other, settings, leaks)
         if other is not None and shot.is_sequence:
             flicker.add(report, picture.name, picture.rgb, other.rgb)
@@ -183,12 +185,18 @@ def _check_one(report: CheckReport, picture: CheckedPicture, plate: CheckedPictu
         leaks.add(report, picture, plate.rgb, reached)
 
 
-def _layers(files: Mapping[str, Path], index: int) -> dict[str, Layer]:
+def _is_many(path: Path) -> bool:
+    return path.is_dir() or (is_pattern(path) and not path.exists())
+
+
+def _layers(files: Mapping[str, Path], index: int, number: int) -> dict[str, Layer]:
     """Read the layers that have one file for each picture."""
-    return {name: read_layer(_of_picture(folder, index)) for name, folder in files.items() if folder.is_dir()}
+    return {name: read_layer(_of_picture(path, index, number)) for name, path in files.items() if _is_many(path)}
 
 
-def _of_picture(folder: Path, index: int) -> Path:
+def _of_picture(folder: Path, index: int, number: int) -> Path:
+    if not folder.is_dir():
+        return numbered(folder, number)
     files = sorted(each for each in folder.glob("*.exr") if not each.name.startswith("."))
     if index >= len(files):
         raise InputError(f"{folder} holds {len(files)} layers (.exr), too few for the pictures: expected one for each")

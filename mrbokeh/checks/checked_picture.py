@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from mrbokeh.images.color import linear_to_srgb
-from mrbokeh.images.exr_io import ExrPart, read_exr
+from mrbokeh.images.exr_io import INTEROP_ID, INTEROP_IDS, REC709, ExrPart, in_rec709, read_exr, stated_primaries
 from mrbokeh.images.image_io import INTEGER_SUFFIXES, LINEAR_SUFFIXES, read_image, read_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.images.picture_codec import stored_pixels
@@ -37,10 +37,12 @@ class Storage:
     """Precision of a file.
 
     is_linear: steps are shares of the value (EXR), else of the sRGB code (integer files, films). step: what rounding may change.
+    mixes: the file has other primaries, so that rounding of its brightest channel reaches all of ours.
     """
 
     is_linear: bool
     step: float
+    mixes: bool = False
 
     @property
     def dark_step(self) -> float:
@@ -53,7 +55,10 @@ class Storage:
         """Return where two pictures differ by more than storing them explains. NaN differs from everything."""
         if self.is_linear:
             known = np.nan_to_num(rgb, posinf=0.0, neginf=0.0)
-            allowed = self.step * np.maximum(np.abs(known), np.abs(plate_rgb)) + (1e-7 if self.step else 0.0)
+            light = np.maximum(np.abs(known), np.abs(plate_rgb))
+            # A row of the matrix from AP0 has 4.05 in sum.
+            scale = 4.1 * light.max(axis=2, keepdims=True) if self.mixes else light
+            allowed = self.step * scale + (1e-7 if self.step else 0.0)
             return ~((np.abs(known - plate_rgb) <= allowed) & np.isfinite(rgb)).all(axis=2)
         # The curve is nowhere steeper than its foot: what differs less in light than that can hide need not be encoded.
         differs = ~(np.abs(rgb - plate_rgb) <= self.step / _STEEPEST).all(axis=2)
@@ -91,13 +96,14 @@ def read_picture(path: Path) -> CheckedPicture:
     parts = read_exr(path)
     layer = read_layer(path)
     has_alpha = any("A" in part.channels for part in parts)
+    is_ours = parts[0].attributes.get(INTEROP_ID) == INTEROP_IDS[REC709]
     is_half = any(part.channels.get("R", np.empty(0)).dtype == np.float16 for part in parts)
     return CheckedPicture(
         name=path.name,
         rgb=layer.rgb,
-        storage=Storage(True, _HALF_STEP if is_half else 0.0),
+        storage=Storage(True, _HALF_STEP if is_half else 0.0, stated_primaries(parts[0], parts) is not None and not is_ours),
         alpha=layer.alpha if has_alpha else None,
-        layers=_layers(parts),
+        layers=_layers(parts, path),
         depth_m=layer.depth_m,
     )
 
@@ -123,20 +129,21 @@ def _integer_storage(path: Path) -> Storage:
     return Storage(False, _CODE_STEP_16 if pixels.dtype == np.uint16 else _CODE_STEP_8)
 
 
-def _layers(parts: list[ExrPart]) -> dict[str, Layer]:
+def _layers(parts: list[ExrPart], path: Path) -> dict[str, Layer]:
     """Return layers NAME.R, NAME.G, NAME.B with NAME.A and NAME.Z of any part, and parts of that name with R, G, B."""
+    primaries = stated_primaries(parts[0], parts)
     named = {name: part.channels for part in parts for name in (VIRTUAL, SHARP, SHADOW) if part.name == name and "R" in part.channels}
     for part in parts:
         for name in (VIRTUAL, SHARP, SHADOW):
             own = {key.removeprefix(f"{name}."): pixels for key, pixels in part.channels.items() if key.startswith(f"{name}.")}
             if own:
                 named[name] = own
-    return {name: _layer(channels) for name, channels in named.items()}
+    return {name: _layer(channels, primaries, path) for name, channels in named.items()}
 
 
-def _layer(channels: Mapping[str, np.ndarray]) -> Layer:
+def _layer(channels: Mapping[str, np.ndarray], primaries: tuple[float, ...] | None, path: Path) -> Layer:
     shape = next(iter(channels.values())).shape
-    rgb = np.stack([channels.get(c, np.zeros(shape)) for c in "RGB"], axis=2).astype(np.float32)
+    rgb = in_rec709(np.stack([channels.get(c, np.zeros(shape)) for c in "RGB"], axis=2).astype(np.float32), primaries, path)
     depth_m = channels.get("Z", np.full(shape, np.inf)).astype(np.float32)
     return Layer(rgb, channels.get("A", np.ones(shape)).astype(np.float32), depth_m)
 

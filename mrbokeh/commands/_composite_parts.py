@@ -23,7 +23,7 @@ from mrbokeh.compositing.plate import (
 )
 from mrbokeh.depth.depth_map import DepthSettings, parse_near_far
 from mrbokeh.depth.phone_depth import read_phone_photo
-from mrbokeh.images.alpha_io import HOLDING_ALPHA, alpha_with
+from mrbokeh.images.alpha_io import HOLDING_ALPHA, alpha_with, write_finished
 from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.images.image_io import INTEGER_SUFFIXES, require_suffix
 from mrbokeh.images.layer import Layer, flatten
@@ -32,6 +32,7 @@ from mrbokeh.stacks.capture_bundle import CaptureBundle
 from mrbokeh.stacks.guessed_metres import GUESSED
 from mrbokeh.stacks.photograph import read_photograph
 from mrbokeh.system.atomic_files import require_safe_outputs
+from mrbokeh.system.channel import say
 from mrbokeh.system.console import flag
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.image_sequence import read_numbers
@@ -126,28 +127,20 @@ def _size_px(sharp: Sequence[Layer]) -> str:
     return f"{np.ptp(columns) + 1}x{np.ptp(rows) + 1}"
 
 
-def write_results(
-    out: Path, inserted: Inserted, plate: Plate, sharp: Sequence[Layer], colour: ColourOptions, result: ResultOptions
-) -> None:
-    """Write the picture and the files beside it. sharp: the inserted layers, front first."""
+def write_results(out: Path, inserted: Inserted, plate: Plate, sharp: Sequence[Layer], options: CompositeOptions) -> None:
+    """Write the picture and the files beside it. sharp: the inserted layers, front first. options: of the plate and its layers."""
     from mrbokeh.images.image_io import write_layer
     from mrbokeh.stacks.exr_layers.composite_exr import write_deep_exr
 
-    write_picture(out, inserted, plate, sharp, colour)
+    result = options.result
+    if out.suffix.lower() == ".exr":
+        _write_layers(out, inserted, plate, flatten(sharp), options)
+    else:
+        write_finished(out, inserted.rgb, alpha_with(plate.alpha, inserted.virtual.alpha), options.colour.of_result)
     if result.save_layer is not None:
         write_layer(result.save_layer, inserted.virtual)
     if result.save_deep is not None:
         write_deep_exr(result.save_deep, sharp)
-
-
-def write_picture(out: Path, inserted: Inserted, plate: Plate, sharp: Sequence[Layer], colour: ColourOptions) -> None:
-    """Write the picture alone if it has an output space; else linear Rec.709 with its layers, or sRGB."""
-    from mrbokeh.images.alpha_io import write_finished
-
-    if out.suffix.lower() == ".exr" and colour.of_result is None:
-        _write_layers(out, inserted, plate, flatten(sharp))
-    else:
-        write_finished(out, inserted.rgb, alpha_with(plate.alpha, inserted.virtual.alpha), colour.of_result)
 
 
 def alpha_lost(out: Path, plate: Plate) -> str | None:
@@ -157,18 +150,32 @@ def alpha_lost(out: Path, plate: Plate) -> str | None:
     return f"the plate has alpha, which {out.suffix} cannot hold: what it does not cover is black in {out} (write .png, .tif or .exr)"
 
 
-def _write_layers(out: Path, inserted: Inserted, plate: Plate, sharp: Layer) -> None:
+def _write_layers(out: Path, inserted: Inserted, plate: Plate, sharp: Layer, options: CompositeOptions) -> None:
     """Depth is that of the frontmost sharp surface; circles of confusion follow from it."""
+    from mrbokeh.images.carried_exr import CarriedExr
     from mrbokeh.stacks.exr_layers.composite_exr import CompositeLayers, write_composite_exr
+    from mrbokeh.stacks.exr_layers.cryptomatte import cryptomatte_among
+    from mrbokeh.stacks.exr_layers.sequence import ExrSequence
 
+    colour = options.colour
+    carried = CarriedExr.of(options.photo, colour.of_plate)
+    if told := carried.told(options.photo):
+        say(told)
     scene_m = np.full(sharp.depth_m.shape, np.inf, np.float32) if plate.depth_m is None else plate.depth_m
     depth_m = np.where(sharp.alpha > 0.5, np.minimum(sharp.depth_m, scene_m), scene_m).astype(np.float32)
     coc_px = plate.lens.coc_px(depth_m, depth_m.shape[1]).astype(np.float32)
     alpha = alpha_with(plate.alpha, inserted.virtual.alpha)
     layers = {"virtual": _bare(inserted.virtual), "sharp": _bare(sharp)}
-    write_composite_exr(
-        out, CompositeLayers(rgb=inserted.rgb, alpha=alpha, depth_m=depth_m, layers=layers, matte=inserted.virtual.alpha, coc_px=coc_px)
+    made = CompositeLayers(
+        rgb=inserted.rgb,
+        alpha=alpha,
+        depth_m=depth_m,
+        layers=layers,
+        matte=inserted.virtual.alpha,
+        coc_px=coc_px,
+        objects=cryptomatte_among([each.path_of(each.frames[0]) for each in map(ExrSequence.of, options.virtual.layer or ())]),
     )
+    write_composite_exr(out, made, space=colour.of_result, carried=carried)
 
 
 def _bare(layer: Layer) -> Layer:

@@ -198,9 +198,7 @@ class ColourOptions:
     input_space: Annotated[str | None, typer.Option(help="OpenColorIO space of the plate's numbers, such as ACEScg or 'ARRI LogC4'.")] = (
         None
     )
-    output_space: Annotated[
-        str | None, typer.Option(help="OpenColorIO space of OUT, such as ACEScg; OUT then holds the picture alone.")
-    ] = None
+    output_space: Annotated[str | None, typer.Option(help="OpenColorIO space of OUT, of its layers too, such as ACEScg.")] = None
     ocio: Annotated[str, typer.Option(metavar="CONFIG", help="OpenColorIO configuration: aces, aces-cg or a file.")] = "aces"
 
     def __post_init__(self) -> None:

@@ -41,7 +41,7 @@ EVERYDAY = {
 """Options of a command that most people need, which come first."""
 
 PANELS = {
-    "The plate": "all-slices behind depth-model-gives depth-scale disparity exact-depth first-number frames input-space matte "
+    "The plate": "all-slices behind depth-model-gives depth-scale disparity exact-depth first-number frames missing input-space matte "
     "near-distance rate refine rgb srgb steady-depth stereo stereo-cameras baseline linear side light-distance sidecar",
     "What is put in": "camera catch layer mode objects paths pitch roll scene scene-begin scene-renderer time turn keyframes",
     "Its light": "environment exposure shadow",
@@ -59,7 +59,7 @@ PANELS = {
     "Tracking": "camera-model cameras delay focus-from freed lens-table longest-gap map mapper max-image-size metres-per-unit opentrackio "
     "phone phone-camera pose rig smooth steadier",
     "The page": "captures interface lan max-rate pictures port project qr tls tls-key webcam",
-    "The result": "constant-rate encoding format leaks no-distortion ocio output-space overwrite preview save-deep save-depth "
+    "The result": "proxy constant-rate encoding format leaks no-distortion ocio output-space overwrite preview save-deep save-depth "
     "save-layer sheet virtual-only allow-absent strict",
     "The work": "cluster device epochs max-width segment threads work workers",
 }
@@ -105,6 +105,7 @@ CHOICES = {
     "cameras": "auto shared separate",
     "depth-model-gives": "inverse metric",
     "device": "cpu cuda",
+    "missing": "stop hold black",
     "encoding": "h264 h264-10bit h265-10bit prores4444 prores4444-alpha prores422 dnxhr-hqx ffv1 ffv1-alpha",
     "focus-from": "hand tracking source board",
     "ocio": "aces aces-cg",

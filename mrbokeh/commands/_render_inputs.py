@@ -116,11 +116,15 @@ def _read(sources: SharpOptions) -> dict[str, Layer]:
 
 
 def _whole_layer(path: Path) -> Layer:
-    from mrbokeh.images.image_io import read_layer, require_numbers
+    """Read a layer as `composite` does, which refuses one without depth, with all other channels but those of Cryptomatte."""
+    from mrbokeh.stacks.exr_layers.cryptomatte import carried_cryptomatte
+    from mrbokeh.stacks.exr_layers.render_channels import RenderChannels, joined, layer_of
 
-    layer = read_layer(path, extra=True)
-    require_numbers(path, {"colour": layer.rgb, "alpha": layer.alpha})
-    return layer
+    render, objects = RenderChannels.read(path), carried_cryptomatte(path)
+    name = render.colour_layer()
+    taken = {*(joined(name, each) for each in "RGBA"), render.depth_name(name), *(objects.channels if objects else ())}
+    others = sorted((render.channels.keys() & set(render.stored)) - taken)
+    return replace(layer_of(render), extra={each: render.plane(each).astype(np.float32)[..., None] for each in others})
 
 
 def _picture(rgb: Path, depth: Path, near_far_m: tuple[float, float] | None, sources: SharpOptions) -> Layer:

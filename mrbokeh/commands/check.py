@@ -27,7 +27,7 @@ class SourceOptions:
     ] = None
     virtual: Annotated[
         Path | None,
-        typer.Option(help="Blurred virtual layer (EXR with alpha), or a folder with one for each picture; else from layered EXR."),
+        typer.Option(help="Blurred virtual layer (EXR with alpha), for each picture virtual.%04d.exr or a folder; else from layered EXR."),
     ] = None
     sharp: Annotated[
         Path | None, typer.Option(help="The same before the blur, for the ledger of light, and with --lens for the reach.")
@@ -74,7 +74,9 @@ class ReportOptions:
 @app.command()
 @grouped
 def check(
-    picture: Annotated[Path, typer.Argument(metavar="OUT", help="A picture, a folder of numbered pictures, a focal stack or a film.")],
+    picture: Annotated[
+        Path, typer.Argument(metavar="OUT", help="A picture, numbered ones (out.%04d.exr, a folder), a focal stack or a film.")
+    ],
     made: SourceOptions,
     limits: LimitOptions,
     result: ReportOptions,

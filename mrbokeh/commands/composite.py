@@ -75,7 +75,7 @@ def composite(options: CompositeOptions, out: OutOption) -> None:
         # What only layered files hold is half of all memory.
         plate, sharp = replace(plate, depth_m=None, sharp_rgb=None), []
     del made
-    write_results(out, inserted, plate, sharp, options.colour, options.result)
+    write_results(out, inserted, plate, sharp, options)
     carry_exif(options.photo, out, plate.rgb.shape[1::-1])
     if lost := alpha_lost(out, plate):
         warn(lost)

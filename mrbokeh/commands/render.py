@@ -1,5 +1,6 @@
 """`mrbokeh render`: blur a picture with depth, or layers, as a lens does."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -113,15 +114,18 @@ def render(
             blurred = renderer.render(list(sharp.values()), used)
         else:
             blurred = reconstructed(renderer, method, given.samples, used)
-    _write(out, blurred, result.alpha_out)
+    _write(out, blurred, (given.layer or ()) if result.alpha_out else None)
     own_lens = given.samples is not None or method.endswith(".onnx")
     tell(f"wrote {out}" + ("" if own_lens else f" ({used.described})"), known={} if own_lens else used.facts, method=method)
 
 
-def _write(out: Path, blurred: Layer, alpha_out: bool) -> None:
-    from mrbokeh.images.image_io import write_image, write_layer
+def _write(out: Path, blurred: Layer, layers: Sequence[Path] | None) -> None:
+    """Write the picture alone, or, with the files of the layers that it was made of, all channels."""
+    from mrbokeh.images.alpha_io import write_finished
+    from mrbokeh.images.image_io import write_layer
+    from mrbokeh.stacks.exr_layers.cryptomatte import cryptomatte_among
 
-    if alpha_out:
-        write_layer(out, blurred)
+    if layers is not None:
+        write_layer(out, blurred, objects=cryptomatte_among(layers))
     else:
-        write_image(out, blurred.rgb)
+        write_finished(out, blurred.rgb)

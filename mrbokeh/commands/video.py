@@ -24,12 +24,14 @@ from mrbokeh.commands._option_groups import grouped
 from mrbokeh.compositing.choose import DEFAULT_MODE
 from mrbokeh.compositing.plate_look.finishing import LookOptions
 from mrbokeh.depth.views import DEPTH_NAME
+from mrbokeh.images.carried_exr import CarriedExr
 from mrbokeh.renderers.choose import BY_NAME, lens_and_renderer
 from mrbokeh.shots.composite_recipe import CompositeRecipe
 from mrbokeh.shots.executors import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
 from mrbokeh.shots.frame_sources import CameraFile, ClipLook, DepthFiles, FocusPulled, MatteFiles
 from mrbokeh.shots.inputs import Moment
-from mrbokeh.shots.layer_sources import LayerFiles, sources_by_depth
+from mrbokeh.shots.layer_sources import LayerFiles, sources_by_depth, with_cryptomatte
+from mrbokeh.shots.proxies import proxy_recipe
 from mrbokeh.shots.render_shot import SequenceTarget, VideoTarget, render_shot
 from mrbokeh.shots.shot import SEGMENT_S, Shot, Target
 from mrbokeh.stacks.photograph import SensorOrientation, lens_for_orientation
@@ -40,8 +42,9 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import cores
 from mrbokeh.video.clip import has_alpha_apart
 from mrbokeh.video.encodings import with_alpha
-from mrbokeh.video.image_sequence import is_pattern
+from mrbokeh.video.image_sequence import STOP, ImageSequence, is_pattern, numbers_of, require_all_there, require_missing_known
 from mrbokeh.video.picture_source import PictureSource, numbers_taken, open_source, parse_rate
+from mrbokeh.video.proxy_source import ProxySource, parse_proxy
 
 ClipArgument = Annotated[
     Path,
@@ -70,6 +73,13 @@ class ClipOptions(shared.NearOptions):
         int | None,
         typer.Option(help="Number of the clip's first frame, for --frames, sequences, tracks and focus pulls; default: its file's, or 0."),
     ] = None
+    missing: Annotated[
+        str,
+        typer.Option(
+            metavar="stop|hold|black",
+            help="Frames without a file: stop before the work, hold the frame before, or black. Depth and mattes are held with both.",
+        ),
+    ] = "stop"
     depth: Annotated[
         Path | None,
         typer.Option(
@@ -126,6 +136,9 @@ class ResultOptions:
     virtual_only: Annotated[
         bool, typer.Option("--virtual-only", help="Write the blurred virtual layer with alpha: EXR files, .mov or .mkv.")
     ] = False
+    proxy: Annotated[
+        str | None, typer.Option(metavar="1/2", help="Make OUT in a part of the plate's width and height, all that is read shrunk alike.")
+    ] = None
     overwrite: shared.OverwriteOption = False
 
 
@@ -165,7 +178,8 @@ def recipe_of(
         pull.require_reached(_numbers(source, taken))
     holding = SensorOrientation((source.info.width_px, source.info.height_px), source.info.quarter_turns)
     objects = virtual.object_names
-    files = tuple(LayerFiles(path.resolve(), objects) for path in virtual.layer or ())
+    files = tuple(LayerFiles(path.resolve(), objects, taken.missing) for path in virtual.layer or ())
+    _require_all_there(source, files, taken)
     recipe = CompositeRecipe(
         lens=None if lens is None else lens.resolve(),
         layers=sources_by_depth(files, _scene_layers(source, virtual, rendering)),
@@ -241,7 +255,13 @@ def target_of(out: Path, source: PictureSource, recipe: CompositeRecipe, colour:
         for name, value in (("--encoding", result.encoding), ("--constant-rate", result.constant_rate)):
             if value is not None:
                 raise InputError(f"{name} {value} is for videos, but {out} are pictures: leave it out")
-        return SequenceTarget(out.resolve(), recipe.first_number, result.virtual_only, colour.of_result)
+        return SequenceTarget(
+            path=out.resolve(),
+            first_number=recipe.first_number,
+            layers=result.virtual_only,
+            space=colour.of_result,
+            renders=with_cryptomatte(recipe.layers),
+        )
     keeping = with_alpha(out) if result.virtual_only or source.info.has_alpha else None
     encoding = result.encoding or keeping or ("prores4444-alpha" if result.virtual_only else None)
     sound = None if is_pattern(source.path) else source.path
@@ -258,6 +278,20 @@ def shot_of(source: PictureSource, recipe: CompositeRecipe, target: Target, take
         taken=[number - first for number in numbers],
         segment_frames=max(1, round(segment_s * source.info.frame_rate)),
     )
+
+
+def _require_all_there(source: PictureSource, layers: "Sequence[LayerFiles]", taken: ClipOptions) -> None:
+    """Raise InputError if files of frames are missing anywhere and nothing is told to stand for them, or if layers are of another rate."""
+    numbers, shift = _numbers(source, taken), _first_number(source, taken) - source.first_number
+    if isinstance(source, ImageSequence) and taken.missing == STOP:
+        require_all_there(source.path, source.there, [number - shift for number in numbers])
+    for each in layers:
+        each.require_all(numbers, source.info.frame_rate)
+    if taken.missing != STOP:
+        return
+    for path in (taken.depth, taken.matte):
+        if path is not None and is_pattern(path):
+            require_all_there(path, numbers_of(path), numbers)
 
 
 def _numbers(source: PictureSource, taken: ClipOptions) -> "Sequence[int]":
@@ -297,7 +331,9 @@ def _look(look: LookGroup, source: PictureSource, taken: ClipOptions) -> ClipLoo
         return None
     first = _first_number(source, taken)
     start = _numbers(source, taken)[0] - first
-    return ClipLook(options=look.wanted, clip=source.path, rate=taken.rate, start=start, first_number=first, space=source.space)
+    return ClipLook(
+        options=look.wanted, clip=source.path, rate=taken.rate, start=start, first_number=first, space=source.space, missing=taken.missing
+    )
 
 
 def _first_number(source: PictureSource, taken: ClipOptions) -> int:
@@ -338,10 +374,14 @@ def video(
     """
     depth_files = () if is_auto(taken.depth) else (taken.depth,)
     require_safe_outputs((out,), (clip, *depth_files, taken.matte, *virtual.files, rendering.distortion, lens), overwrite=True)
-    source = open_source(clip, taken.rate, colour.of_plate)
+    require_missing_known(taken.missing)
+    source = open_source(clip, taken.rate, colour.of_plate, taken.missing)
     recipe = recipe_of(source, lens, facts, taken, virtual, rendering, look, blur, virtual_only=result.virtual_only)
     if lens_and_renderer(lens, blur.renderer)[0] is None and not {"focal_length_mm", "f_number"} <= facts.given.keys():
         guess(f"no whole lens is stated, so that this one is taken: {recipe.stated_lens.described}")
+    scale = parse_proxy(result.proxy)
+    if scale < 1:
+        recipe, source = proxy_recipe(recipe, source.info, scale), ProxySource.of(source, scale)
     target = target_of(out, source, recipe, colour, result)
     shot = shot_of(source, recipe, target, taken, work.segment)
     target.require_new(shot, result.overwrite or shot.was_begun)
@@ -352,6 +392,8 @@ def video(
     _try_first_frame(shot)
     if not result.virtual_only and (lost := _alpha_lost(clip, source, target)):
         warn(f"{clip} {lost}")
+    if is_pattern(out) and scale == 1 and (carried := CarriedExr.of(source.file_of(shot.taken[0])).told(clip)):
+        say(carried)
     note = _made(shot, _executor(work, len(shot.segments)), result.overwrite)
     frames = len(shot.taken)
     told = f"wrote {out} ({source.info.width_px}x{source.info.height_px} px, {frames} frame{'' if frames == 1 else 's'}, {note})"

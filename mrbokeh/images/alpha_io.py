@@ -1,16 +1,17 @@
 """Pictures with alpha in and out: the alpha of a plate, and finished pictures in a colour space that the user names.
 
-EXR is premultiplied and states its primaries if they are known; PNG and TIFF hold straight colour, as their standards ask.
+EXR is premultiplied and states its colour space; PNG and TIFF hold straight colour, as their standards ask.
 """
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.images.exif import AS_STORED, upright
-from mrbokeh.images.exr_io import ATTRIBUTE, ExrPart, read_exr, write_exr
+from mrbokeh.images.exr_io import ATTRIBUTE, INTEROP_ID, INTEROP_IDS, SPACE_NAME, STATED_REC709, ExrPart, read_exr, write_exr
 from mrbokeh.images.image_io import INTEGER_SUFFIXES, write_image
 from mrbokeh.images.picture_codec import codes_of, even_codes, stored_pixels, write_stored
 
@@ -90,10 +91,15 @@ def exr_part(rgb: Picture, alpha: Plane | None, space: NamedSpace | None) -> Exr
     return ExrPart(channels, attributes=stated(space))
 
 
-def stated(space: NamedSpace | None) -> dict[str, tuple[float, ...]]:
-    """Return the header entries that state the primaries of a space; none for Rec.709, EXR's default, or unknown primaries."""
-    primaries = None if space is None else space.primaries
-    return {} if primaries is None else {ATTRIBUTE: primaries}
+def stated(space: NamedSpace | None) -> dict[str, Any]:
+    """Return the header entries that state a colour space: its name, and its primaries if it is linear and they are a public standard's.
+
+    None is linear Rec.709.
+    """
+    if space is None:
+        return dict(STATED_REC709)
+    primaries, name = space.primaries, {SPACE_NAME: space.name}
+    return name if primaries is None else {ATTRIBUTE: primaries, INTEROP_ID: INTEROP_IDS[primaries], **name}
 
 
 def in_named_space(rgb: Picture, alpha: Plane | None, space: NamedSpace | None) -> Picture:

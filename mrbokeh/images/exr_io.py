@@ -19,13 +19,17 @@ Channels = dict[str, Float[np.ndarray, "height width"]]
 class ExrPart:
     """Picture of an EXR file: one part with its channels.
 
-    channels: name to (H, W) float16 or float32, all of the size of the display window.
+    channels: name to (H, W) float16 or float32, all of the size of the display window, with overscan more by `margins_px`.
     attributes: further header entries: numbers, strings, and chromaticities (CIE x, y of red, green, blue and white).
+    header: all entries as OpenEXR gives them. origin_px: (x, y) of the display window. margins_px: left, top, right, bottom.
     """
 
     channels: Channels
     name: str = ""
     attributes: Mapping[str, Any] = field(default_factory=dict)
+    header: Mapping[str, Any] = field(default_factory=dict)
+    origin_px: tuple[int, int] = (0, 0)
+    margins_px: tuple[int, int, int, int] = (0, 0, 0, 0)
 
     def stacked(self, names: Sequence[str]) -> Float[np.ndarray, "height width channels"]:
         """Return the named channels as one (H, W, C) float32 array."""
@@ -39,10 +43,10 @@ class ExrPart:
         return [self.channels[name] for name in names]
 
 
-def read_exr(path: Path | str) -> list[ExrPart]:
+def read_exr(path: Path | str, *, overscan: bool = False) -> list[ExrPart]:
     """Read all flat parts of an EXR file; data windows are placed into their display windows, with 0 outside.
 
-    Raises InputError when the file is not EXR, is damaged or holds only deep parts.
+    overscan: keep what lies around the display window. Raises InputError when the file is not EXR, is damaged or holds only deep parts.
     """
     import OpenEXR
 
@@ -52,7 +56,7 @@ def read_exr(path: Path | str) -> list[ExrPart]:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             is_deep = any(part.type() in (OpenEXR.deepscanline, OpenEXR.deeptile) for part in file.parts)
             flat = [part for part in file.parts if part.type() in (OpenEXR.scanlineimage, OpenEXR.tiledimage)]
-            parts = [_part_from_openexr(part) for part in flat]
+            parts = [_part_from_openexr(part, overscan) for part in flat]
     except (RuntimeError, OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read as EXR: {error}") from None
     if not parts and is_deep:
@@ -60,6 +64,17 @@ def read_exr(path: Path | str) -> list[ExrPart]:
     if not parts:
         raise InputError(f"{path} cannot be read as EXR: its pixels are missing or damaged, copy or render it again")
     return parts
+
+
+def header_of(path: Path | str) -> dict[str, Any]:
+    """Return the header entries of the first part of an EXR file, without reading its pixels. Raises InputError where it is none."""
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            return dict(file.parts[0].header)
+    except (RuntimeError, OSError, ValueError) as error:
+        raise InputError(f"{path} cannot be read as EXR: {error}") from None
 
 
 def write_exr(path: Path | str, parts: Sequence[ExrPart] | ExrPart, *, compress: bool = True) -> None:
@@ -85,15 +100,24 @@ def write_exr(path: Path | str, parts: Sequence[ExrPart] | ExrPart, *, compress:
         OpenEXR.File(converted).write(str(temporary))
 
 
-def _part_from_openexr(part: Any) -> ExrPart:
+def _part_from_openexr(part: Any, overscan: bool) -> ExrPart:
     header = part.header
-    data_min, display_min = header["dataWindow"][0], header["displayWindow"][0]
-    size = tuple((header["displayWindow"][1] - display_min + 1)[::-1].tolist())
-    offset_y, offset_x = (data_min - display_min)[::-1].tolist()
+    (data_min, data_max), (display_min, display_max) = header["dataWindow"], header["displayWindow"]
+    over = np.maximum([display_min - data_min, data_max - display_max], 0) if overscan else np.zeros((2, 2), np.int64)
+    size = tuple((display_max - display_min + 1 + over.sum(axis=0))[::-1].tolist())
+    offset_y, offset_x = (data_min - display_min + over[0])[::-1].tolist()
     channels = {name: _placed(channel.pixels, size, offset_y, offset_x) for name, channel in part.channels.items()}
     told = {key: value for key, value in header.items() if isinstance(value, (int, float, str)) or key == "chromaticities"}
     attributes = {key: value for key, value in told.items() if key != "name"}
-    return ExrPart(channels, str(header.get("name", "")), attributes)
+    left, top, right, bottom = over.ravel().tolist()
+    return ExrPart(
+        channels=channels,
+        name=str(header.get("name", "")),
+        attributes=attributes,
+        header=dict(header),  # OpenEXR empties its own when the file is closed
+        origin_px=(int(display_min[0]), int(display_min[1])),
+        margins_px=(left, top, right, bottom),
+    )
 
 
 def _placed(pixels: np.ndarray, size: tuple[int, ...], offset_y: int, offset_x: int) -> np.ndarray:
@@ -110,6 +134,8 @@ def _placed(pixels: np.ndarray, size: tuple[int, ...], offset_y: int, offset_x: 
 
 
 ATTRIBUTE = "chromaticities"
+SPACE_NAME, INTEROP_ID = "oiio:ColorSpace", "colorInteropID"
+"""Header entries of a colour space: the name by which OpenColorIO knows it, and that of the Color Interop Forum (OpenEXR 3.4)."""
 REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 """CIE x, y of red, green, blue and white (D65), ITU-R BT.709; what EXR takes where a file states nothing."""
 
@@ -124,6 +150,17 @@ AP1 = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
 
 P3_D65 = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
 """Primaries of SMPTE RP 431-2 with the white of displays."""
+
+INTEROP_IDS = {
+    REC709: "lin_rec709_scene",
+    BT2020: "lin_rec2020_scene",
+    AP0: "lin_ap0_scene",
+    AP1: "lin_ap1_scene",
+    P3_D65: "lin_p3d65_scene",
+}
+
+STATED_REC709 = {ATTRIBUTE: REC709, INTEROP_ID: INTEROP_IDS[REC709], SPACE_NAME: "lin_rec709"}
+"""Header entries of pictures as they are here."""
 
 # Cone responses that the Bradford transform scales (Lam 1985; CIE 160:2004).
 _CONES_FROM_XYZ = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])

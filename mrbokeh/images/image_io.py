@@ -4,7 +4,7 @@ through a stated encoding; and previews and contact sheets for people.
 WebP and HEIC are read only: WebP keeps 8 bits, mostly lossily, and HEIC needs the extra `heic`; what encodes it from Python brings x265
 (GPL). Colour profiles are honoured on reading (`color_profiles`); integers are written as sRGB without one.
 
-Files are written without stating primaries: EXR takes Rec.709 by default, and kernels and maps of numbers have none.
+`write_image` states no primaries, for kernels and maps of numbers have none; layers and finished pictures (`alpha_io`) state theirs.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 
 from mrbokeh.images.color import display_rgb8
-from mrbokeh.images.exr_io import ExrPart, in_rec709, read_exr, stated_primaries, write_exr
+from mrbokeh.images.exr_io import STATED_REC709, ExrPart, in_rec709, read_exr, stated_primaries, write_exr
 from mrbokeh.images.heif import HEIF_SUFFIXES
 from mrbokeh.images.layer import Layer
 from mrbokeh.images.picture_codec import Encoding, codes_of, linear_from_codes, stored_pixels, stored_rgb, write_stored
@@ -186,17 +186,19 @@ def read_layer(path: Path | str, *, extra: bool = False) -> Layer:
     return Layer(rgb, alpha, depth_m, {name: channels[name].astype(np.float32)[..., None] for name in others})
 
 
-def write_layer(path: Path | str, layer: Layer, *, half: bool = True) -> None:
+def write_layer(path: Path | str, layer: Layer, *, half: bool = True, objects: ExrPart | None = None) -> None:
     """Write a layer as EXR: R, G, B, A in half or float; Z (metres along the optical axis, not antialiased) and extra channels in float.
 
-    An extra channel of one component keeps its name, others become NAME.0, NAME.1 and so on.
+    objects: Cryptomatte with its header entries. An extra channel of one component keeps its name, others become NAME.0, NAME.1 and so on.
     """
     colour = np.float16 if half else np.float32
     channels = {name: layer.rgb[..., i].astype(colour) for i, name in enumerate("RGB")}
     channels |= {"A": layer.alpha.astype(colour), "Z": layer.depth_m.astype(np.float32)}
     for name, values in layer.extra.items():
         channels |= {name if values.shape[2] == 1 else f"{name}.{i}": values[..., i] for i in range(values.shape[2])}
-    write_exr(path, ExrPart(channels, attributes={"comments": "premultiplied alpha; Z in metres along the optical axis, not antialiased"}))
+    comments = "premultiplied alpha; Z in metres along the optical axis, not antialiased"
+    attributes = {"comments": comments, **STATED_REC709, **(objects.attributes if objects else {})}
+    write_exr(path, ExrPart(channels | (objects.channels if objects else {}), attributes=attributes))
 
 
 def _read_rgba(path: Path, encoding: Encoding) -> Float32[np.ndarray, "height width channels"]:

@@ -1,26 +1,30 @@
 """Executors: who renders the segments of a shot: this process, worker processes of this machine, or a Dask cluster.
 
+The first two claim segments on the disk where the parts lie, so that the same command on several machines shares the work.
+
 A SegmentTask is one segment, rendered from the clip to its part; the same in this process, in another and on another machine.
 """
 
+import os
 import pickle
 import secrets
 import signal
 import threading
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, ThreadPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from itertools import repeat
-from multiprocessing import get_context, parent_process
-from os import _exit
+from multiprocessing import connection, get_context
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 from mrbokeh import __version__
-from mrbokeh.shots.shot import FrameMaker, MakerRecipe, Picture, Segment, Shot
+from mrbokeh.shots.claims import claimed
+from mrbokeh.shots.shot import MANIFEST, FrameMaker, MakerRecipe, Picture, Segment, Shot
 from mrbokeh.system.errors import InputError, MissingExtraError
 from mrbokeh.system.resources import CallingThread, ahead, cores
 from mrbokeh.video.clip import Frame
@@ -102,6 +106,8 @@ Progress = Callable[[int], None]
 
 _TRIES = 3
 _POLL_S = 0.25
+CLAIM = ".claim"
+"""Suffix of the sign that somebody renders a segment (`mrbokeh.shots.claims`)."""
 
 
 @runtime_checkable
@@ -116,6 +122,70 @@ class Executor(Protocol):
         ...
 
 
+Tell = Callable[[str, int], None]
+"""Told ("begun" | "made", number of the segment)."""
+
+
+def work_off(tasks: Sequence[SegmentTask], tell: Tell) -> None:
+    """Render segments that nobody else has claimed until all are there, whoever made them.
+
+    Other processes, on any machine that sees the same disk, may do the same at the same time. Ends early if the folder of the parts is
+    gone: then somebody has joined them.
+    """
+    remaining = list(tasks)
+    while remaining:
+        worked = False
+        for task in list(remaining):
+            number, part = task.segment.number, task.shot.target.part(task.folder, task.segment)
+            if not part.exists():
+                if not (task.folder / MANIFEST).exists():
+                    return
+                with claimed(task.folder / f"{number:05d}{CLAIM}") as is_ours:
+                    if not is_ours:
+                        continue
+                    tell("begun", number)
+                    render_segment(task, partial(tell, "made", number))
+                    worked = True
+            remaining.remove(task)
+        if remaining and not worked:
+            time.sleep(_POLL_S)
+
+
+class _Tally:
+    """Frames made, by whomever, of which the user is told."""
+
+    def __init__(self, tasks: Sequence[SegmentTask], progress: Progress) -> None:
+        self._missing = {task.segment.number: task for task in tasks}
+        self._made = dict.fromkeys(self._missing, 0)
+        self._progress, self._told = progress, 0
+
+    def tell(self, what: str, number: int) -> None:
+        self._made[number] = self._made[number] + 1 if what == "made" else 0
+        self.update()
+
+    @property
+    def missing(self) -> int:
+        """Number of segments that were not there at the last look."""
+        return len(self._missing)
+
+    def look(self) -> None:
+        """See which parts are there; all are, if somebody has joined them."""
+        task = next(iter(self._missing.values()), None)
+        if task is None:
+            return
+        names = {entry.name for entry in os.scandir(task.folder)} if (task.folder / MANIFEST).exists() else None
+        for number, each in list(self._missing.items()):
+            if names is None or each.shot.target.part(each.folder, each.segment).name in names:
+                self._made[number] = len(self._missing.pop(number).segment.taken)
+        self.update()
+
+    def update(self) -> None:
+        frames = sum(self._made.values())
+        if frames != self._told:
+            self._progress(frames - self._told)
+            self._told = frames
+
+
 class SerialExecutor:
     """Executor that renders the segments one after the other in this process. threads: of the renderer, 0 for all cores."""
 
@@ -123,12 +193,13 @@ class SerialExecutor:
         self.threads = threads
 
     def run(self, tasks: Sequence[SegmentTask], progress: Progress) -> None:
-        for task in tasks:
-            render_segment(task, lambda: progress(1))
+        tally = _Tally(tasks, progress)
+        work_off(tasks, tally.tell)
+        tally.look()
 
 
 class ProcessExecutor:
-    """Executor with worker processes, one segment each at a time.
+    """Executor with worker processes, each of which claims one segment after the other.
 
     Workers are started afresh (spawn), for threads do not survive a fork; they leave when this process does. count: of the workers.
     threads: of each, so that all of them together take the machine and no more.
@@ -139,98 +210,97 @@ class ProcessExecutor:
         self.threads = threads or max(1, cores() // count)
 
     def run(self, tasks: Sequence[SegmentTask], progress: Progress) -> None:
-        """Render every segment. Raises InputError if workers keep dying without finishing anything."""
-        missing, deaths = list(tasks), 0
-        while missing:
-            done = self._try(missing, progress)
-            deaths = 0 if done else deaths + 1
-            missing = [task for task in missing if task.segment.number not in done]
-            if missing and deaths >= _TRIES:
-                raise InputError(
-                    f"worker processes died {deaths} times in a row without finishing a segment (too little memory?): "
-                    f"try fewer with --workers; what is finished stays"
-                )
-
-    def _try(self, tasks: Sequence[SegmentTask], progress: Progress) -> set[int]:
-        """Return the numbers of the segments finished until all are, or a worker died."""
-        context = get_context("spawn")
-        board = _Board(context.Value("i", 0), context.Event())
-        pool = ProcessPoolExecutor(min(self.count, len(tasks)), context, _begin, (board,))
-        shown = _Shown(board, progress)
+        """Render every segment. Raises InputError if workers keep dying without finishing anything, and what they raise."""
+        if not tasks:
+            return
+        tally, deaths, left = _Tally(tasks, progress), 0, len(tasks)
+        workers = [_Worker(tasks) for _ in range(min(self.count, len(tasks)))]
         try:
-            futures = {pool.submit(_make_here, task): task for task in tasks}
-            return self._finished(futures, shown)
+            while workers:
+                connection.wait([pipe for each in workers for pipe in (each.pipe, each.process.sentinel)], _POLL_S)
+                for worker in list(workers):
+                    if not worker.heard(tally.tell):
+                        workers.remove(worker)
+                        tally.look()
+                        deaths, left = (0, tally.missing) if tally.missing < left else (deaths + 1, left)
+                        if tally.missing and worker.process.exitcode and deaths < _TRIES:
+                            workers.append(_Worker(tasks))
+                tally.look()
         finally:
-            board.stop.set()
-            pool.shutdown(wait=True, cancel_futures=True)
-
-    def _finished(self, futures: dict["Future[int]", SegmentTask], shown: "_Shown") -> set[int]:
-        waiting, numbers = set(futures), set[int]()
-        while waiting:
-            done, waiting = wait(waiting, timeout=_POLL_S, return_when=FIRST_COMPLETED)
-            shown.update()
-            for future in done:
-                try:
-                    numbers.add(future.result())
-                except BrokenProcessPool:
-                    waiting = set()
-        if len(numbers) < len(futures):
-            shown.settle(sum(len(task.segment.taken) for task in futures.values() if task.segment.number in numbers))
-        return numbers
+            for worker in workers:
+                worker.stop()
+        if tally.missing:
+            raise InputError(
+                f"worker processes died {deaths} times in a row without finishing a segment (too little memory?): "
+                f"try fewer with --workers; what is finished stays"
+            )
 
 
-class _Board:
-    """State that workers share with their parent: how many frames were made, and whether to stop."""
+class _Worker:
+    """Worker process and this end of its pipe: what it tells comes in, and the end of the pipe or a word tells it to stop."""
 
-    def __init__(self, made: Any, stop: Any) -> None:
-        self.made, self.stop = made, stop
+    def __init__(self, tasks: Sequence[SegmentTask]) -> None:
+        context = get_context("spawn")
+        self.pipe, theirs = context.Pipe()
+        self.process = context.Process(target=_work, args=(theirs, tasks), daemon=True)
+        self.process.start()
+        theirs.close()
 
-    def count_one(self) -> None:
-        with self.made.get_lock():
-            self.made.value += 1
-        if self.stop.is_set():
-            raise _StopWorkingError
+    def heard(self, tell: Tell) -> bool:
+        """Pass on what the worker tells; return whether it is still at work. Raises what it raised."""
+        try:
+            while self.pipe.poll():
+                heard = self.pipe.recv()
+                if isinstance(heard, BaseException):
+                    raise heard
+                tell(*heard)
+        except (EOFError, ConnectionError):
+            self.process.join()
+        return self.process.is_alive()
 
-
-class _Shown:
-    """Progress that the user has been told."""
-
-    def __init__(self, board: _Board, progress: Progress) -> None:
-        self._board, self._progress, self._told = board, progress, 0
-
-    def update(self) -> None:
-        self.settle(self._board.made.value)
-
-    def settle(self, frames: int) -> None:
-        if frames != self._told:
-            self._progress(frames - self._told)
-            self._told = frames
+    def stop(self) -> None:
+        """Let the worker leave after its frame, without half files."""
+        with suppress(OSError):
+            self.pipe.send(None)
+        self.process.join()
 
 
 class _StopWorkingError(Exception):
     """The parent wants no more."""
 
 
-_board: _Board | None = None
+_stopping = threading.Event()
+"""Set in a worker that is to leave."""
 
 
-def _begin(board: _Board) -> None:
-    """Set up a new worker: Ctrl-C is the parent's to handle, and a worker without parent ends."""
-    global _board
-    _board = board
+def _work(pipe: Any, tasks: Sequence[SegmentTask]) -> None:
+    """Work in a process of its own: Ctrl-C is the parent's to handle, and a worker without parent ends at once."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=_listen, args=(pipe,), daemon=True).start()
+    if tasks[0].threads == 1:
+        import cv2
+
+        cv2.setNumThreads(1)
+
+    def tell(what: str, number: int) -> None:
+        pipe.send((what, number))
+        if _stopping.is_set():
+            raise _StopWorkingError
+
+    try:
+        work_off(tasks, tell)
+    except _StopWorkingError:
+        pass
+    except Exception as error:  # told by the parent
+        pipe.send(error)
 
 
-def _end_with_parent() -> None:
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        _exit(1)
-
-
-def _make_here(task: SegmentTask) -> int:
-    return render_segment(task, _board.count_one if _board is not None else lambda: None)
+def _listen(pipe: Any) -> None:
+    try:
+        pipe.recv()
+    except (EOFError, OSError):
+        os._exit(1)
+    _stopping.set()
 
 
 class DaskExecutor:

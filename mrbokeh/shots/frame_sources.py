@@ -23,8 +23,9 @@ from mrbokeh.tracking.camera_track.focus_pull import FocusPull, parse_focus_keys
 from mrbokeh.tracking.camera_track.formats import format_of_file, read_track
 from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame, TrackOptions
 from mrbokeh.video.clip import VideoInfo
-from mrbokeh.video.image_sequence import is_pattern, numbered
+from mrbokeh.video.image_sequence import STOP, held_number, is_pattern, numbered, numbers_of
 from mrbokeh.video.picture_source import PictureSource, open_source
+from mrbokeh.video.proxy_source import ProxySource
 
 Plane = Float32[np.ndarray, "height width"]
 _WARM_UP = 48
@@ -132,7 +133,7 @@ class _Depth:
         self._path, self._read = described.path, Kept(described.read)
 
     def depth_m_at(self, moment: Moment) -> Plane:
-        return _of_size(self._read(str(numbered(self._path, moment.number))), moment, self._path)
+        return _of_size(self._read(str(_file_at(self._path, moment.number))), moment, self._path)
 
 
 @dataclass(frozen=True)
@@ -154,7 +155,13 @@ class _Mattes:
         self._path, self._read = path, Kept(lambda name: read_matte(Path(name)))
 
     def near_alpha_at(self, moment: Moment) -> Plane:
-        return _of_size(self._read(str(numbered(self._path, moment.number))), moment, self._path)
+        return _of_size(self._read(str(_file_at(self._path, moment.number))), moment, self._path)
+
+
+def _file_at(path: Path, number: int) -> Path:
+    """Return a frame's file; where it is missing, which was allowed before the work then, the one before."""
+    there = numbered(path, number)
+    return there if there.exists() or not is_pattern(path) else numbered(path, held_number(numbers_of(path), number))
 
 
 class _SteadyDepth:
@@ -166,7 +173,7 @@ class _SteadyDepth:
     def depth_m_at(self, moment: Moment) -> Plane:
         if self._plane is None or self._next != moment.number + 1:
             for number in self._still_to_go(moment.number):
-                self._plane = self._filter.filtered(self._described.read(numbered(self._described.path, number)))
+                self._plane = self._filter.filtered(self._described.read(_file_at(self._described.path, number)))
             self._next = moment.number + 1
         assert self._plane is not None
         return _of_size(self._plane, moment, self._described.path)
@@ -210,6 +217,8 @@ class ClipLook:
     start: int
     first_number: int = 0
     space: NamedSpace | None = None
+    missing: str = STOP
+    proxy: Fraction = Fraction(1)
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -217,7 +226,7 @@ class ClipLook:
         return tuple(path for path in (Path(text) for text in texts if text) if path.is_file())
 
     def opened(self, threads: int) -> Finisher:
-        source = open_source(self.clip, self.rate, self.space)
+        source = ProxySource.of(open_source(self.clip, self.rate, self.space, self.missing), self.proxy)
         stop = min(self.start + 2, len(source.times_s))
         first, *rest = (frame.rgb for frame in source.frames(self.start, stop, threads))
         finishing = finishing_of(self.options, first, source.file_of(self.start), rest[0] if rest else None)

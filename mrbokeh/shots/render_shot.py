@@ -13,10 +13,12 @@ at every segment.
 """
 
 import hashlib
+import secrets
 import shutil
+import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, fields, is_dataclass, replace
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field, fields, is_dataclass, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -25,22 +27,30 @@ import numpy as np
 
 from mrbokeh import __version__
 from mrbokeh.images.alpha_io import HOLDING_ALPHA, exr_part, in_named_space, write_finished
+from mrbokeh.images.carried_exr import CarriedExr
 from mrbokeh.images.color_management import NamedSpace
-from mrbokeh.images.exr_io import write_exr
-from mrbokeh.images.image_io import INTEGER_SUFFIXES, write_layer
+from mrbokeh.images.exr_io import ExrPart, header_of, write_exr
+from mrbokeh.images.image_io import INTEGER_SUFFIXES
 from mrbokeh.images.layer import Layer
-from mrbokeh.shots.executors import Executor, Progress, SegmentTask
+from mrbokeh.shots.claims import claimed
+from mrbokeh.shots.executors import CLAIM, Executor, Progress, SegmentTask
+from mrbokeh.shots.inputs import Kept
+from mrbokeh.shots.proxies import picked
 from mrbokeh.shots.shot import MANIFEST, PartSink, Picture, Rgba, Segment, Shot
+from mrbokeh.stacks.exr_layers.cryptomatte import cryptomatte_among
+from mrbokeh.stacks.exr_layers.sequence import ExrSequence
 from mrbokeh.system.atomic_files import read_json, refuse_existing, write_json
 from mrbokeh.system.channel import channel
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.encodings import encoding_for, encoding_name, with_alpha
-from mrbokeh.video.image_sequence import NumberedFiles, is_pattern, numbered
-from mrbokeh.video.picture_source import written_frames
-from mrbokeh.video.writer import PacketWriter, VideoWriter, packets_of
+from mrbokeh.video.image_sequence import NumberedFiles, is_pattern, numbered, written_frames
+from mrbokeh.video.picture_source import PictureSource
+from mrbokeh.video.proxy_source import ProxySource
+from mrbokeh.video.writer import PacketWriter, StreamFacts, VideoWriter, packets_of
 
 _EXR = ".exr"
 _THREADS = 1
+_POLL_S = 0.25
 
 
 def in_space(picture: Picture, space: NamedSpace | None) -> Picture:
@@ -58,18 +68,26 @@ def in_space(picture: Picture, space: NamedSpace | None) -> Picture:
 class SequenceTarget:
     """A Target. first_number: of the clip's frame 0, whether it is taken or not. layers: what is written is layers.
 
-    space: what the numbers of the pictures are; None is linear Rec.709 in EXR and sRGB in integers.
+    space: what the numbers of the pictures are; None is linear Rec.709 in EXR and sRGB in integers. renders: files, numbered or not, whose
+    Cryptomatte is written into EXR.
     """
 
     path: Path
     first_number: int = 0
     layers: bool = False
     space: NamedSpace | None = None
+    renders: tuple[Path, ...] = ()
 
     @property
     def settings(self) -> dict[str, str]:
         numbers = f"{self.first_number} layers={self.layers}"
         return {"container": self.path.name, "numbers": numbers, "output space": str(self.space or "")}
+
+    def parts_name(self, taken: Sequence[int]) -> str:
+        """Name the folder by the frames too, so that many may write parts of one sequence at once."""
+        first, last = self.first_number + taken[0], self.first_number + taken[-1]
+        some = "" if last - first + 1 == len(taken) else f".{len(taken)}"
+        return f"{self.path.name}.{first}-{last}{some}.parts"
 
     @property
     def lacks_alpha(self) -> str | None:
@@ -94,8 +112,8 @@ class SequenceTarget:
         return folder / f"{segment.number:05d}.json"
 
     @contextmanager
-    def writing(self, shot: Shot, segment: Segment, folder: Path) -> Iterator[PartSink]:  # noqa: ARG002
-        yield _SequenceSink(self)
+    def writing(self, shot: Shot, segment: Segment, folder: Path) -> Iterator[PartSink]:
+        yield _SequenceSink(self, shot.source)
         write_json(self.part(folder, segment), {"frames": list(segment.taken)})
 
     def join(self, shot: Shot, folder: Path) -> str:  # noqa: ARG002
@@ -106,22 +124,48 @@ class SequenceTarget:
         """Return the file of a frame of the clip."""
         return numbered(self.path, self.first_number + index)
 
+    def renders_of(self, index: int) -> list[Path]:
+        """Return the renders of a frame, those that are there."""
+        sequences = [ExrSequence.of(path, whole=False) for path in self.renders]
+        number = self.first_number + index
+        return [each.path_of(number) for each in sequences if each.is_still or number in each.paths]
+
+
+def _cryptomatte_of(width_px: int, height_px: int, *names: str) -> ExrPart | None:
+    found = cryptomatte_among([Path(name) for name in names])
+    if found is None:
+        return None
+    return replace(found, channels={name: picked(plane, (width_px, height_px)) for name, plane in found.channels.items()})
+
 
 @dataclass(frozen=True)
 class _SequenceSink:
     target: SequenceTarget
+    source: PictureSource
+    objects: Kept[..., ExrPart | None] = field(default_factory=lambda: Kept(_cryptomatte_of))
 
     def write(self, picture: Picture, index: int, time_s: float) -> None:  # noqa: ARG002
         path, space = self.target.file(index), self.target.space
-        if isinstance(picture, Rgba):
-            write_finished(path, picture.rgb, picture.alpha, space)
-        elif not isinstance(picture, Layer):
-            write_finished(path, picture, None, space)
-        elif space is None:
-            write_layer(path, picture)
-        else:
-            part = exr_part(in_named_space(picture.rgb, picture.alpha, space), picture.alpha, space)
-            write_exr(path, replace(part, channels={**part.channels, "Z": picture.depth_m}))
+        rgb, alpha = (picture.rgb, picture.alpha) if isinstance(picture, (Rgba, Layer)) else (picture, None)
+        if path.suffix.lower() != _EXR:
+            write_finished(path, rgb, alpha, space)
+            return
+        part = exr_part(in_named_space(rgb, alpha, space), alpha, space)
+        if isinstance(picture, Layer):
+            part = replace(part, channels={**part.channels, "Z": picture.depth_m})
+        if (objects := self.objects(rgb.shape[1], rgb.shape[0], *map(str, self.target.renders_of(index)))) is not None:
+            part = replace(part, channels={**part.channels, **objects.channels}, attributes={**part.attributes, **objects.attributes})
+        write_exr(path, self._carried(index).onto(part, space))
+
+    def _carried(self, index: int) -> CarriedExr:
+        """Return what the plate has beside this frame, with its rate and timecode; layers alone and proxies have no overscan."""
+        carried, timecode = CarriedExr.of(self.source.file_of(index), self.source.space), self.source.timecode_of(index)
+        stated = {"framesPerSecond": self.source.info.frame_rate, "timeCode": None if timecode is None else timecode.to_exr()}
+        attributes = {name: value for name, value in stated.items() if value is not None} | dict(carried.attributes)
+        if isinstance(self.source, ProxySource):
+            return CarriedExr(attributes)
+        around = replace(carried, margins_px=(0, 0, 0, 0), rgb=None, alpha=None) if self.target.layers else carried
+        return replace(around, attributes=attributes)
 
 
 @dataclass(frozen=True)
@@ -146,6 +190,9 @@ class VideoTarget:
             "output space": str(self.space or ""),
             "even rate": str(self.even_rate or ""),
         }
+
+    def parts_name(self, taken: Sequence[int]) -> str:  # noqa: ARG002
+        return f"{self.path.name}.parts"
 
     @property
     def lacks_alpha(self) -> str | None:
@@ -191,6 +238,7 @@ class VideoTarget:
             audio_start_s=shot.begin_s,
             reordered=reordered,
             as_codes=self.space is not None,
+            facts=_facts(shot, self.even_rate),
         )
         with writer:
             for segment in shot.segments:
@@ -215,6 +263,15 @@ class VideoTarget:
         if self.even_rate is not None:
             return info.width_px, info.height_px, self.even_rate, 1 / (self.even_rate * 1000)
         return info.width_px, info.height_px, info.frame_rate, info.time_base
+
+
+def _facts(shot: Shot, even_rate: Fraction | None) -> StreamFacts:
+    """Return timecode and pixel aspect of the first frame taken; at another rate than the plate's a timecode would count wrongly."""
+    first = shot.taken[0]
+    path = shot.source.file_of(first)
+    aspect = Fraction(header_of(path).get("pixelAspectRatio", 1.0)) if path is not None and path.suffix.lower() == _EXR else Fraction(1)
+    same_rate = even_rate in (None, shot.source.info.frame_rate)
+    return StreamFacts(shot.source.timecode_of(first) if same_rate else None, aspect.limit_denominator(1000))
 
 
 def held_pictures(times_s: Sequence[float], rate: Fraction) -> list[int]:
@@ -253,15 +310,20 @@ def render_shot(shot: Shot, executor: Executor, *, overwrite: bool = False, prog
     missing = folder.missing
     progress(len(shot.taken) - sum(len(segment.taken) for segment in missing))
     executor.run([SegmentTask(shot, segment, folder.path, executor.threads) for segment in missing], progress)
-    note = shot.target.join(shot, folder.path)
-    folder.remove()
-    return note
+    while folder.is_there:
+        with claimed(folder.path / f"join{CLAIM}") as is_ours:
+            if is_ours:
+                note = shot.target.join(shot, folder.path)
+                folder.remove()
+                return note
+        time.sleep(_POLL_S)
+    return "joined by another process"
 
 
 @dataclass(frozen=True, eq=False)
 class PartsFolder:
-    """Folder OUT.parts of finished segments, from the first segment until the result is whole; its manifest says what they were made
-    with.
+    """Folder OUT.parts of finished segments, of a sequence one for each range of frames, until the result is whole; its manifest says what
+    they were made with.
     """
 
     path: Path
@@ -295,10 +357,18 @@ class PartsFolder:
     @property
     def holds_parts(self) -> bool:
         """Whether finished parts are there: half files and signs of workers have other names."""
-        return any(each.stem.isdigit() for each in self.path.iterdir())
+        return any(each.stem.isdigit() and each.suffix != CLAIM for each in self.path.iterdir())
+
+    @property
+    def is_there(self) -> bool:
+        return (self.path / MANIFEST).is_file()
 
     def remove(self) -> None:
-        shutil.rmtree(self.path, ignore_errors=True)
+        """Remove the folder, for others at one blow: none may take a part of it for a missing one."""
+        aside = self.path.with_name(f".{self.path.name}.{secrets.token_hex(4)}")
+        with suppress(OSError):
+            self.path.rename(aside)
+        shutil.rmtree(aside, ignore_errors=True)
 
 
 def settings_of(shot: Shot) -> dict[str, str]:
@@ -312,6 +382,7 @@ def settings_of(shot: Shot) -> dict[str, str]:
         "clip": _stamps([shot.source.path]),
         "input space": "" if shot.source.space is None else f"{shot.source.space} {_stamps(shot.source.space.files)}",
         "frames": f"{written_frames(shot.taken)} by {shot.segment_frames} at {shot.source.info.frame_rate}",
+        "size": f"{shot.source.info.width_px}x{shot.source.info.height_px}",
         **of_recipe,
         "files": _stamps(recipe.files),
         **shot.target.settings,

@@ -97,7 +97,7 @@ class Shot:
     @property
     def parts_path(self) -> Path:
         """Folder in which finished segments wait for the others."""
-        return self.target.path.with_name(self.target.path.name + ".parts")
+        return self.target.path.with_name(self.target.parts_name(self.taken))
 
     @property
     def was_begun(self) -> bool:
@@ -137,6 +137,10 @@ class Target(Protocol):
     @property
     def settings(self) -> dict[str, str]:
         """Settings that the parts depend on beside the pictures."""
+        ...
+
+    def parts_name(self, taken: Sequence[int]) -> str:
+        """The name of the folder of the parts, beside the result. taken: the frames of the shot."""
         ...
 
     @property

@@ -16,6 +16,7 @@ from jaxtyping import Float32, UInt8
 from mrbokeh.system.errors import InputError, require_file
 from mrbokeh.video.color import VideoColor, color_of
 from mrbokeh.video.frames import display_bgr, has_alpha, linear_rgb, stored_alpha
+from mrbokeh.video.timecode import Timecode
 
 _LONGEST_LAST_FRAME_S = 1.0
 """Recordings of a screen show their last frame for long."""
@@ -149,7 +150,7 @@ class VideoInfo:
     """Facts of a video's header and first frame. Sizes are those of the upright picture; frame_count is None if unknown.
 
     rotation_deg: counter-clockwise, that brings the stored picture upright. has_alpha: whether frames hold coverage, even if all is
-    opaque.
+    opaque. timecode: of the first frame.
     """
 
     width_px: int
@@ -160,6 +161,7 @@ class VideoInfo:
     color: VideoColor
     rotation_deg: int
     has_alpha: bool = False
+    timecode: Timecode | None = None
 
     @property
     def quarter_turns(self) -> int:
@@ -185,7 +187,15 @@ def probe(path: Path, *, as_codes: bool = False) -> VideoInfo:
             color=color,
             rotation_deg=turned,
             has_alpha=has_alpha(frame),
+            timecode=_timecode(container, frame_rate(stream)),
         )
+
+
+def _timecode(container: Any, rate: Fraction) -> Timecode | None:
+    """Return the timecode that a video states, in whichever of its streams."""
+    stated = [container.metadata, *(stream.metadata for stream in container.streams)]
+    texts = [text for each in stated for name, text in each.items() if name.lower() == "timecode"]
+    return Timecode.parsed(texts[0], rate) if texts else None
 
 
 def read_frames(path: Path, start: int = 0, stop: int | None = None) -> Iterator[Frame]:

@@ -16,7 +16,8 @@ from jaxtyping import Bool, Float64, Int64
 from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.system.errors import InputError
 from mrbokeh.video.clip import Frame, VideoInfo, chroma_placement, frame_rate, opened, probe, told_as_damage, upright_alpha, upright_frame
-from mrbokeh.video.image_sequence import ImageSequence, is_pattern, pattern_of_folder
+from mrbokeh.video.image_sequence import STOP, ImageSequence, is_pattern, pattern_of_folder
+from mrbokeh.video.timecode import Timecode
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,6 +112,9 @@ class VideoSource:
     def file_of(self, index: int) -> Path | None:  # noqa: ARG002
         return None
 
+    def timecode_of(self, index: int) -> Timecode | None:
+        return None if self.info.timecode is None else self.info.timecode.later(index)
+
     def frames(self, start: int, stop: int, threads: int = 0) -> Iterator[Frame]:
         with opened(self.path, threads) as (container, stream), told_as_damage(self.path):
             placed, expected = chroma_placement(stream), start
@@ -183,6 +187,10 @@ class PictureSource(Protocol):
         """The picture that frame is stored in, whose metadata may be asked; None of a video."""
         ...
 
+    def timecode_of(self, index: int) -> Timecode | None:
+        """The timecode of a frame, if the file has one."""
+        ...
+
     @property
     def space(self) -> NamedSpace | None:
         """The colour space of its numbers, where the user names it; None is what the files say themselves."""
@@ -196,16 +204,15 @@ class PictureSource(Protocol):
         ...
 
 
-def open_source(clip: Path, rate: str | None = None, space: NamedSpace | None = None) -> PictureSource:
+def open_source(clip: Path, rate: str | None = None, space: NamedSpace | None = None, missing: str = STOP) -> PictureSource:
     """Open a video, or numbered pictures (a pattern or their folder) with a rate in frames per second ("25", "23.976" or "24000/1001").
 
-    Paths become absolute. space: meaning of the clip's numbers, in place of what its files say.
+    Paths become absolute. rate: None is that of an EXR's header. space: meaning of the clip's numbers, in place of what its files say.
+    missing: of numbered pictures, stop, hold or black.
     """
     clip = pattern_of_folder(clip) if clip.is_dir() else clip
     if is_pattern(clip):
-        if rate is None:
-            raise InputError(f"{clip}: numbered pictures have no rate of their own: give --rate, such as 25 or 24000/1001")
-        return ImageSequence.open(clip.resolve(), parse_rate(rate), space)
+        return ImageSequence.open(clip.resolve(), None if rate is None else parse_rate(rate), space, missing)
     if rate is not None:
         raise InputError(f"--rate is for numbered pictures (frames.%04d.exr), but {clip} has its own times: leave it out")
     if space is not None and space.is_linear:
@@ -253,13 +260,6 @@ def numbers_taken(text: str | None, numbers: range, clip: Path) -> Sequence[int]
     if any(each[0] < numbers[0] or each[-1] > numbers[-1] for each in ranges):
         raise InputError(f"--frames {text}: {clip} has the frames {numbers[0]}-{numbers[-1]}: take some of those")
     return ranges[0] if len(ranges) == 1 else sorted({number for each in ranges for number in each})
-
-
-def written_frames(numbers: Sequence[int]) -> str:
-    """Return frame numbers as --frames takes them."""
-    begins = [each for place, each in enumerate(numbers) if place == 0 or each - numbers[place - 1] > 1]
-    ends = [each for place, each in enumerate(numbers) if place + 1 == len(numbers) or numbers[place + 1] - each > 1]
-    return ",".join(str(begin) if begin == end else f"{begin}-{end}" for begin, end in zip(begins, ends, strict=True))
 
 
 def parse_rate(text: str) -> Fraction:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
 from types import TracebackType
@@ -16,9 +17,18 @@ from mrbokeh.video.audio import CarriedAudio
 from mrbokeh.video.color import BT709, BT709_RGB, UNNAMED, UNNAMED_RGB, VideoColor
 from mrbokeh.video.encodings import Encoding, encoding_for
 from mrbokeh.video.frames import encoded_frame
+from mrbokeh.video.timecode import Timecode
 
 _REORDERED = 16
 """How many places a packet comes before its turn at most, by the standards of H.264 and H.265."""
+
+
+@dataclass(frozen=True)
+class StreamFacts:
+    """Facts of a video beside its pictures. timecode: of the first. pixel_aspect: width of a pixel over its height."""
+
+    timecode: Timecode | None = None
+    pixel_aspect: Fraction = Fraction(1)
 
 
 class VideoWriter:
@@ -30,7 +40,7 @@ class VideoWriter:
     beyond what the codes can hold are clipped: the limited range of h264, prores and dnxhr goes from -0.06 to 1.08, ffv1 from 0 to 1.
     audio_from: a video whose first audio stream is carried over, from audio_start_s on; `audio_note` says what became of it.
     threads: of the encoder, 0 for all cores; H.264 comes out a little different with another number.
-    as_codes: pictures are code values already (0 black, 1 white), of a colour space for which video has no tags.
+    as_codes: pictures are code values already (0 black, 1 white), of a colour space for which video has no tags. facts: written along.
     """
 
     def __init__(
@@ -46,6 +56,7 @@ class VideoWriter:
         audio_start_s: float = 0.0,
         threads: int = 0,
         as_codes: bool = False,
+        facts: StreamFacts | None = None,
     ) -> None:
         self.path, self.encoding, self.suffix = Path(path), encoding_for(path, encoding), Path(path).suffix.lower()
         self.size_px, self.frame_rate = (width_px, height_px), frame_rate
@@ -54,6 +65,7 @@ class VideoWriter:
         self.time_base = 1 / frame_rate if even else time_base or 1 / (frame_rate * 1000)
         self.color = _color(self.encoding, as_codes)
         self.audio_note = "no audio"
+        self._facts = facts or StreamFacts()
         self._audio_from, self._audio_start_s, self._threads = audio_from, audio_start_s, threads
         self._last_tick: int | None = None
         self.frame_count = 0
@@ -136,6 +148,9 @@ class VideoWriter:
         context.thread_type, context.thread_count = "AUTO", self._threads
         context.colorspace, context.color_range = self.color.matrix, self.color.code_range
         context.color_trc, context.color_primaries = self.color.transfer, self.color.primaries
+        if self._facts.timecode is not None:
+            stream.metadata["timecode"] = str(self._facts.timecode)
+        context.sample_aspect_ratio = self._facts.pixel_aspect
         if self.encoding.tag and self.suffix in (".mov", ".mp4"):
             context.codec_tag = self.encoding.tag
         return stream

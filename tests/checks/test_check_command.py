@@ -270,6 +270,12 @@ def test_layers_may_come_one_for_each_picture(tmp_path: Path) -> None:
     write_layer(tmp_path / "virtual" / "v.1.exr", nothing, half=False)
     found = report_of(out, plate, 1, "--virtual", tmp_path / "virtual")
     assert [(each["check"], each["where"]) for each in found["findings"]] == [("leak", "shot.0002.exr")]
+    # By number, as `video --virtual-only` names them.
+    named = [(tmp_path / "virtual" / f"v.{index}.exr").replace(tmp_path / f"layer.{1 + index:04d}.exr") for index in range(3)]
+    found = report_of(out, plate, 1, "--virtual", tmp_path / "layer.%04d.exr")
+    assert [(each["check"], each["where"]) for each in found["findings"]] == [("leak", "shot.0002.exr")]
+    for index in range(3):
+        named[index].replace(tmp_path / "virtual" / f"v.{index}.exr")
     (tmp_path / "virtual" / "v.2.exr").unlink()
     refused("one for each", run, out, "--against", plate, "--virtual", tmp_path / "virtual", expected=2)
 

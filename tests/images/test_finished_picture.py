@@ -1,5 +1,6 @@
 """Finished pictures: alpha of the plate carried through `mrbokeh composite`, and colour spaces stated in EXR headers."""
 
+from fractions import Fraction
 from pathlib import Path
 
 import cv2
@@ -18,6 +19,7 @@ from mrbokeh.images.exr_io import (
     P3_D65,
     REC709,
     ExrPart,
+    in_rec709,
     known_primaries,
     read_exr,
     rec709_from_chromaticities,
@@ -124,14 +126,73 @@ def test_coverage_adds_up() -> None:
     [("ACEScg", AP1), ("ACES2065-1", AP0), ("Linear Rec.2020", BT2020), ("Linear P3-D65", P3_D65), ("Linear Rec.709 (sRGB)", REC709)],
 )
 def test_the_header_states_the_primaries_of_the_space(files: Path, name: str, primaries: tuple[float, ...]) -> None:
-    """By `mrbokeh composite`: read as any EXR it is the same light again."""
+    """By `mrbokeh composite`: read as any EXR it is the same light again, layers too; depth and mattes are the same numbers."""
     pytest.importorskip("PyOpenColorIO")
     put_in(files, "plate.exr", "plain.exr")
     put_in(files, "plate.exr", "out.exr", "--output-space", name)
     (part,) = read_exr(files / "out.exr")
     assert part.attributes["chromaticities"] == pytest.approx(primaries, abs=1e-6)
-    assert sorted(part.channels) == ["A", "B", "G", "R"]
+    assert part.attributes["oiio:ColorSpace"] == name and part.attributes["colorInteropID"].startswith("lin_")
     np.testing.assert_allclose(read_image(files / "out.exr"), read_image(files / "plain.exr"), atol=2e-3)
+    (plain,) = read_exr(files / "plain.exr")
+    assert plain.attributes["chromaticities"] == pytest.approx(REC709, abs=1e-6) and plain.attributes["oiio:ColorSpace"] == "lin_rec709"
+    assert part.channels.keys() == plain.channels.keys()
+    for data in ("A", "Z", "coc.px", "matte.A", "virtual.A", "virtual.Z", "sharp.Z"):
+        np.testing.assert_array_equal(part.channels[data], plain.channels[data])
+    for layer in ("virtual", "sharp"):
+        colours = [each.stacked([f"{layer}.{channel}" for channel in "RGB"]) for each in (part, plain)]
+        np.testing.assert_allclose(in_rec709(colours[0], primaries, "out.exr"), colours[1], atol=2e-3)
+
+
+def overscanned(path: Path, margins: tuple[int, int, int, int], **attributes: object) -> ExrPart:
+    """A plate of random colour whose display window begins at (5, -3), with so many pixels around it: left, top, right, bottom."""
+    left, top, right, bottom = margins
+    height, width = SIZE[0] + top + bottom, SIZE[1] + left + right
+    rgb = np.random.default_rng(2).random((3, height, width), np.float32)
+    display = (np.array([5, -3], np.int32), np.array([5 + SIZE[1] - 1, -3 + SIZE[0] - 1], np.int32))
+    data = (display[0] - np.int32([left, top]), display[1] + np.int32([right, bottom]))
+    part = ExrPart(dict(zip("RGB", rgb, strict=True)), attributes={"displayWindow": display, "dataWindow": data, **attributes})
+    write_exr(path, part)
+    return part
+
+
+def test_windows_overscan_and_metadata_of_a_plate_stay(files: Path) -> None:
+    """Where nothing virtual is, every pixel of the data window is the plate's; layers are empty around the display window."""
+    import OpenEXR
+
+    code = OpenEXR.TimeCode(10, 20, 30, 12, True, *[False] * 5, *[0] * 8)
+    stated = {"timeCode": code, "framesPerSecond": Fraction(24000, 1001), "pixelAspectRatio": 2.0, "reel": "A001"}
+    plate = overscanned(files / "wide.exr", (6, 4, 2, 3), acesImageContainerFlag=1, **stated)
+    assert "has overscan (6, 4, 2, 3 px left, top, right, bottom)" in put_in(files, "wide.exr", "out.exr")
+    with OpenEXR.File(str(files / "out.exr"), separate_channels=True) as file:
+        header, red = dict(file.parts[0].header), file.parts[0].channels["R"].pixels
+        empty = file.parts[0].channels["sharp.A"].pixels.copy()
+    for window in ("displayWindow", "dataWindow"):
+        np.testing.assert_array_equal(header[window], plate.attributes[window])
+    assert (header["framesPerSecond"], header["pixelAspectRatio"], header["reel"]) == (Fraction(24000, 1001), 2.0, "A001")
+    assert str(header["timeCode"]) == str(code) and "acesImageContainerFlag" not in header
+    below = np.zeros(red.shape, bool)
+    below[4 + 14 :] = True
+    below[:, :6] = below[:, 6 + SIZE[1] :] = below[:4] = True
+    np.testing.assert_allclose(red[below], plate.channels["R"][below], atol=2**-11)
+    np.testing.assert_allclose(red[4:12, 6 : 6 + SIZE[1]], 0.8, atol=2e-3)  # the card
+    empty[4 : 4 + SIZE[0], 6 : 6 + SIZE[1]] = 0
+    assert not empty.any()
+    # A data window within its display window: the picture is black around it, and the result as large as the display window.
+    overscanned(files / "small.exr", (-6, -4, -2, -3))
+    put_in(files, "small.exr", "small_out.exr")
+    (part,) = read_exr(files / "small_out.exr", overscan=True)
+    assert part.origin_px == (5, -3) and part.margins_px == (0, 0, 0, 0) and not part.channels["R"][-3:].any()
+
+
+def test_the_first_of_several_views_is_taken_and_said(files: Path) -> None:
+    parts = [
+        ExrPart(dict.fromkeys("RGB", np.full(SIZE, light, np.float32)), side, {"view": side})
+        for side, light in (("left", 0.3), ("right", 0.6))
+    ]
+    write_exr(files / "stereo.exr", parts)
+    assert "holds the views left, right: left is taken, and written alone" in put_in(files, "stereo.exr", "out.exr")
+    assert read_image(files / "out.exr")[20, 5] == pytest.approx([0.3] * 3, abs=1e-3)
 
 
 def test_unknown_primaries_and_curves_are_not_stated(tmp_path: Path) -> None:

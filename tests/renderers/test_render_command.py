@@ -9,6 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mrbokeh.cli import app as everything
+from mrbokeh.commands.composite import app as composite
 from mrbokeh.commands.render import app
 from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
 from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer
@@ -17,6 +18,7 @@ from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
+from tests.support.command_line import printed_by
 
 WIDTH, HEIGHT = 48, 32
 LENS = {"focal_length_mm": 50, "f_number": 1.8, "focus_distance_m": 2.0, "sensor_width_mm": 12}
@@ -250,3 +252,13 @@ def test_half_a_picture_alpha_in_a_png_and_existing_files_are_refused(folder: Pa
         with pytest.raises(InputError, match=said):
             run(folder, *words, out=out)
     assert (folder / "out.exr").read_text() == "mine"
+
+
+def test_a_layer_without_depth_is_refused_as_composite_does(tmp_path: Path) -> None:
+    """Its blur would be that of infinity, which nobody asked for."""
+    write_exr(tmp_path / "flat.exr", ExrPart(dict.fromkeys("RGBA", np.full((8, 8), 0.5, np.float32))))
+    write_exr(tmp_path / "plate.exr", ExrPart(dict.fromkeys("RGB", np.zeros((8, 8), np.float32))))
+    layer = ("--layer", tmp_path / "flat.exr", "--focal-length", 50, "--f-number", 2, "--out", tmp_path / "out.exr")
+    for command, words in ((app, ()), (composite, (tmp_path / "plate.exr", "--focus", "1", "--sensor-width", "36"))):
+        with pytest.raises(InputError, match=r"flat\.exr: expected depth in a channel Z, .* but it has A, B, G, R: render with depth"):
+            printed_by(command, *words, *layer)

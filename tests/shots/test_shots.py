@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from fractions import Fraction
@@ -18,6 +19,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.images.image_io import read_image, read_layer, write_image
+from mrbokeh.shots.claims import claimed
 from mrbokeh.shots.executors import Executor, ProcessExecutor, SegmentTask, SerialExecutor, render_segment
 from mrbokeh.shots.render_shot import PartsFolder, SequenceTarget, VideoTarget, render_shot
 from mrbokeh.shots.shot import FrameMaker, MakerRecipe, Shot, Target
@@ -335,6 +337,66 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path) -> None:
     assert told[0] == 2 * PER_SEGMENT and sum(told) == COUNT, "what was finished is not made again"
     assert (tmp_path / "out.mkv").read_bytes() == (tmp_path / "whole.mkv").read_bytes()
     assert not shot.parts_path.exists()
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
+def test_two_runs_of_one_command_share_the_segments(tmp_path: Path) -> None:
+    """As two machines on one disk: each makes what the other has not claimed, one joins, and the file is that of one run, though one of the
+    first run's workers dies of signal 9 in the middle of a segment, which whoever is free takes over.
+    """
+    clip = clip_of_blobs(tmp_path)
+    render_shot(shot_of(clip, VideoTarget(tmp_path / "whole.mkv")), SerialExecutor())
+    (tmp_path / "pids").mkdir()
+    (tmp_path / "program.py").write_text(PROGRAM)
+    shot, root = held_shot(tmp_path), Path(__file__).parents[2]
+    command, environment = [sys.executable, str(tmp_path / "program.py"), str(tmp_path)], {**os.environ, "PYTHONPATH": str(root)}
+    runs = [subprocess.Popen(command, cwd=root, env=environment) for _ in range(2)]
+    # Four workers: two make the first two segments, then three hold one each, before the gate.
+    parts = [shot.target.part(shot.parts_path, segment) for segment in shot.segments]
+    wait_for(lambda: len(list(shot.parts_path.glob("0*.claim"))) == 3 and all(part.exists() for part in parts[:2]))
+    claims = {int(each.read_text().split()[1]): each.name for each in shot.parts_path.glob("*.claim")}
+    assert sorted(claims.values()) == ["00002.claim", "00003.claim", "00004.claim"], "nobody works on what another has"
+    os.kill(next(iter(claims)), signal.SIGKILL)
+    (tmp_path / "gate").touch()
+    assert [run.wait(timeout=60) for run in runs] == [0, 0]
+    assert (tmp_path / "out.mkv").read_bytes() == (tmp_path / "whole.mkv").read_bytes()
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["clip.mkv", "gate", "out.mkv", "pids", "program.py", "whole.mkv"]
+
+
+def test_claims_are_taken_over_only_from_the_dead(tmp_path: Path) -> None:
+    """A living owner keeps its claim as long as it is touched; one of a dead process is free at once, one untouched for a minute then."""
+    claim = tmp_path / "00000.claim"
+    with claimed(claim) as mine:
+        with claimed(claim) as other:
+            assert (mine, other) == (True, False)
+        machine = claim.read_text().split()[0]
+    assert not claim.exists()
+    dead = subprocess.Popen([sys.executable, "-c", ""])
+    dead.wait()
+    for owner, age_s, is_free in (
+        (f"{machine} {dead.pid} a", 0, True), (f"{machine} {os.getpid()} a", 0, False), (f"{machine} {os.getpid()} a", 90, True),
+        (f"elsewhere {dead.pid} a", 30, False), (f"elsewhere {os.getpid()} a", 90, True), ("", 30, False), ("", 90, True),
+    ):  # fmt: skip
+        claim.write_text(owner)
+        touched_s = time.time() - age_s
+        os.utime(claim, (touched_s, touched_s))
+        with claimed(claim) as taken:
+            assert taken == is_free
+        assert claim.exists() != is_free
+    assert {each.name for each in tmp_path.iterdir()} <= {"00000.claim"}, "no signs are left"
+    with claimed(tmp_path / "gone" / "00000.claim") as taken:
+        assert not taken
+
+
+def test_ranges_of_a_sequence_are_written_side_by_side(tmp_path: Path) -> None:
+    """As a farm does it: the parts of each task have a folder of their own."""
+    clip, target = clip_of_blobs(tmp_path), SequenceTarget(tmp_path / "out.%04d.exr", 1001)
+    shots = [shot_of(clip, target, frames=frames) for frames in ((0, 10), (10, 23))]
+    assert [each.parts_path.name for each in shots] == ["out.%04d.exr.1001-1010.parts", "out.%04d.exr.1011-1023.parts"]
+    PartsFolder.opened(shots[0])
+    render_shot(shots[1], SerialExecutor())
+    render_shot(shots[0], SerialExecutor())
+    assert len(list(tmp_path.glob("out.*"))) == 23
 
 
 def alive(pid: int) -> bool:

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mrbokeh.images.exr_io import read_exr
+from mrbokeh.images.exr_io import REC709, read_exr
 from mrbokeh.images.image_io import read_depth, read_image
 from mrbokeh.images.layer import Layer
 from mrbokeh.stacks.exr_layers.composite_exr import CompositeLayers, write_composite_exr
@@ -41,7 +41,7 @@ def test_names_and_precision_are_those_that_other_programs_expect(tmp_path: Path
     assert float32 == {"Z", "coc.px", "virtual.Z", "shadow.Z"}
     for word in ("premultiplied", "metres along the optical axis", "not antialiased", "coc.px"):
         assert word in part.attributes["comments"]
-    assert "chromaticities" not in part.attributes
+    assert part.attributes["chromaticities"] == pytest.approx(REC709, abs=1e-6)
 
 
 @pytest.mark.parametrize("half", [True, False])

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mrbokeh.commands.composite import app as composite
+from mrbokeh.commands.render import app as blur
 from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
 from mrbokeh.images.layer import flatten
 from mrbokeh.optics.lens import Lens
@@ -14,6 +16,7 @@ from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.stacks.exr_layers.cryptomatte import ObjectSplit, cryptomattes, id_bits, murmur3_32
 from mrbokeh.stacks.exr_layers.render_channels import FlatRender, RenderChannels
 from mrbokeh.system.errors import InputError
+from tests.support.command_line import printed_by
 from tests.support.refusals import refused
 
 HEIGHT, WIDTH = 6, 10
@@ -127,6 +130,27 @@ def test_manifest_in_a_file_of_its_own(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.matte("renamed"), coverages()["near"])
     (tmp_path / "names.json").write_text("{")
     refused("manifest of the Cryptomatte CryptoObject cannot be read", cryptomattes, RenderChannels.read(tmp_path / "a.exr"))
+
+
+def test_mattes_of_layers_are_written_into_what_is_made_of_them(tmp_path: Path) -> None:
+    """By `composite` beside all layers, also in ACEScg, and by `render --alpha-out`: to the bit, so that names still select."""
+    (tmp_path / "names.json").write_text(json.dumps({each: f"{id_bits(each):08x}" for each in NAMES}))
+    entries = header(manifest="", manif_file="names.json")
+    write_exr(tmp_path / "cg.exr", ExrPart(beauty() | crypto_channels(), attributes=entries))
+    write_exr(tmp_path / "plate.exr", ExrPart(dict.fromkeys("RGB", np.zeros((HEIGHT, WIDTH), np.float32))))
+    layer, lens = ("--layer", tmp_path / "cg.exr"), ("--focal-length", 50, "--f-number", 2, "--focus", 1, "--sensor-width", 36)
+    (tmp_path / "out").mkdir()
+    made = [tmp_path / "out" / f"{name}.exr" for name in ("plain", "aces", "blurred")]
+    printed_by(composite, tmp_path / "plate.exr", *layer, *lens, "--out", made[0])
+    printed_by(composite, tmp_path / "plate.exr", *layer, *lens, "--output-space", "ACEScg", "--out", made[1])
+    printed_by(blur, *layer, *lens, "--alpha-out", "--out", made[2])
+    for path in made:
+        (found,) = cryptomattes(RenderChannels.read(path)).values()
+        assert found.names == sorted(NAMES)
+        for name, coverage in coverages().items():
+            np.testing.assert_array_equal(found.matte(name), coverage)
+    printed = printed_by(composite, tmp_path / "plate.exr", *layer, "--layer", tmp_path / "cg.exr", *lens, "--out", tmp_path / "two.exr")
+    assert "has a Cryptomatte of the same name" not in printed, "the same file twice has nothing to choose"
 
 
 def test_what_the_specification_does_not_know_is_refused(tmp_path: Path) -> None:

@@ -157,7 +157,7 @@ class Held(CompositeRecipe):
         make = maker.make
 
         def held(index, *frame):
-            assert index < 6 or executors._board.stop.wait(60)
+            assert index < 6 or executors._stopping.wait(60)
             return make(index, *frame)
 
         maker.make = held
@@ -247,7 +247,7 @@ def test_layers_and_depth_of_each_frame(clip: Path, tmp_path: Path) -> None:
         )
     run(clip, *options, "--depth", tmp_path / "depth.%04d.exr", "--mode", "front", "--out", tmp_path / "front.mkv", "--frames", "1007-1008")
     assert (next(read_frames(tmp_path / "front.mkv")).rgb != list(read_frames(clip))[6].rgb).any()
-    with pytest.raises(InputError, match="1001 to 1012"):
+    with pytest.raises(InputError, match=r"has the frames 1001-1012, none of those taken \(0-11\): say --first-number"):
         run(clip, "--lens", tmp_path / "lens.json", "--layer", tmp_path / "moving.%04d.exr", "--out", tmp_path / "no.mkv")
 
 

@@ -14,6 +14,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float32
 
+from mrbokeh.images.alpha_io import in_named_space, stated
+from mrbokeh.images.carried_exr import CarriedExr
+from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.layer import Layer
 from mrbokeh.system.atomic_files import atomic_path
@@ -51,7 +54,7 @@ def write_deep_exr(path: Path | str, layers: Sequence[Layer], *, half: bool = Tr
 
 
 COMMENTS = (
-    "Scene-linear; alpha premultiplied; unnamed R,G,B,A is the finished picture. Z and *.Z: metres along the optical axis, sharp, not "
+    "Alpha premultiplied; unnamed R,G,B,A is the finished picture. Z and *.Z: metres along the optical axis, sharp, not "
     "antialiased, inf is background. virtual.*: light of the virtual objects as it arrives, blurred and partly hidden, so picture = "
     "photo left over + virtual. shadow.*: what darkens the photo. matte.A: part of the pupil that sees virtual things. coc.px: diameter "
     "of the circle of confusion in pixels, + behind the focus, - in front of it. Written by mrbokeh."
@@ -66,6 +69,7 @@ class CompositeLayers:
 
     rgb: (H, W, 3) linear. alpha: of the picture; None is opaque. depth_m: of the picture. layers: by name, such as "virtual" and
     "shadow", front first, each with its own depth; letters, digits and _ (Nuke changes all else). matte: in [0, 1]. coc_px: signed.
+    objects: Cryptomatte with its header entries (`cryptomatte.carried_cryptomatte`).
     """
 
     rgb: Float32[np.ndarray, "height width 3"]
@@ -74,6 +78,7 @@ class CompositeLayers:
     layers: Mapping[str, Layer] = field(default_factory=dict)
     matte: Float32[np.ndarray, "height width"] | None = None
     coc_px: Float32[np.ndarray, "height width"] | None = None
+    objects: ExrPart | None = None
 
     def __post_init__(self) -> None:
         size = self.rgb.shape[:2]
@@ -87,19 +92,34 @@ class CompositeLayers:
                 raise InputError(f"a layer's name is letters, digits and _, a letter first, and not {' or '.join(_RESERVED)}; got {name!r}")
 
 
-def write_composite_exr(path: Path | str, composite: CompositeLayers, *, half: bool = True) -> None:
-    """Write colour in half or float, depth and circles of confusion always in float."""
+def write_composite_exr(
+    path: Path | str,
+    composite: CompositeLayers,
+    *,
+    half: bool = True,
+    space: NamedSpace | None = None,
+    carried: CarriedExr | None = None,
+) -> None:
+    """Write colour in half or float, depth and circles of confusion always in float.
+
+    space: to which the colours of the picture and of all layers are brought. carried: metadata and windows of the plate.
+    """
     dtype = np.float16 if half else np.float32
     alpha = np.ones(composite.rgb.shape[:2], np.float32) if composite.alpha is None else composite.alpha
-    channels = _rgba("", composite.rgb, alpha, dtype)
+    channels = _rgba("", in_named_space(composite.rgb, composite.alpha, space), alpha, dtype)
     for name, layer in composite.layers.items():
-        channels |= _rgba(f"{name}.", layer.rgb, layer.alpha, dtype) | {f"{name}.Z": layer.depth_m}
+        rgb = in_named_space(layer.rgb, layer.alpha, space)
+        channels |= _rgba(f"{name}.", rgb, layer.alpha, dtype) | {f"{name}.Z": layer.depth_m}
     maps = {"Z": composite.depth_m, "coc.px": composite.coc_px}
     channels |= {name: plane for name, plane in maps.items() if plane is not None}
     if composite.matte is not None:
         channels["matte.A"] = composite.matte.astype(dtype)
-    order = ",".join(composite.layers)
-    write_exr(path, ExrPart(channels, attributes={"comments": COMMENTS, "mrbokehLayers": order}))
+    attributes = {"comments": COMMENTS, "mrbokehLayers": ",".join(composite.layers), **stated(space)}
+    if composite.objects is not None:
+        channels |= composite.objects.channels
+        attributes |= composite.objects.attributes
+    part = ExrPart(channels, attributes=attributes)
+    write_exr(path, part if carried is None else carried.onto(part, space))
 
 
 def _rgba(prefix: str, rgb: np.ndarray, alpha: np.ndarray, dtype: type) -> dict[str, np.ndarray]:

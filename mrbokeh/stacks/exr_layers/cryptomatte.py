@@ -11,6 +11,7 @@ pixel is that of one of them; so all take theirs from the nearest pixel that is 
 
 import difflib
 import json
+import re
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,8 +22,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float32, UInt32
 
+from mrbokeh.images.exr_io import ExrPart
 from mrbokeh.images.layer import Layer
+from mrbokeh.stacks.exr_layers.deep_layers import is_deep
 from mrbokeh.stacks.exr_layers.render_channels import RenderChannels, layer_of, nearest_depth
+from mrbokeh.system.channel import say
 from mrbokeh.system.errors import InputError
 
 _MASK = 0xFFFFFFFF
@@ -115,6 +119,26 @@ def cryptomattes(render: RenderChannels) -> dict[str, Cryptomatte]:
 _ENTRIES = ("name", "hash", "conversion", "manifest", "manif_file")
 
 
+def carried_cryptomatte(path: Path) -> ExrPart | None:
+    """Return all Cryptomattes of a render, channels and header entries, to be written into a picture made of it; None without any.
+
+    They stay as rendered, sharp: an ID cannot be blurred. Manifests of files beside the render are put into the header.
+    """
+    render = RenderChannels.read(path)
+    prefix = "cryptomatte/"
+    entries = {name: value for name, value in render.metadata.items() if name.startswith(prefix)}
+    channels: dict[str, np.ndarray] = {}
+    for name, value in list(entries.items()):
+        if name.endswith("/name"):
+            ranked = re.compile(rf"{re.escape(str(value))}\d\d\.\w+")
+            channels |= {each: render.plane(each) for each in render.channels if ranked.fullmatch(each)}
+        if name.endswith("/manif_file"):
+            beside = entries.pop(name)
+            bits = _manifest(path, {"name": name, "manifest": None, "manif_file": beside})
+            entries[name.removesuffix("manif_file") + "manifest"] = json.dumps({each: f"{of:08x}" for each, of in bits.items()})
+    return ExrPart(channels, attributes=entries) if channels else None
+
+
 def _cryptomatte(render: RenderChannels, entries: Mapping[str, Any]) -> Cryptomatte:
     name = str(entries["name"])
     for what, expected in (("hash", "MurmurHash3_32"), ("conversion", "uint32_to_float32")):
@@ -160,6 +184,20 @@ def _manifest(path: Path, entries: Mapping[str, Any]) -> dict[str, int]:
         return {name: int(bits, 16) for name, bits in json.loads(text).items()} if text else {}
     except (OSError, ValueError, AttributeError) as error:
         raise InputError(f"{path}: the manifest of the Cryptomatte {entries['name']} cannot be read ({error})") from None
+
+
+def cryptomatte_among(paths: Sequence[Path]) -> ExrPart | None:
+    """Return the Cryptomattes of several renders; of those with one name the first is taken, and said. None without any."""
+    found = {path: each for path in paths if not is_deep(path) and (each := carried_cryptomatte(path)) is not None}
+    channels: dict[str, np.ndarray] = {}
+    entries: dict[str, Any] = {}
+    for path, each in found.items():
+        if channels.keys() & each.channels.keys():
+            say(f"{path} has a Cryptomatte of the same name as a layer before it: the first is written, write them under other names")
+            continue
+        channels |= each.channels
+        entries |= each.attributes
+    return ExrPart(channels, attributes=entries) if channels else None
 
 
 _NOTHING = np.float32(1e-6)

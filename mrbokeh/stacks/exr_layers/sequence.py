@@ -29,22 +29,23 @@ class ExrSequence:
     is_still: bool = False
 
     @classmethod
-    def of(cls, where: Path | str, reader: LayerReader | None = None) -> "ExrSequence":
-        """Find the files of a sequence. Raises InputError if nothing is found, or frames between the first and the last are missing.
+    def of(cls, where: Path | str, reader: LayerReader | None = None, *, whole: bool = True) -> "ExrSequence":
+        """Find the files of a sequence. Raises InputError if nothing is found, or one that is to be whole has gaps.
 
         where: beauty.%04d.exr, beauty.####.exr, beauty.$F4.exr, a folder with one sequence, or a single file.
         reader: how files are understood; None takes FlatRender, or DeepSurfaces if they are deep.
         """
         found, is_still = _found(Path(where))
         frames = range(min(found), max(found) + 1)
-        _require_all(where, found, frames)
+        if whole:
+            _require_all(where, found, frames)
         return cls(found, frames, reader or _reader_for(next(iter(found.values()))), is_still)
 
     def path_of(self, frame: int) -> Path:
         """Return the file that shows a frame."""
         if self.is_still:
             return next(iter(self.paths.values()))
-        if frame not in self.frames:
+        if frame not in self.paths:
             raise InputError(
                 f"the render has frames {self.frames[0]} to {self.frames[-1]}, not {frame}: render that one, or take its range"
             )
