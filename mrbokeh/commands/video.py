@@ -240,14 +240,12 @@ def _found_depth(source: PictureSource, camera: Path, taken: "Sequence[int]", fi
         say(f"depth of {made} frames lies in {folder} ({took_s:.1f} s a frame); what moves by itself has that of what is behind it")
 
 
-def _focused_at(recipe: CompositeRecipe, shot: Shot, place: str) -> CompositeRecipe:
-    """Return the recipe focused for the whole clip on what the depth of the first frame that is taken has at a place."""
-    info = shot.source.info
-    moment = Moment(recipe.first_number + shot.taken[0], 0.0, (info.width_px, info.height_px))
+def _focus_at_fact(recipe: CompositeRecipe, source: PictureSource, first: int, place: str) -> tuple[str, float]:
+    """Return the focus, for the whole clip, on what the depth of the first frame that is taken has at a place."""
+    moment = Moment(recipe.first_number + first, 0.0, (source.info.width_px, source.info.height_px))
     depth_m = None if recipe.depth is None else recipe.depth.opened(1).depth_m_at(moment)
     lens = recipe.stated_lens if recipe.holding is None else lens_for_orientation(recipe.stated_lens, recipe.holding)
-    focused = focused_at_pixel(lens, depth_m, place)
-    return replace(recipe, facts=(*recipe.facts, ("focus_distance_m", focused.focus_distance_m)))
+    return "focus_distance_m", focused_at_pixel(lens, depth_m, place).focus_distance_m
 
 
 def target_of(out: Path, source: PictureSource, recipe: CompositeRecipe, colour: ColourOptions, result: ResultOptions) -> Target:
@@ -379,16 +377,17 @@ def video(
     recipe = recipe_of(source, lens, facts, taken, virtual, rendering, look, blur, virtual_only=result.virtual_only)
     if lens_and_renderer(lens, blur.renderer)[0] is None and not {"focal_length_mm", "f_number"} <= facts.given.keys():
         guess(f"no whole lens is stated, so that this one is taken: {recipe.stated_lens.described}")
-    scale = parse_proxy(result.proxy)
+    scale, whole, plate = parse_proxy(result.proxy), recipe, source
     if scale < 1:
         recipe, source = proxy_recipe(recipe, source.info, scale), ProxySource.of(source, scale)
     target = target_of(out, source, recipe, colour, result)
     shot = shot_of(source, recipe, target, taken, work.segment)
     target.require_new(shot, result.overwrite or shot.was_begun)
     if is_auto(taken.depth) and virtual.camera is not None:
-        _found_depth(source, virtual.camera, shot.taken, recipe.first_number)
+        _found_depth(plate, virtual.camera, shot.taken, recipe.first_number)
     if blur.focus_at is not None:
-        shot = replace(shot, recipe=_focused_at(recipe, shot, blur.focus_at))
+        focused = _focus_at_fact(whole, plate, shot.taken[0], blur.focus_at)
+        shot = replace(shot, recipe=replace(recipe, facts=(*recipe.facts, focused)))
     _try_first_frame(shot)
     if not result.virtual_only and (lost := _alpha_lost(clip, source, target)):
         warn(f"{clip} {lost}")
