@@ -31,6 +31,8 @@ Plane = Float32[np.ndarray, "height width"]
 Rgb = Float32[np.ndarray, "height width 3"]
 
 _SWEPT_PIXELS = 854 * 480
+_MOST_CELLS = 1 << 24
+"""Of the coarse level: eight times as many take 2.7 times as long and are no better."""
 _NEIGHBOURS = 6
 _SOURCES = 7
 _FEWEST_POINTS = 50
@@ -102,7 +104,7 @@ class StillScene:
         ranges = [dioptre_range(camera, self.points) for camera in self._cameras]
         nearest, farthest = (bound([each[k] for each in ranges if each]) for bound, k in ((max, 1), (min, 0)))
         self._tolerance = TOLERANCE * (nearest - farthest)
-        views, settings = [each.view for each in pictures], DenseSettings(device=device)
+        views, settings = [each.view for each in pictures], DenseSettings(most_cells=_MOST_CELLS, device=device)
         near = [best_neighbours(index, self._cameras, self.points, _NEIGHBOURS) for index in range(len(views))]
         swept: dict[int, ViewDepth] = {}
         for index in track(range(len(views)), "sweeps"):
