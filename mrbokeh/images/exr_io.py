@@ -67,12 +67,18 @@ def read_exr(path: Path | str, *, overscan: bool = False) -> list[ExrPart]:
 
 
 def header_of(path: Path | str) -> dict[str, Any]:
-    """Return the header entries of the first part of an EXR file, without reading its pixels. Raises InputError where it is none."""
+    """Return the header entries of the first part of an EXR file that holds R, else of its first."""
+    headers = headers_of(path)
+    return next((each for each in headers if any(channel.name == "R" for channel in each["channels"])), headers[0])
+
+
+def headers_of(path: Path | str) -> list[dict[str, Any]]:
+    """Return the header entries of all parts of an EXR file, without reading its pixels. Raises InputError where it is none."""
     import OpenEXR
 
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
-            return dict(file.parts[0].header)
+            return [dict(part.header) for part in file.parts]
     except (RuntimeError, OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read as EXR: {error}") from None
 
