@@ -157,7 +157,7 @@ AP1 = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
 P3_D65 = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
 """Primaries of SMPTE RP 431-2 with the white of displays."""
 
-INTEROP_IDS = {
+INTEROP_IDS: dict[tuple[float, ...], str] = {
     REC709: "lin_rec709_scene",
     BT2020: "lin_rec2020_scene",
     AP0: "lin_ap0_scene",
