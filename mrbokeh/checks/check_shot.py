@@ -27,6 +27,12 @@ class Taken:
     numbers: Sequence[int] | None = None
     first_number: int = 0
 
+    def number_of(self, index: int, shot: Shot) -> int:
+        """Return the number of a picture of a shot; those of a film are the plate's."""
+        if shot.numbers is not None:
+            return shot.numbers[index]
+        return self.first_number + index if self.numbers is None or index >= len(self.numbers) else self.numbers[index]
+
     def of(self, plate: Shot) -> Iterator[tuple[int, CheckedPicture]]:
         """Yield the pictures taken, each with its place in the plate; nothing behind the last is read."""
         wanted = None if self.numbers is None else set(self.numbers)
@@ -159,8 +165,7 @@ def check_shot(shot: Shot, plate: Shot | None, settings: CheckSettings) -> tuple
             flicker.skip()
             continue
         report.pictures += 1
-        number = index if shot.numbers is None else shot.numbers[index]
-        complete = with_layers(picture, still | _layers(settings.layers, index, number))
+        complete = with_layers(picture, still | _layers(settings.layers, index, settings.taken.number_of(index, shot)))
         _check_one(report, complete, other, settings, leaks)
         if other is not None and shot.is_sequence:
             flicker.add(report, picture.name, picture.rgb, other.rgb)

@@ -48,7 +48,7 @@ from mrbokeh.video.proxy_source import ProxySource, parse_proxy
 
 ClipArgument = Annotated[
     Path,
-    typer.Argument(metavar="CLIP", help="A video; or, with --rate, numbered pictures: frames.%04d.exr, frames.####.exr or their folder."),
+    typer.Argument(metavar="CLIP", help="A video, or numbered pictures, with --rate: frames.%04d.exr, frames.####.exr or their folder."),
 ]
 LensOption = Annotated[
     Path | None, typer.Option(help=f"{shared.ANY_LENS}, focused as it was when the clip was shot. Default: 50 mm f/1.8.")
@@ -65,7 +65,9 @@ OutOption = Annotated[
 class ClipOptions(shared.NearOptions):
     """Options of the clip: which frames are taken, their numbers, and depth."""
 
-    rate: Annotated[str | None, typer.Option(help="Frames per second of numbered pictures: 25, 23.976, 24000/1001.")] = None
+    rate: Annotated[
+        str | None, typer.Option(help="Frames per second of numbered pictures: 25, 23.976, 24000/1001. Default: as EXR headers state.")
+    ] = None
     frames: Annotated[
         str | None, typer.Option(metavar="NUMBERS", help="Frames to take, by the numbers of the files: 1001-1050, 1001-1050x2, 1001,1020.")
     ] = None

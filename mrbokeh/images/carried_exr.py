@@ -14,7 +14,7 @@ from jaxtyping import Int32
 
 from mrbokeh.images.alpha_io import Picture, Plane, exr_part, in_named_space
 from mrbokeh.images.color_management import NamedSpace
-from mrbokeh.images.exr_io import ATTRIBUTE, INTEROP_ID, SPACE_NAME, ExrPart, in_rec709, read_exr, stated_primaries
+from mrbokeh.images.exr_io import ATTRIBUTE, INTEROP_ID, SPACE_NAME, ExrPart, header_of, headers_of, in_rec709, read_exr, stated_primaries
 
 _OF_PIXELS = {
     *("channels", "compression", "dataWindow", "displayWindow", "lineOrder", "type", "name", "version", "chunkCount", "tiles", "preview"),
@@ -47,19 +47,20 @@ class CarriedExr:
         """Read what a plate has; nothing where it is no EXR. space: of its numbers, as the user names it."""
         if path is None or path.suffix.lower() != ".exr" or not path.is_file():
             return cls()
+        header = header_of(path)
+        told = {key: value for key, value in header.items() if key not in _OF_PIXELS and not key.startswith("cryptomatte/")}
+        attributes = {key: value for key, value in told.items() if type(value).__name__ in _WRITABLE}
+        bare = cls(attributes, tuple(header["displayWindow"][0].tolist()), views=_views(path, header))
+        if (header["dataWindow"][0] >= header["displayWindow"][0]).all() and (header["dataWindow"][1] <= header["displayWindow"][1]).all():
+            return bare
         parts = read_exr(path, overscan=True)
-        part = next((each for each in parts if set("RGB") <= each.channels.keys()), parts[0])
-        told = {key: value for key, value in part.header.items() if key not in _OF_PIXELS}
-        attributes = {key: value for key, value in told.items() if not key.startswith("cryptomatte/") and type(value).__name__ in _WRITABLE}
-        of_parts = dict.fromkeys([part.header.get("view"), *(each.header.get("view") for each in parts)])
-        views = tuple(part.header.get("multiView") or (str(view) for view in of_parts if view is not None))
-        margins = part.margins_px
-        if margins == (0, 0, 0, 0) or not set("RGB") <= part.channels.keys():
-            return cls(attributes, part.origin_px, views=views)
+        part = next((each for each in parts if set("RGB") <= each.channels.keys()), None)
+        if part is None:
+            return bare
         numbers = part.stacked("RGB")
         rgb = in_rec709(numbers, stated_primaries(part, parts), path) if space is None else space.to_rec709(numbers)
         alpha = part.stacked("A")[..., 0] if "A" in part.channels else None
-        return cls(attributes, part.origin_px, margins, rgb, alpha, views)
+        return replace(bare, margins_px=part.margins_px, rgb=rgb, alpha=alpha)
 
     def told(self, path: Path) -> str:
         """Return what the user should know of a plate: views that are left out, and overscan; else ""."""
@@ -90,6 +91,13 @@ class CarriedExr:
             whole[top : top + height, left : left + width] = plane
             channels[name] = whole
         return replace(part, channels=channels, attributes=attributes)
+
+
+def _views(path: Path, header: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return the views of a stereo file, the first of them that of this header."""
+    if "view" not in header:
+        return tuple(header.get("multiView", ()))
+    return tuple(dict.fromkeys([str(header["view"]), *(str(each["view"]) for each in headers_of(path) if "view" in each)]))
 
 
 _WRITABLE = ("int", "float", "str", "Fraction", "list", "ndarray", "tuple", "TimeCode", "KeyCode", "Envmap")

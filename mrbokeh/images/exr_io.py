@@ -67,12 +67,18 @@ def read_exr(path: Path | str, *, overscan: bool = False) -> list[ExrPart]:
 
 
 def header_of(path: Path | str) -> dict[str, Any]:
-    """Return the header entries of the first part of an EXR file, without reading its pixels. Raises InputError where it is none."""
+    """Return the header entries of the first part of an EXR file that holds R, else of its first."""
+    headers = headers_of(path)
+    return next((each for each in headers if any(channel.name == "R" for channel in each["channels"])), headers[0])
+
+
+def headers_of(path: Path | str) -> list[dict[str, Any]]:
+    """Return the header entries of all parts of an EXR file, without reading its pixels. Raises InputError where it is none."""
     import OpenEXR
 
     try:
         with OpenEXR.File(str(path), header_only=True) as file:
-            return dict(file.parts[0].header)
+            return [dict(part.header) for part in file.parts]
     except (RuntimeError, OSError, ValueError) as error:
         raise InputError(f"{path} cannot be read as EXR: {error}") from None
 
@@ -151,7 +157,7 @@ AP1 = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
 P3_D65 = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
 """Primaries of SMPTE RP 431-2 with the white of displays."""
 
-INTEROP_IDS = {
+INTEROP_IDS: dict[tuple[float, ...], str] = {
     REC709: "lin_rec709_scene",
     BT2020: "lin_rec2020_scene",
     AP0: "lin_ap0_scene",

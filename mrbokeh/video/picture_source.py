@@ -258,7 +258,7 @@ def numbers_taken(text: str | None, numbers: range, clip: Path) -> Sequence[int]
     """Return the frame numbers that --frames names, in order, each once; None takes all. numbers: those that the clip has."""
     ranges = [numbers] if text is None else parse_frames(text)
     if any(each[0] < numbers[0] or each[-1] > numbers[-1] for each in ranges):
-        raise InputError(f"--frames {text}: {clip} has the frames {numbers[0]}-{numbers[-1]}: take some of those")
+        raise InputError(f"--frames {text}: {clip} has the frames {numbers[0]}-{numbers[-1]}: take some of those, or say --first-number")
     return ranges[0] if len(ranges) == 1 else sorted({number for each in ranges for number in each})
 
 

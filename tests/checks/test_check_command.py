@@ -321,6 +321,11 @@ def test_films_are_paired_by_time(tmp_path: Path) -> None:
     part = film(tmp_path / "part.mkv", made[3:7], [time_s - times[3] for time_s in times[3:7]])
     report_of(part, plate, 0, "--frames", "3-6", *known)
     report_of(part, plate, 1, *known)
+    # Called as `video --first-number` called them, every second, with layers by these numbers.
+    for number in (1004, 1006):
+        write_layer(tmp_path / f"layer.{number}.exr", layer, half=False)
+    some = film(tmp_path / "some.mkv", made[3:7:2], [0.0, times[5] - times[3]])
+    report_of(some, plate, 0, "--frames", "1004-1007x2", "--first-number", 1001, "--virtual", tmp_path / "layer.%04d.exr")
 
 
 def test_slices_of_a_stack_are_checked_against_those_of_the_other(tmp_path: Path) -> None:

@@ -254,6 +254,14 @@ def test_half_a_picture_alpha_in_a_png_and_existing_files_are_refused(folder: Pa
     assert (folder / "out.exr").read_text() == "mine"
 
 
+def test_colours_are_stated(folder: Path) -> None:
+    """Linear Rec.709, with the primaries of ITU-R BT.709."""
+    for more, out in (((), "picture.exr"), (("--alpha-out",), "layer.exr")):
+        (part,) = read_exr(run(folder, *PICTURE, *more, out=out))
+        assert part.attributes["chromaticities"] == pytest.approx((0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329))
+        assert (part.attributes["oiio:ColorSpace"], part.attributes["colorInteropID"]) == ("lin_rec709", "lin_rec709_scene")
+
+
 def test_a_layer_without_depth_is_refused_as_composite_does(tmp_path: Path) -> None:
     """Its blur would be that of infinity, which nobody asked for."""
     write_exr(tmp_path / "flat.exr", ExrPart(dict.fromkeys("RGBA", np.full((8, 8), 0.5, np.float32))))
