@@ -18,7 +18,7 @@ from tests.support.refusals import refused
 
 HEIGHT, WIDTH = 12, 16
 # Rendered by Blender 4.2.23 (Cycles, 80x56 px, pixels 1.2 times as tall as wide) of a red cube in motion before a green ball;
-# exported by mrbokeh/scene/blender_addon.py.
+# exported by mrbokeh/hosts/blender.py.
 BLENDER = Path(__file__).parents[1] / "data" / "blender"
 
 

@@ -14,18 +14,18 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mrbokeh.commands.blender_addon import app
+from mrbokeh.commands.host import app
+from mrbokeh.hosts import blender
+from mrbokeh.hosts.blender import Film, camera_from_world, check_scene, intrinsics, track_frame
 from mrbokeh.optics.camera import camera_from_json
 from mrbokeh.optics.lens import Lens
-from mrbokeh.scene import blender_addon
-from mrbokeh.scene.blender_addon import Film, camera_from_world, check_scene, intrinsics, track_frame
 from mrbokeh.scene.virtual_scene import WORLD_FROM_GLTF
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.formats import read_track
 from mrbokeh.tracking.world_axes import UPRIGHT_FROM_WORLD
 
 DATA = Path(__file__).parents[1] / "data" / "blender"
-ADDON = Path(blender_addon.__file__)
+ADDON = Path(blender.__file__)
 
 
 def test_a_full_frame_camera() -> None:
