@@ -1,5 +1,6 @@
 """`mrbokeh host`: writes the one file by which another program blurs through `mrbokeh serve`."""
 
+import re
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, NamedTuple
@@ -15,6 +16,9 @@ class Program(StrEnum):
     """Programs that there is a file for."""
 
     BLENDER = "blender"
+    NUKE = "nuke"
+    NATRON = "natron"
+    FUSION = "fusion"
 
 
 class _File(NamedTuple):
@@ -25,8 +29,11 @@ class _File(NamedTuple):
 
 _FILES = {
     Program.BLENDER: _File("blender.py", "mrbokeh_blender.py", "in Blender, Edit > Preferences > Add-ons > Install from Disk"),
+    Program.NUKE: _File("nuke.py", "mrbokeh_nuke.py", "put it into ~/.nuke, with `import mrbokeh_nuke` in ~/.nuke/menu.py"),
+    Program.NATRON: _File("natron.py", "mrbokeh_natron.py", "put it into a folder of Natron's search path for plug-ins"),
+    Program.FUSION: _File("fusion.fuse", "mrbokeh_lens_blur.fuse", "put it into Fusion's folder Fuses"),
 }
-CARRIED = "from mrbokeh.hosts.client import Refused, ask\n"
+_CARRIED = re.compile(r"^from mrbokeh\.hosts\.client import .*\n", re.MULTILINE)
 """Line of a host's file in whose place the client is written."""
 
 
@@ -36,7 +43,7 @@ def written(program: Program) -> str:
 
     folder = files("mrbokeh.hosts")
     text, client = ((folder / name).read_text(encoding="utf-8") for name in (_FILES[program].source, "client.py"))
-    return text.replace(CARRIED, client.partition('"""\n\n')[2])
+    return _CARRIED.sub(lambda _: client.partition('"""\n\n')[2], text)
 
 
 @app.command("host")

@@ -350,15 +350,25 @@ class _Asked:
 
         out = self.request["out"]
         if isinstance(out, dict):
-            path = _memory("out", out)
-            return lambda rgb: (rgb.astype(np.float32, copy=False).tofile(path), str(path))[1]
+            memory = _memory("out", out)
+
+            def write_memory(rgb: np.ndarray) -> str:
+                rgb.astype(np.float32, copy=False).tofile(memory)
+                return str(memory)
+
+            return write_memory
         if not isinstance(out, str) or not out:
             raise InputError(f'out of a request: expected a file or {{"memory": FILE}}, got {str(out)[:80]}')
         require_suffix(out, (".exr", *INTEGER_SUFFIXES), "out of a request")
         inserted = self.request.get("insert")
         named = [self.request.get(key) for key in ("picture", "depth", "lens")] + (inserted if isinstance(inserted, list) else [])
         require_safe_outputs((out,), [each for each in named if isinstance(each, str)], bool(self.request.get("overwrite")))
-        return lambda rgb: (write_image(out, rgb), out)[1]
+
+        def write_file(rgb: np.ndarray) -> str:
+            write_image(out, rgb)
+            return out
+
+        return write_file
 
 
 def _read(picture: Path) -> np.ndarray:

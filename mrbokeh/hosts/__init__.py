@@ -1,5 +1,6 @@
-"""What runs inside other programs and asks `mrbokeh serve` for blur. Each is one file that imports nothing of mrbokeh.
+"""What runs inside other programs and asks `mrbokeh serve` for blur. `mrbokeh host` writes each as one file that needs nothing of mrbokeh.
 
-client      ask, blurred: the request, in the Python 3.7 of older hosts; it is put into the files of the hosts
-blender     add-on: blurs the render of the scene camera; exports objects, camera track and render settings
+client          ask, blurred: the request, in the Python 3.7 of older hosts; it is put into the others' files
+blender         add-on: blurs the render of the scene camera; exports objects, camera track and render settings
+nuke, natron    a group with a button; fusion.fuse, in Lua, blurs in Fusion while it renders
 """

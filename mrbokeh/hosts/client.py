@@ -43,6 +43,14 @@ def ask(request: dict, connection: str = "") -> dict:
     return dict(answer)
 
 
+def frame_request(values: dict, sharp: str, out: str) -> dict:
+    """Return what is asked for one frame in files. values: focus, facts of the lens, lens and renderer; what is empty is left out."""
+    given = {name: value for name, value in values.items() if value not in (None, "")}
+    if str(given.get("lens", "")).lower().endswith(".onnx"):  # a network blurs as the lens that it learned
+        given = {name: given[name] for name in ("focus", "lens") if name in given}
+    return dict(given, what="render", picture=sharp, out=out, overwrite=True)
+
+
 def blurred(picture, depth_m, **request):  # type: ignore[no-untyped-def]
     """Return the blurred picture and the answer. Arrays lie in shared memory, where there is a folder of it, and never on a disk there.
 
