@@ -198,11 +198,11 @@ def set_up_render(scene: Any, folder: str) -> None:
         layer.pass_cryptomatte_depth = 6
 
 
-def _multilayer(image: Any) -> None:
+def _multilayer(image: Any, codec: str = "ZIP") -> None:
     if hasattr(image, "media_type"):
         # Since Blender 5.0 only formats of the medium can be chosen.
         image.media_type = "MULTI_LAYER_IMAGE"
-    image.file_format, image.color_mode, image.color_depth, image.exr_codec = "OPEN_EXR_MULTILAYER", "RGBA", "32", "ZIP"
+    image.file_format, image.color_mode, image.color_depth, image.exr_codec = "OPEN_EXR_MULTILAYER", "RGBA", "32", codec
 
 
 def export(scene: Any, folder: str, selected_only: bool = False, with_render: bool = True) -> None:
@@ -238,7 +238,7 @@ def blur_render(scene: Any, lens: str = "") -> dict[str, Any]:
     check_blur(scene)
     sharp, out = (os.path.join(bpy.app.tempdir, name) for name in ("mrbokeh_sharp.exr", "mrbokeh_blurred.exr"))
     with _kept(scene.render.image_settings, ("media_type", "file_format", "color_mode", "color_depth", "exr_codec")):
-        _multilayer(scene.render.image_settings)
+        _multilayer(scene.render.image_settings, "NONE")
         try:
             bpy.data.images["Render Result"].save_render(sharp, scene=scene)
         except (KeyError, RuntimeError):

@@ -46,7 +46,7 @@ def create():  # type: ignore[no-untyped-def]
     source = nuke.createNode("Input", inpanel=False)
     metres = _inside("Expression", "metres", source, channel0="depth")
     metres["expr0"].setValue("parent.depth_is == 1 ? (depth.Z > 0 ? 1 / depth.Z : 0) : depth.Z")
-    _inside("Write", "sharp", metres, file_type="exr", channels="all", datatype="32 bit float", raw=True)
+    _inside("Write", "sharp", metres, file_type="exr", channels="all", datatype="32 bit float", compression="none", raw=True)
     blurred = _inside("Read", "blurred", None, raw=True, on_error="nearest frame")
     _inside("Output", "Output1", blurred)
     group.end()

@@ -175,6 +175,18 @@ def test_blender_5_writes_a_part_for_each_layer() -> None:
     assert rest.alpha.max() < 1e-6
 
 
+def test_what_blenders_compositor_made_is_not_the_render(tmp_path: Path) -> None:
+    """Blender 4.5 saves Composite.Combined beside the view layer, which alone has depth; of two view layers none is chosen."""
+    rgb, depth_m = {name: np.full((4, 6), 0.25, np.float32) for name in "RGBA"}, np.full((4, 6), 3.0, np.float32)
+    planes = {f"ViewLayer.Combined.{name}": values for name, values in rgb.items()} | {"ViewLayer.Depth.Z": depth_m}
+    planes |= {f"Composite.Combined.{name}": 2 * values for name, values in rgb.items()}
+    write_exr(tmp_path / "render.exr", ExrPart(planes))
+    (layer,) = FlatRender().layers(tmp_path / "render.exr")
+    assert (layer.rgb == 0.25).all() and (layer.depth_m == 3.0).all()
+    write_exr(tmp_path / "two.exr", ExrPart(planes | {"Composite.Depth.Z": depth_m}))
+    refused("could be any of the layers", FlatRender().layers, tmp_path / "two.exr")
+
+
 @pytest.mark.parametrize("name", ["multi", pytest.param("single", marks=pytest.mark.slow)])
 def test_eyes_of_stereo_files(shared_data: Path, name: str) -> None:
     """The same frame as 10 parts with data windows of their own and as one part whose channels name the eye; the default eye is right."""
