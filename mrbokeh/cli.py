@@ -1,11 +1,8 @@
 """`mrbokeh`: one typer app; the package behind a sub-command is imported when it is called, not before."""
 
-import errno
 import os
 import signal
 import sys
-import tempfile
-import traceback
 from collections.abc import Callable
 from contextlib import ExitStack, redirect_stderr, suppress
 from importlib import import_module
@@ -22,7 +19,7 @@ from typer.main import get_command
 from mrbokeh.commands._option_words import with_words
 from mrbokeh.system.atomic_files import writing_alone
 from mrbokeh.system.channel import channel, object_on_stdout, opened, remove_unfinished, write_object
-from mrbokeh.system.errors import FAULT, INTERRUPTED, InputError, MissingExtraError
+from mrbokeh.system.errors import FAULT, INTERRUPTED, InputError, fault_in, mistake_in
 
 # OpenCV's threads otherwise spin while they wait for work: a tenth of the CPU time of a merge. It is read when OpenCV is imported.
 os.environ.setdefault("OPENCV_THREAD_POOL_ACTIVE_WAIT_WORKER", "0")
@@ -32,21 +29,6 @@ SHARING = ("video",)
 """Commands that may write one result together: they claim parts of it (`mrbokeh.shots.claims`)."""
 LATEST_S = 1.5
 """Time from Ctrl-C to the end of the process at the latest."""
-
-# Where a module can be missing because its extra was not installed.
-EXTRA_OF_MODULE = {
-    "rawpy": "capture",
-    "pyexiv2": "capture",
-    "exifread": "capture",
-    "lensfunpy": "capture",
-    "pycolmap": "capture",
-    "gphoto2": "tether",
-    "torch": "train",
-    "onnx": "train",
-    "onnxscript": "train",
-    "aiohttp": "viewfinder",
-    "h5py": "hdf5",
-}
 
 
 class SubCommand(NamedTuple):
@@ -69,7 +51,8 @@ SUB_COMMANDS = {
     "track": SubCommand("mrbokeh.commands.track", "The camera of every frame of a clip, and its files."),
     "viewfinder": SubCommand("viewfinder.cli", "Stream a camera with virtual objects in it to a browser."),
     "studio": SubCommand("viewfinder.studio.cli", "Place an object in a photograph in the browser."),
-    "blender-addon": SubCommand("mrbokeh.commands.blender_addon", "Write the add-on that exports scenes from Blender."),
+    "serve": SubCommand("mrbokeh.commands.serve", "Blur for compositors on this machine, with everything warm."),
+    "host": SubCommand("mrbokeh.commands.host", "Write what blurs inside Blender, Nuke, Natron or Fusion."),
     "demo": SubCommand("mrbokeh.commands.demo", "The whole pipeline on shipped photographs, with a report."),
     "doctor": SubCommand("mrbokeh.commands.doctor", "What is installed, what is missing, and what it would enable."),
 }
@@ -214,12 +197,12 @@ def _run(wants_object: bool, interrupted: list[int]) -> tuple[int, str]:
     except SystemExit as left:
         code = left.code
     except Exception as error:
-        if mistake := _mistake(error):
+        if mistake := mistake_in(error):
             return 2, mistake
         if not interrupted:
             if sys.argv[1:2] == ["--debug"]:
                 raise
-            return FAULT, _fault(error)
+            return FAULT, fault_in(error)
         code = INTERRUPTED
     code = code if isinstance(code, int) else int(code is not None)
     return code, _stopped() if code >= INTERRUPTED else ""
@@ -236,39 +219,6 @@ def _stopped() -> str:
         return ""
     written = ", ".join(map(str, channel().written()))
     return channel().kept or ("stopped: " + (f"finished before: {written}" if written else "nothing was written"))
-
-
-def _mistake(error: Exception) -> str:
-    """Return the sentence for an error that the user can mend, else ""."""
-    if isinstance(error, InputError):
-        return str(error)
-    if hasattr(error, "format_message"):  # of the parser, where it does not print itself
-        return str(error.format_message())
-    if isinstance(error, ModuleNotFoundError):
-        extra = EXTRA_OF_MODULE.get((error.name or "").partition(".")[0])
-        return str(MissingExtraError(str(error.name), extra)) if extra else ""
-    if isinstance(error, RuntimeError) and "Symlink loop" in str(error):
-        return f"{str(error).partition(' from ')[2]} is a link that leads back to itself: name the file that is meant"
-    if isinstance(error, MemoryError):
-        return "there is not enough memory for this: use smaller pictures (--max-width where there is one) or fewer at once"
-    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return "there is no space left where this was written, or in the temporary folder: free some and run the same command again"
-    if isinstance(error, OSError) and isinstance(error.filename, str | bytes):
-        return _refused(error)
-    return ""
-
-
-def _fault(error: Exception) -> str:
-    """Keep the traceback in a file, where one can be written, and return what to do with it."""
-    kept, text = "`mrbokeh --debug ...`", " ".join(sys.argv) + "\n\n" + "".join(traceback.format_exception(error))
-    with suppress(OSError), tempfile.NamedTemporaryFile("wb", prefix="mrbokeh-fault-", suffix=".txt", delete=False) as file:
-        file.write(text.encode("utf-8", "backslashreplace"))
-        kept = file.name
-    first = (str(error).splitlines() or [""])[0]
-    return (
-        f"this is a fault of mrbokeh ({type(error).__name__}{': ' + first if first else ''}). "
-        f"Please report it with {kept}; `mrbokeh --debug ...` shows it here"
-    )
 
 
 def _noted_interrupts(last_words: Callable[[], object]) -> list[int]:
@@ -294,19 +244,6 @@ def _noted_interrupts(last_words: Callable[[], object]) -> list[int]:
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, note)
     return noted
-
-
-def _refused(error: OSError) -> str:
-    """Describe what the system refused to do with a file or folder; for a temporary file, name its folder."""
-    path = Path(os.fsdecode(error.filename))
-    shown = path.parent if path.name.startswith(".") and ".part" in path.name else path
-    if isinstance(error, FileNotFoundError):
-        return f"{shown}: there is no such file or folder: check the name"
-    if isinstance(error, IsADirectoryError):
-        return f"{shown} is a folder (it is a directory), but a file was expected there: check the name"
-    if isinstance(error, NotADirectoryError | FileExistsError):
-        return f"{shown}: a file is where a folder was expected: check the name"
-    return f"{shown}: {(error.strerror or 'the system refused it').lower()}; check the name, the space left and who may write there"
 
 
 def _complain(message: str, file: Any, *, stopped: bool) -> None:

@@ -167,7 +167,7 @@ def _optics(lens: Lens | File | None, renderer: str | Renderer | None) -> tuple[
     if renderer is None or isinstance(renderer, str):
         read, spreads = lens_and_renderer(path, renderer)
     else:
-        read, spreads = None if path is None else read_lens(path), renderer
+        read, spreads = None if path is None or isinstance(lens, Lens) else read_lens(path), renderer
     return lens if isinstance(lens, Lens) else read, spreads
 
 

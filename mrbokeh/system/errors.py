@@ -1,7 +1,11 @@
 """Errors that the user can mend: the command line prints them as one sentence, without a traceback."""
 
+import errno
 import json
 import os
+import sys
+import tempfile
+import traceback
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
@@ -11,6 +15,22 @@ INTERRUPTED = 130
 
 FAULT = 1
 """Exit code of a command that ended by a fault of ours."""
+
+
+# Where a module can be missing because its extra was not installed.
+EXTRA_OF_MODULE = {
+    "rawpy": "capture",
+    "pyexiv2": "capture",
+    "exifread": "capture",
+    "lensfunpy": "capture",
+    "pycolmap": "capture",
+    "gphoto2": "tether",
+    "torch": "train",
+    "onnx": "train",
+    "onnxscript": "train",
+    "aiohttp": "viewfinder",
+    "h5py": "hdf5",
+}
 
 
 class InputError(ValueError):
@@ -48,3 +68,49 @@ def install_command(extra: str = "") -> str:
         noted = json.loads(distribution("mrbokeh").read_text("direct_url.json") or "{}")
         source = f"{noted['vcs_info']['vcs']}+{noted['url']}" if "vcs_info" in noted else str(noted.get("url", ""))
     return f"pip install 'mrbokeh{chosen} @ {source}'" if source else f"pip install 'mrbokeh{chosen}'"
+
+
+def mistake_in(error: Exception) -> str:
+    """Return the sentence for an error that the user can mend, else ""."""
+    if isinstance(error, InputError):
+        return str(error)
+    if hasattr(error, "format_message"):  # of the parser, where it does not print itself
+        return str(error.format_message())
+    if isinstance(error, ModuleNotFoundError):
+        extra = EXTRA_OF_MODULE.get((error.name or "").partition(".")[0])
+        return str(MissingExtraError(str(error.name), extra)) if extra else ""
+    if isinstance(error, RuntimeError) and "Symlink loop" in str(error):
+        return f"{str(error).partition(' from ')[2]} is a link that leads back to itself: name the file that is meant"
+    if isinstance(error, MemoryError):
+        return "there is not enough memory for this: use smaller pictures (--max-width where there is one) or fewer at once"
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return "there is no space left where this was written, or in the temporary folder: free some and run the same command again"
+    if isinstance(error, OSError) and isinstance(error.filename, str | bytes):
+        return _refused(error)
+    return ""
+
+
+def fault_in(error: Exception) -> str:
+    """Keep the traceback in a file, where one can be written, and return what to do with it."""
+    kept, text = "`mrbokeh --debug ...`", " ".join(sys.argv) + "\n\n" + "".join(traceback.format_exception(error))
+    with suppress(OSError), tempfile.NamedTemporaryFile("wb", prefix="mrbokeh-fault-", suffix=".txt", delete=False) as file:
+        file.write(text.encode("utf-8", "backslashreplace"))
+        kept = file.name
+    first = (str(error).splitlines() or [""])[0]
+    return (
+        f"this is a fault of mrbokeh ({type(error).__name__}{': ' + first if first else ''}). "
+        f"Please report it with {kept}; `mrbokeh --debug ...` shows it here"
+    )
+
+
+def _refused(error: OSError) -> str:
+    """Describe what the system refused to do with a file or folder; for a temporary file, name its folder."""
+    path = Path(os.fsdecode(error.filename))
+    shown = path.parent if path.name.startswith(".") and ".part" in path.name else path
+    if isinstance(error, FileNotFoundError):
+        return f"{shown}: there is no such file or folder: check the name"
+    if isinstance(error, IsADirectoryError):
+        return f"{shown} is a folder (it is a directory), but a file was expected there: check the name"
+    if isinstance(error, NotADirectoryError | FileExistsError):
+        return f"{shown}: a file is where a folder was expected: check the name"
+    return f"{shown}: {(error.strerror or 'the system refused it').lower()}; check the name, the space left and who may write there"

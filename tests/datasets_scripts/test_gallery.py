@@ -17,7 +17,8 @@ EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples.md"
 ENTRIES = read_entries(EXAMPLES.read_text(encoding="utf-8"))
 WITHOUT_PICTURE = {
     "doctor",  # it prints a table of what is installed here
-    "blender-addon",  # what it writes is to be seen in Blender only
+    "serve",  # it goes on until Ctrl-C; the page shows what Blender made of it,
+    "host",  # which the gallery cannot make
 }
 
 

@@ -15,7 +15,7 @@ LEVELS = (
     {"commands"},
     {"shots", "synthesis"},
     {"compositing", "refocus", "demo"},
-    {"scene", "depth", "checks", "figures", "lens_measuring"},
+    {"scene", "depth", "checks", "figures", "lens_measuring", "hosts"},
     {"renderers", "stacks", "distortion"},
     {"layering", "psf_models", "tracking", "solving"},
     {"optics", "video"},

@@ -61,7 +61,7 @@ BASES = {
     "train ablate": "stack --out table",
     "viewfinder board": "--out board.pdf",
     "studio": "missing.jpg",
-    "blender-addon": "--out addons",
+    "host": "blender --out addons",
 }
 """Arguments with which each command would work, or is refused late; commands that are not here get none."""
 ENDLESS = {"viewfinder", "capture shoot", "capture cameras"}

@@ -10,12 +10,12 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from mrbokeh.cli import EXTRA_OF_MODULE, SUB_COMMANDS
+from mrbokeh.cli import SUB_COMMANDS
 from mrbokeh.images.image_io import read_layer, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
-from mrbokeh.system.errors import FAULT
+from mrbokeh.system.errors import EXTRA_OF_MODULE, FAULT
 from tests.support.command_line import mrbokeh
 from viewfinder.cli import app as viewfinder
 
@@ -27,7 +27,7 @@ COMMANDS = [
     ["lens"], ["lens", "new"], ["lens", "coc"], ["lens", "show"], ["lens", "psf"], ["lens", "export"],
     ["lens", "fit"], ["lens", "match"], ["render"], ["composite"], ["video"], ["refocus"], ["transfer"], ["tilt-shift"],
     ["dataset"], ["dataset", "synthesize"],
-    ["check"], ["blender-addon"], ["track"], ["track", "clip"], ["track", "convert"],
+    ["check"], ["serve"], ["host"], ["track"], ["track", "clip"], ["track", "convert"],
     ["capture", "matchmove"],
     ["viewfinder"], ["viewfinder", "board"], ["viewfinder", "calibrate-phone"], ["studio"], ["demo"], ["doctor"],
 ]  # fmt: skip

@@ -18,7 +18,7 @@ from tests.support.refusals import refused
 
 HEIGHT, WIDTH = 12, 16
 # Rendered by Blender 4.2.23 (Cycles, 80x56 px, pixels 1.2 times as tall as wide) of a red cube in motion before a green ball;
-# exported by mrbokeh/scene/blender_addon.py.
+# exported by mrbokeh/hosts/blender.py.
 BLENDER = Path(__file__).parents[1] / "data" / "blender"
 
 
@@ -173,6 +173,18 @@ def test_blender_5_writes_a_part_for_each_layer() -> None:
     cube, rest = ObjectSplit(("Cube",)).layers(path)
     np.testing.assert_allclose(cube.alpha, layer.alpha, atol=1e-6)
     assert rest.alpha.max() < 1e-6
+
+
+def test_what_blenders_compositor_made_is_not_the_render(tmp_path: Path) -> None:
+    """Blender 4.5 saves Composite.Combined beside the view layer, which alone has depth; of two view layers none is chosen."""
+    rgb, depth_m = {name: np.full((4, 6), 0.25, np.float32) for name in "RGBA"}, np.full((4, 6), 3.0, np.float32)
+    planes = {f"ViewLayer.Combined.{name}": values for name, values in rgb.items()} | {"ViewLayer.Depth.Z": depth_m}
+    planes |= {f"Composite.Combined.{name}": 2 * values for name, values in rgb.items()}
+    write_exr(tmp_path / "render.exr", ExrPart(planes))
+    (layer,) = FlatRender().layers(tmp_path / "render.exr")
+    assert (layer.rgb == 0.25).all() and (layer.depth_m == 3.0).all()
+    write_exr(tmp_path / "two.exr", ExrPart(planes | {"Composite.Depth.Z": depth_m}))
+    refused("could be any of the layers", FlatRender().layers, tmp_path / "two.exr")
 
 
 @pytest.mark.parametrize("name", ["multi", pytest.param("single", marks=pytest.mark.slow)])

@@ -100,6 +100,8 @@ class RenderChannels:
         layers = [layer for layer in self._layers() if all(joined(layer, name) in self.channels for name in "RGB")]
         known = [layer for layer in layers if layer.rpartition(".")[2] in COLOUR_LAYERS]
         found = [layer for layer in known if layer == ""] or self._distinct(known)
+        # Blender's compositor writes its picture beside the layers that were rendered, without depth.
+        found = [each for each in found if self._has_depth(each)] if len(found) > 1 else found
         if len(found) == 1:
             return found[0]
         if found:
@@ -117,6 +119,10 @@ class RenderChannels:
         raise InputError(
             f"{self.path}: expected depth in a channel {', '.join(DEPTH_NAMES)}, but it has {', '.join(self.stored)}: render with depth"
         )
+
+    def _has_depth(self, layer: str) -> bool:
+        """Return whether depth lies beside a layer, under its own name or that of the layer it is in."""
+        return any(joined(parent, name) in self.channels for parent in (layer, layer.rpartition(".")[0]) if parent for name in DEPTH_NAMES)
 
     def plane(self, name: str) -> Float[np.ndarray, "height width"]:
         return self.channels[name]

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blender add-on (4.2 and later): the scene's objects, its camera and its render settings as mrbokeh wants them.
+"""Blender add-on (4.2 and later): blurs renders as a lens does, and exports scenes as mrbokeh wants them.
+
+Image Editor > sidebar > mrbokeh asks a running `mrbokeh serve` to blur the render by the scene camera's focus and f-stop; the result is
+the image "mrbokeh blur", also in the compositor where that uses nodes.
 
 File > Export > mrbokeh writes into a folder:
 - scene.glb: the objects (all that render, or the selected ones);
@@ -15,17 +18,22 @@ combined with it. It uses Blender's Python interface only and nothing of mrbokeh
 """
 
 import json
+import math
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
+from mrbokeh.hosts.client import Refused, ask
+
 bl_info = {
-    "name": "mrbokeh export",
+    "name": "mrbokeh",
     "author": "mrbokeh",
-    "version": (1, 0, 0),
+    "version": (1, 1, 0),
     "blender": (4, 2, 0),
-    "location": "File > Export > mrbokeh (folder)",
-    "description": "Objects, camera track and render settings for mrbokeh's lens blur",
-    "category": "Import-Export",
+    "location": "Image Editor > sidebar > mrbokeh, and File > Export > mrbokeh (folder)",
+    "description": "Lens blur of renders by mrbokeh; objects, camera track and render settings for it",
+    "category": "Render",
 }
 
 FORMAT = "mrbokeh-camera-track"
@@ -98,6 +106,24 @@ def track_frame(number: int, time_s: float, matrix_world: Matrix, film: Film) ->
     }
 
 
+def lens_request(film: Film, focus: dict[str, float], lens: str = "", blades: int = 0, rotation_deg: float = 0.0) -> dict[str, Any]:
+    """Return focus and lens as `mrbokeh serve` takes them.
+
+    lens: a name, file or folder; "" for the opening of Blender's camera. Its lens stays where it is when it focuses, and its pupil is
+    lens_mm / f_number wide: those are the image distance and pupil of a thin lens that is a little shorter and faster.
+    """
+    distance_m = focus["focus_distance_m"]
+    if lens.lower().endswith(".onnx"):
+        return {"lens": lens, "focus": distance_m}
+    facts = {"focal_length_mm": film.lens_mm, "f_number": focus["f_number"], "sensor_width_mm": intrinsics(film)[2]}
+    if lens:
+        return {"lens": lens, "focus": distance_m, **facts}
+    share = distance_m / (distance_m + film.lens_mm / 1000)
+    opening = {"shape": "polygon", "blades": blades, "rotation_deg": rotation_deg} if blades >= 3 else {"shape": "disc"}
+    thin = {**facts, "focal_length_mm": film.lens_mm * share, "f_number": focus["f_number"] * share}
+    return {"lens": {**thin, "focus_distance_m": distance_m, "aperture": opening}}
+
+
 # What follows needs Blender.
 
 
@@ -159,10 +185,7 @@ def _focus(camera: Any) -> dict[str, float]:
 def set_up_render(scene: Any, folder: str) -> None:
     """Multilayer EXR with RGBA, Z, motion vectors and Cryptomatte of objects, unblurred: lens and shutter come later."""
     render, image = scene.render, scene.render.image_settings
-    if hasattr(image, "media_type"):
-        # Since Blender 5.0 only formats of the medium can be chosen.
-        image.media_type = "MULTI_LAYER_IMAGE"
-    image.file_format, image.color_mode, image.color_depth, image.exr_codec = "OPEN_EXR_MULTILAYER", "RGBA", "32", "ZIP"
+    _multilayer(image)
     if hasattr(image, "use_exr_interleave"):
         # All in one part: Blender 5.0.1 cannot write several where pixels are not square.
         image.use_exr_interleave = True
@@ -173,6 +196,13 @@ def set_up_render(scene: Any, folder: str) -> None:
     for layer in scene.view_layers:
         layer.use_pass_combined = layer.use_pass_z = layer.use_pass_vector = layer.use_pass_cryptomatte_object = True
         layer.pass_cryptomatte_depth = 6
+
+
+def _multilayer(image: Any, codec: str = "ZIP") -> None:
+    if hasattr(image, "media_type"):
+        # Since Blender 5.0 only formats of the medium can be chosen.
+        image.media_type = "MULTI_LAYER_IMAGE"
+    image.file_format, image.color_mode, image.color_depth, image.exr_codec = "OPEN_EXR_MULTILAYER", "RGBA", "32", codec
 
 
 def export(scene: Any, folder: str, selected_only: bool = False, with_render: bool = True) -> None:
@@ -197,10 +227,78 @@ def export(scene: Any, folder: str, selected_only: bool = False, with_render: bo
         set_up_render(scene, folder)
 
 
+BLURRED = "mrbokeh blur"
+"""Name of the image that holds the result, and of the node that shows it."""
+
+
+def blur_render(scene: Any, lens: str = "") -> dict[str, Any]:
+    """Blur what was rendered last; return the server's answer. Raises ValueError or Refused with one sentence."""
+    import bpy
+
+    check_blur(scene)
+    sharp, out = (os.path.join(bpy.app.tempdir, name) for name in ("mrbokeh_sharp.exr", "mrbokeh_blurred.exr"))
+    with _kept(scene.render.image_settings, ("media_type", "file_format", "color_mode", "color_depth", "exr_codec")):
+        _multilayer(scene.render.image_settings, "NONE")
+        try:
+            bpy.data.images["Render Result"].save_render(sharp, scene=scene)
+        except (KeyError, RuntimeError):
+            raise ValueError("there is no render yet: render the image first (F12)") from None
+    camera = scene.camera.evaluated_get(bpy.context.evaluated_depsgraph_get())
+    opening = camera.data.dof
+    asked = lens_request(film_of(scene, camera), _focus(camera), lens, opening.aperture_blades, math.degrees(opening.aperture_rotation))
+    answer = ask({"what": "render", "picture": sharp, "out": out, "overwrite": True, **asked})
+    os.remove(sharp)
+    _show(scene, out)
+    return answer
+
+
+def check_blur(scene: Any) -> None:
+    """Raise ValueError with one sentence if a render of the scene would be blurred wrongly."""
+    check_scene(scene)
+    render = scene.render
+    if scene.camera.data.dof.use_dof:
+        raise ValueError("the camera's own Depth of Field is on: switch it off and render again, so that nothing is blurred twice")
+    if not any(layer.use_pass_z for layer in scene.view_layers):
+        raise ValueError("the render has no depth: switch Z on (View Layer > Passes > Data) and render again")
+    if render.pixel_aspect_x != render.pixel_aspect_y or (render.use_border and render.use_crop_to_border):
+        raise ValueError("expected a whole picture with square pixels: set the pixel aspect to 1 and leave Crop to Render Region off")
+
+
+@contextmanager
+def _kept(settings: Any, names: tuple[str, ...]) -> Iterator[None]:
+    """Put settings back as they were, in that order, for one may decide what others may be."""
+    before = {name: getattr(settings, name) for name in names if hasattr(settings, name)}
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            setattr(settings, name, value)
+
+
+def _show(scene: Any, path: str) -> None:
+    """Make the picture the image BLURRED wherever that is shown, in the open Image Editors, and in a node of the compositor."""
+    import bpy
+
+    image, before = bpy.data.images.load(path), bpy.data.images.get(BLURRED)
+    image.pack()  # Blender's temporary folder goes when it ends
+    if before is not None:
+        before.user_remap(image)
+        bpy.data.images.remove(before)
+    image.name = BLURRED
+    # Since Blender 5.0 the compositor's nodes are a group of their own.
+    tree = getattr(scene, "compositing_node_group", None) or (scene.node_tree if getattr(scene, "use_nodes", False) else None)
+    if tree is not None:
+        node = tree.nodes.get(BLURRED) or tree.nodes.new("CompositorNodeImage")
+        node.name, node.label, node.image = BLURRED, BLURRED, image
+    for area in bpy.context.screen.areas if bpy.context.screen else ():
+        if area.type == "IMAGE_EDITOR":
+            area.spaces.active.image = image
+
+
 _registered: list[Any] = []
 
 
-def _operator() -> Any:
+def _operators() -> list[Any]:
     import bpy
     from bpy_extras.io_utils import ExportHelper
 
@@ -221,7 +319,49 @@ def _operator() -> Any:
                 return {"CANCELLED"}
             return {"FINISHED"}
 
-    return ExportMrbokeh
+    class BlurMrbokeh(bpy.types.Operator):  # type: ignore[misc]
+        """Blur the render by the camera's focus and f-stop, through a running `mrbokeh serve`"""
+
+        bl_idname = "render.mrbokeh_blur"
+        bl_label = "Blur the render"
+        render_first: bpy.props.BoolProperty(name="Render first", description="With Z, without Blender's own depth of field", default=False)
+
+        def execute(self, context: Any) -> set[str]:
+            scene = context.scene
+            try:
+                if self.render_first:
+                    check_scene(scene)
+                    scene.camera.data.dof.use_dof = False
+                    context.view_layer.use_pass_z = True
+                    bpy.ops.render.render()
+                answer = blur_render(scene, scene.mrbokeh_lens)
+            except (ValueError, Refused) as error:
+                self.report({"ERROR"}, str(error))
+                return {"CANCELLED"}
+            for warning in answer["warnings"]:
+                self.report({"WARNING"}, warning)
+            self.report({"INFO"}, "blurred in {:.1f} s: the image {!r}".format(answer["seconds"], BLURRED))
+            return {"FINISHED"}
+
+    class MrbokehPanel(bpy.types.Panel):  # type: ignore[misc]
+        """Focus, f-stop and lens, and the button that blurs"""
+
+        bl_idname = "IMAGE_PT_mrbokeh"
+        bl_label = bl_category = "mrbokeh"
+        bl_space_type, bl_region_type = "IMAGE_EDITOR", "UI"
+
+        def draw(self, context: Any) -> None:
+            layout, scene = self.layout, context.scene
+            if scene.camera is None:
+                layout.label(text="The scene has no camera")
+                return
+            focus = scene.camera.data.dof
+            for owner, name in ((focus, "focus_object"), (focus, "focus_distance"), (focus, "aperture_fstop"), (scene, "mrbokeh_lens")):
+                layout.prop(owner, name)
+            layout.operator("render.mrbokeh_blur").render_first = False
+            layout.operator("render.mrbokeh_blur", text="Render and blur").render_first = True
+
+    return [ExportMrbokeh, BlurMrbokeh, MrbokehPanel]
 
 
 def _menu(menu: Any, _context: Any) -> None:
@@ -232,8 +372,11 @@ def register() -> None:
     """Called by Blender when the add-on is switched on."""
     import bpy
 
-    _registered.append(_operator())
-    bpy.utils.register_class(_registered[-1])
+    told = "A lens file, a bank of kernels or a network of mrbokeh, or a name of `mrbokeh lens list`; empty for the camera's own opening"
+    bpy.types.Scene.mrbokeh_lens = bpy.props.StringProperty(name="Lens", description=told)
+    for each in _operators():
+        bpy.utils.register_class(each)
+        _registered.append(each)
     bpy.types.TOPBAR_MT_file_export.append(_menu)
 
 
@@ -244,3 +387,4 @@ def unregister() -> None:
     bpy.types.TOPBAR_MT_file_export.remove(_menu)
     while _registered:
         bpy.utils.unregister_class(_registered.pop())
+    del bpy.types.Scene.mrbokeh_lens
