@@ -30,6 +30,7 @@ _DISTORTION_SIGMA = 0.02
 _MOST_POINTS = 300
 """So many of the longest tracks are taken, and as many of the others at random: the longest may all be on what moves."""
 _STEPS, _TRIAL_STEPS, _TRIALS, _LEAST_GAIN, _LEAST_DAMPING = 60, 10, 6, 1e-5, 1e-9
+_RESTS_SCALES, _SORTED_OUT = 1.5, 2
 _FEWEST_COMMON = 8
 _TILTS_DEG = (0.0, 20.0, 40.0, 60.0)
 _TURNS = 8
@@ -133,7 +134,7 @@ class _Equations:
     view_side: np.ndarray
     point_side: np.ndarray
 
-    def reduced(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    def reduced(self, damping: float) -> tuple[np.ndarray, csr_array]:
         """Return (the equations of lens and views without the points (Schur's complement), shared C^-1), all damped."""
         inverse = np.linalg.inv(self._damped_points(damping))
         count = len(inverse)
@@ -286,8 +287,29 @@ def explained(tracks: FlowTracks, kind: str, focal: Focal) -> tuple[SimpleCamera
         return None
     best = min(tried, key=lambda each: each[1])[0]
     seen = replace(seen, sigma_px=max(_LEAST_SIGMA_PX, _SIGMAS * float(np.median(residuals_px(best, seen)))))
-    best, _ = fitted(best, seen, focal)
-    return with_focal_sigma(best, seen, focal), seen
+    return fitted(best, seen, focal)[0], seen
+
+
+def sorted_out(camera: SimpleCamera, seen: Observed, focal: Focal) -> SimpleCamera:
+    """Return the camera fitted to what rests alone, with how well its focal length is known."""
+    for _ in range(_SORTED_OUT):
+        resting = _only(seen, rests(camera, seen)[seen.points])
+        camera, _ = fitted(camera, resting, focal)
+    return with_focal_sigma(camera, seen, focal)
+
+
+def rests(camera: SimpleCamera, seen: Observed) -> Bool[np.ndarray, " points"]:
+    """Return which points do not move by themselves, by their median residuals; points that nobody sees do."""
+    medians_px = np.full(len(camera.points), np.inf)
+    medians_px[np.unique(seen.points)] = medians_of(residuals_px(camera, seen), seen.points)
+    return medians_px < _RESTS_SCALES * seen.scale_px
+
+
+def medians_of(values: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return the median of each point's values, for points in their order."""
+    order = np.argsort(points, kind="stable")
+    groups = np.split(values[order], np.flatnonzero(np.diff(points[order])) + 1)
+    return np.array([np.median(each, axis=0) for each in groups])
 
 
 def _fewer(tracks: FlowTracks) -> FlowTracks:

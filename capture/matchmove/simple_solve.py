@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float64
 from capture.matchmove.clip_solve import FLAT, TURNING, ClipSolve, FrameFit
 from capture.matchmove.flow_tracks import FlowTracks
 from capture.matchmove.keyframes import view_name
-from capture.matchmove.simple_cameras import Focal, Observed, SimpleCamera, across_of, explained, fitted, observed, residuals_px
+from capture.matchmove.simple_cameras import Focal, Observed, SimpleCamera, across_of, explained, fitted, medians_of, observed, residuals_px, rests, sorted_out
 from capture.poses.sparse_model import SparseModel, SparseView, undistorted_px
 from mrbokeh.optics.camera import Camera
 
@@ -52,7 +52,7 @@ def simple_solve(tracks: FlowTracks, keyframes: Sequence[int], focal: Focal, tim
     medians_px = {kind: float(np.median(residuals_px(*each))) for kind, each in found.items()}
     shares = {kind: _share(*each) for kind, each in found.items()}
     kind = _chosen(medians_px, shares, next(iter(found.values()))[1])
-    camera = found[kind][0]
+    camera = sorted_out(*found[kind], focal)
     model, fits = _of_all_frames(tracks, among, camera)
     if not fits:
         return None
@@ -112,23 +112,23 @@ def _of_all_frames(tracks: FlowTracks, among: FlowTracks, camera: SimpleCamera) 
     seen, frames, features = observed(among)
     points = _placed(camera, seen)
     start = replace(camera, points=points, across=_across(camera, points))
-    rests = _medians(residuals_px(start, seen), seen.points) < _FITS_SCALES * seen.scale_px
+    resting = rests(start, seen)
     numbered = np.full(int(tracks.features.max()) + 1, -1)
     numbered[features] = np.arange(len(features))
     poses, fits = {}, {}
     for first in range(0, tracks.frame_count, _AT_ONCE):
         part = tracks.only((tracks.frames >= first) & (tracks.frames < first + _AT_ONCE) & (numbered[tracks.features] >= 0))
-        solved, found = _posed(part, numbered, rests, start, frames)
+        solved, found = _posed(part, numbered, resting, start, frames)
         poses, fits = poses | solved, fits | found
     places = {number: index for index, number in enumerate(sorted(poses))}
-    kept = among.only(np.isin(among.frames, list(places)) & rests[numbered[among.features]])
+    kept = among.only(np.isin(among.frames, list(places)) & resting[numbered[among.features]])
     rows = np.array([places[each] for each in kept.frames.tolist()], np.int64)
     (width_px, height_px), far = tracks.size_px, FAR if camera.kind == TURNING else 1.0
     lens = Camera(width_px, height_px, (camera.focal_px,) * 2, (width_px / 2.0, height_px / 2.0))
     model = SparseModel(
         views=tuple(SparseView(view_name(n), replace(lens, camera_from_world=poses[n]), (camera.k1, 0.0)) for n in sorted(poses)),
         points=far * points,
-        errors_px=_medians(residuals_px(start, seen), seen.points),
+        errors_px=medians_of(residuals_px(start, seen), seen.points),
         observations=np.stack([rows, numbered[kept.features]], axis=1),
         observed_xy_px=kept.xy_px,
         left_out=tuple(view_name(number) for number in range(tracks.frame_count) if number not in places),
@@ -137,10 +137,10 @@ def _of_all_frames(tracks: FlowTracks, among: FlowTracks, camera: SimpleCamera) 
 
 
 def _posed(
-    part: FlowTracks, numbered: np.ndarray, rests: Bool[np.ndarray, " points"], start: SimpleCamera, frames: np.ndarray
+    part: FlowTracks, numbered: np.ndarray, at_rest: Bool[np.ndarray, " points"], start: SimpleCamera, frames: np.ndarray
 ) -> tuple[dict[int, Float64[np.ndarray, "4 4"]], dict[int, FrameFit]]:
     """Solve some frames against the points at rest, from the poses of the keyframes nearest to them."""
-    resting = part.only(rests[numbered[part.features]])
+    resting = part.only(at_rest[numbered[part.features]])
     enough = np.flatnonzero(np.bincount(resting.frames, minlength=part.frame_count) >= _FEWEST_POINTS)
     resting = resting.only(np.isin(resting.frames, enough))
     if not len(resting.frames):
@@ -171,16 +171,10 @@ def _placed(camera: SimpleCamera, seen: Observed) -> Float64[np.ndarray, "points
     poses = camera.poses[seen.views]
     rays = np.einsum("nji,nj->ni", poses[:, :3, :3], np.column_stack([straight / camera.focal_px, np.ones(len(straight))]))
     if camera.kind == TURNING:
-        directions = _medians(rays / np.linalg.norm(rays, axis=1, keepdims=True), seen.points)
+        directions = medians_of(rays / np.linalg.norm(rays, axis=1, keepdims=True), seen.points)
         return directions / np.linalg.norm(directions, axis=1, keepdims=True)
     normal = np.cross(*camera.across[0])
     centres = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
     along = (camera.points[0] @ normal - centres @ normal) / (rays @ normal)
-    return _medians(centres + along[:, None] * rays, seen.points)
+    return medians_of(centres + along[:, None] * rays, seen.points)
 
-
-def _medians(values: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Return the median of each point's values."""
-    order = np.argsort(points, kind="stable")
-    groups = np.split(values[order], np.flatnonzero(np.diff(points[order])) + 1)
-    return np.array([np.median(each, axis=0) for each in groups])
