@@ -14,15 +14,14 @@ if TYPE_CHECKING:
 
 HELP = "\n\n".join(
     (
-        "Find the camera of every frame of a clip: one that only turns (a pan from a tripod, a phone held still), one before a flat scene (a "
-        "wall, a chart, a floor), or a path through space, by COLMAP. The simplest that explains what is seen is taken and said.",
+        "Find the camera of every frame of a clip: one that only turns (a pan from a tripod, a phone held still), one before a flat scene "
+        "(a wall, a chart, a floor), or a path through space, by COLMAP. The simplest that explains what is seen is taken and said.",
         "The scale is arbitrary unless something of known size is told: a printed board in the clip (--board), two pixels on the ground "
         "and their distance (--ruler), or how far the camera went between two frames (--distance). --ground puts the world's floor under "
-        "three pixels or more, its origin under the first, x towards the second: what stands at 0,0,0 in a scene file stands there. z is up, "
-        "negative, as on a printed board and in scene files. A flat scene is its own floor. A camera that only turns sees no floor: "
-        "--horizon and --camera-height say where it is.",
-        "What was solved stays in --work: the same command with another --ground, --ruler or --horizon and --overwrite solves nothing anew. "
-        "An interrupted run goes on from there. Delete it to begin again.",
+        "three pixels or more, its origin under the first, x towards the second: what stands at 0,0,0 in a scene file stands there; up is "
+        "-z, as of a printed board. A flat scene is its own floor. A camera that only turns sees none: --horizon and --camera-height tell.",
+        "What was solved stays in --work: the same command with --overwrite and another --ground or --horizon solves nothing anew. "
+        "An interrupted run goes on from there. Delete that folder to begin again.",
         "Example:  mrbokeh capture matchmove clip.mp4 --out track.json --ground 0:300,900/1500,900/900,700 --ruler 0:300,900/1500,900/2.4",
         "Example:  mrbokeh capture matchmove pan.mp4 --out track.json --horizon 0:0,310/1920,296 --camera-height 1.6",
     )
@@ -43,7 +42,9 @@ def matchmove_command(
     ground: Annotated[str | None, typer.Option(metavar="FRAME:X,Y/X,Y/X,Y", help="pixels with flat ground between them")] = None,
     ruler: Annotated[str | None, typer.Option(metavar="FRAME:X,Y/X,Y/METRES", help="between two pixels on the ground")] = None,
     distance: Annotated[str | None, typer.Option(metavar="FRAME,FRAME,METRES", help="between the cameras of two frames")] = None,
-    horizon: Annotated[str | None, typer.Option(metavar="FRAME:X,Y/X,Y", help="of a camera that turns: two pixels of it, seen or not")] = None,
+    horizon: Annotated[
+        str | None, typer.Option(metavar="FRAME:X,Y/X,Y", help="of a camera that turns: two pixels of it, seen or not")
+    ] = None,
     camera_height: Annotated[float | None, typer.Option(metavar="METRES", help="above the ground, of a camera that turns")] = None,
     work: Annotated[Path | None, typer.Option(metavar="DIR", help="folder for what was solved; default: beside OUT")] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="replace the track; what was solved is used again")] = False,

@@ -69,7 +69,7 @@ class MatchmoveSettings:
 
 @dataclass(frozen=True)
 class Matchmove:
-    """The result. track: metric only with a scale. solve: in the track's world and unit. assumed: what was guessed of the world, in words."""
+    """The result. track: metric only with a scale. solve: in the track's world and unit. assumed: what was guessed, in words."""
 
     track: CameraTrack
     solve: ClipSolve
@@ -96,7 +96,9 @@ def matchmove_clip(clip: Path, work: Path, settings: MatchmoveSettings | None = 
 def _key(clip: Path, settings: MatchmoveSettings) -> dict[str, object]:
     stat = clip.stat()
     names = ("keyframes", "camera_model", "mapper", "max_image_size_px", "focal_length_35mm")
-    return {"clip": str(clip.resolve()), "bytes": stat.st_size, "modified_s": stat.st_mtime} | {name: getattr(settings, name) for name in names}
+    return {"clip": str(clip.resolve()), "bytes": stat.st_size, "modified_s": stat.st_mtime} | {
+        name: getattr(settings, name) for name in names
+    }
 
 
 def _solved(clip: Path, info: VideoInfo, work: Path, settings: MatchmoveSettings, *, fresh: bool) -> ClipSolve:
@@ -121,8 +123,8 @@ def _solved(clip: Path, info: VideoInfo, work: Path, settings: MatchmoveSettings
         if simple is not None and simple.usable:
             return simple.solve
         raise InputError(
-            f"{clip}: no match-move ({error}). Neither does a camera that turns, or one before a flat scene, explain it: film with the camera "
-            f"moving sideways past things that stand still, or track a printed board with `mrbokeh track`"
+            f"{clip}: no match-move ({error}). Neither does a camera that turns, or one before a flat scene, explain it: film with the "
+            f"camera moving sideways past things that stand still, or track a printed board with `mrbokeh track`"
         ) from None
 
 
@@ -150,7 +152,7 @@ def stated_focal(clip: Path, info: VideoInfo, focal_length_35mm: float | None) -
 
 
 def _focal_in_file_mm(clip: Path) -> float | None:
-    """Return the focal length on full frame that QuickTime metadata state of the photograph's whole sensor; video often takes less of it."""
+    """Return the focal length on full frame that QuickTime metadata state: of the whole sensor, of which video often takes less."""
     from mrbokeh.video.clip import opened
 
     with opened(clip) as (container, stream):

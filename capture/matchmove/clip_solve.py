@@ -20,7 +20,7 @@ _KEY_NAME = "solved_from.json"
 
 @dataclass(frozen=True)
 class FrameFit:
-    """How a frame fits. residual_px: median over its features that rest. fitting: the share of all its features that the camera explains."""
+    """How a frame fits. residual_px: median over its features that rest. fitting: the share of all that the camera explains."""
 
     residual_px: float
     fitting: float

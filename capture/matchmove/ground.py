@@ -70,7 +70,7 @@ def on_own_plane(solve: ClipSolve, picks: GroundPicks | None = None) -> SparseMo
     view = model.view(view_name(min(solve.fits)))
     middle_px = np.array(view.camera.principal_px)
     origin = _on_plane(view, middle_px, normal, offset)
-    moved = _moved_to(model, view, np.array([middle_px, middle_px + (0.1 * view.camera.width_px, 0.0)]), normal, offset)
+    moved = _moved_to(model, view, middle_px + np.array([[0.0, 0.0], [0.1 * view.camera.width_px, 0.0]]), normal, offset)
     return replace(moved.times(1.0 / float(np.linalg.norm(origin - view.centre))), metres_per_unit=None)
 
 

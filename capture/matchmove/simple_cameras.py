@@ -186,7 +186,9 @@ def _equations(camera: SimpleCamera, seen: Observed, focal: Focal, *, poses_only
     of_view = np.concatenate([by_lens, by_pose], axis=2)
     weighted, side = of_view * weights[:, None, None], off[:, :, None]
     per_view, views, points = by_pose.shape[2], len(camera.poses), len(camera.points)
-    places = np.concatenate([np.broadcast_to(np.arange(2), (len(off), 2)), 2 + per_view * seen.views[:, None] + np.arange(per_view)], axis=1)
+    places = np.concatenate(
+        [np.broadcast_to(np.arange(2), (len(off), 2)), 2 + per_view * seen.views[:, None] + np.arange(per_view)], axis=1
+    )
     count = 2 + per_view * views
     squares, shares = weighted.transpose(0, 2, 1) @ of_view, weighted.transpose(0, 2, 1) @ by_point
     matrix = _summed((squares, places[:, :, None], places[:, None, :]), (count, count)).toarray()

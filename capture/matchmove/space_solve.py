@@ -51,7 +51,7 @@ def require_translation(clip: Path, model: SparseModel) -> None:
             f"{clip}: COLMAP placed {len(model.views)} keyframes by {points:.0f} points each, too few to trust: film more texture with the "
             f"camera moving sideways (one that only rotates gives no points), or track a printed board"
         )
-    rotating_px, model_px = rotation_only_residual_px(model), float(np.median(_off_px(model)))
+    rotating_px, model_px = rotation_only_residual_px(model), float(np.median(off_px(model)))
     if rotating_px < max(_ROTATES_AS_WELL * model_px, _ROTATES_PX):
         raise InputError(
             f"{clip}: the camera seems only to rotate (rotation alone explains the clip to {rotating_px:.2f} px, a path through space to "
@@ -83,7 +83,7 @@ def rotation_only_residual_px(model: SparseModel) -> float:
     return np.inf if found is None else float(np.median(residuals_px(*found)))
 
 
-def _off_px(model: SparseModel) -> np.ndarray:
+def off_px(model: SparseModel) -> np.ndarray:
     """Return the reprojection error of each observation."""
     off = np.zeros(len(model.observations))
     for index, view in enumerate(model.views):
@@ -105,13 +105,13 @@ def _with_all_frames(clip: Path, info: VideoInfo, model: SparseModel) -> ClipSol
             found |= _stretch(model, stretch, first, views)
             first, stretch = number, stretch[-1:]
     found |= _stretch(model, stretch, first, views)
-    off_px = _off_px(model)
-    fits = {n: FrameFit(float(np.median(off_px[model.observations[:, 0] == index])), 1.0) for index, n in enumerate(views)}
+    each_px = off_px(model)
+    fits = {n: FrameFit(float(np.median(each_px[model.observations[:, 0] == index])), 1.0) for index, n in enumerate(views)}
     fits |= {n: FrameFit(pose.residual_px, pose.fitting) for n, pose in found.items()}
     parallax_deg = median_parallax_deg(model)
     return ClipSolve(
         kind=SPACE,
-        model=_of_all(model, views, found),
+        model=_of_all(model, found),
         times_s=tuple(times_s),
         keyframes=tuple(views),
         fits=fits,
@@ -121,7 +121,7 @@ def _with_all_frames(clip: Path, info: VideoInfo, model: SparseModel) -> ClipSol
     )
 
 
-def _of_all(model: SparseModel, views: Mapping[int, SparseView], found: Mapping[int, FramePose]) -> SparseModel:
+def _of_all(model: SparseModel, found: Mapping[int, FramePose]) -> SparseModel:
     """Return the model with a view for every frame; only keyframes have observations, and come first."""
     others = tuple(SparseView(view_name(number), pose.camera, pose.distortion) for number, pose in sorted(found.items()))
     return SparseModel(

@@ -66,7 +66,9 @@ def wall_points(count: int = 500) -> np.ndarray:
 
 
 def solved(tracks: FlowTracks, focal: Focal | None = None) -> ClipSolve:
-    found = simple_solve(tracks, range(0, tracks.frame_count, 2), focal or Focal(320.0), [number / 25.0 for number in range(tracks.frame_count)])
+    found = simple_solve(
+        tracks, range(0, tracks.frame_count, 2), focal or Focal(320.0), [number / 25.0 for number in range(tracks.frame_count)]
+    )
     assert found is not None and found.usable
     return found.solve
 
@@ -121,7 +123,7 @@ def test_a_room_with_depth_is_left_to_colmap() -> None:
 
 
 def test_a_turning_camera_stands_over_the_ground_that_its_horizon_tells() -> None:
-    """The cameras are level in their room, so that its horizon is y = 0 far away: two directions 30 degrees apart, seen by the first frame."""
+    """The cameras are level in their room, so that its horizon is y = 0 far away: two directions 30 degrees apart."""
     cameras = turning()
     solve = solved(tracks_of(cameras, room_points()), Focal(FOCAL_PX, 0.0))
     far = cameras[0].project(1e6 * np.array([[-0.5, 0.0, 1.0], [0.05, 0.0, 1.0]]))[0]
