@@ -21,7 +21,8 @@ HELP = "\n\n".join(
         "three pixels or more, its origin under the first, x towards the second: what stands at 0,0,0 in a scene file stands there; up is "
         "-z, as of a printed board. A flat scene is its own floor. A camera that only turns sees none: --horizon and --camera-height tell.",
         "What was solved stays in --work: the same command with --overwrite and another --ground or --horizon solves nothing anew. "
-        "An interrupted run goes on from there. Delete that folder to begin again.",
+        "Delete that folder to begin again. Beside the track TRACK.html "
+        "shows how each frame fits, and a grid on the ground.",
         "Example:  mrbokeh capture matchmove clip.mp4 --out track.json --ground 0:300,900/1500,900/900,700 --ruler 0:300,900/1500,900/2.4",
         "Example:  mrbokeh capture matchmove pan.mp4 --out track.json --horizon 0:0,310/1920,296 --camera-height 1.6",
     )
@@ -51,13 +52,15 @@ def matchmove_command(
 ) -> None:
     from capture.matchmove.clip_matchmove import MatchmoveSettings, matchmove_clip
     from capture.matchmove.ground import parse_frame_distance, parse_ground, parse_horizon, parse_ruler
+    from capture.matchmove.solve_page import write_solve_page
     from mrbokeh.system.console import kept_when_interrupted
     from mrbokeh.tracking.camera_track.formats import format_of_name, write_track
     from mrbokeh.tracking.charuco.board import read_board
 
     if not clip.is_file():
         raise InputError(f"expected a video at {clip}, but {'it is a folder' if clip.is_dir() else 'there is none'}")
-    require_safe_outputs((out,), (clip, board), overwrite)
+    page = out.with_name(f"{out.stem}.html")
+    require_safe_outputs((out, page), (clip, board), overwrite)
     format_of_name(out)
     for name, value in (("--focal-length", focal_length), ("--camera-height", camera_height)):
         if value is not None and not 0.0 < value < float("inf"):
@@ -79,13 +82,14 @@ def matchmove_command(
     with kept_when_interrupted(f"keyframes and what was solved, as far as it is finished, are kept in {folder}"):
         made = matchmove_clip(clip, folder, settings)
     missing = write_track(out, made.track)
+    write_solve_page(page, clip, made)
     scales = (("board", board), ("ruler", ruler), ("distance", distance), ("camera-height", camera_height))
-    _tell(out, made, next((name for name, told in scales if told), None))
+    _tell(out, page, made, next((name for name, told in scales if told), None))
     if missing:
         warn(f"{out} cannot hold and lacks: {', '.join(missing)}")
 
 
-def _tell(out: Path, made: "Matchmove", told_by: str | None) -> None:
+def _tell(out: Path, page: Path, made: "Matchmove", told_by: str | None) -> None:
     solve = made.solve
     say(f"solved as {solve.why}")
     guess(f"nothing tells it: mrbokeh takes {' and '.join(made.assumed)}" if made.assumed else "")
@@ -102,4 +106,6 @@ def _tell(out: Path, made: "Matchmove", told_by: str | None) -> None:
         parallax_deg=solve.parallax_deg,
     )
     if solve.warnings:
-        warn(f"this track may be wrong: {'; '.join(solve.warnings)}; lay a grid on the ground and look before you trust it")
+        warn(f"this track may be wrong: {'; '.join(solve.warnings)}; look at the grid in {page} before you trust it")
+    else:
+        say(f"{page} shows a grid in it, and the frames that fit worst")

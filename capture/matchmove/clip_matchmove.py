@@ -73,6 +73,7 @@ class Matchmove:
 
     track: CameraTrack
     solve: ClipSolve
+    has_ground: bool
     assumed: tuple[str, ...] = ()
 
 
@@ -179,7 +180,8 @@ def _standing(solve: ClipSolve, settings: MatchmoveSettings, pictures: Path) -> 
     model = _scaled(model, solve, settings, pictures)
     views = {frame_of(view.name): view for view in model.views}
     frames = {number: _tracked(views[number], solve.times_s[number]) for number in sorted(views)}
-    return Matchmove(CameraTrack(frames, "-y", model.metres_per_unit is not None).with_up("-z"), replace(solve, model=model), assumed)
+    made = CameraTrack(frames, "-y", model.metres_per_unit is not None).with_up("-z")
+    return Matchmove(made, replace(solve, model=model), solve.kind != SPACE or settings.ground is not None, assumed)
 
 
 def _scaled(model: SparseModel, solve: ClipSolve, settings: MatchmoveSettings, pictures: Path) -> SparseModel:

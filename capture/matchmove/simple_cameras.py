@@ -29,8 +29,9 @@ _DISTORTION_SIGMA = 0.02
 """Of the distance from the middle, in the corner."""
 _MOST_POINTS = 300
 """So many of the longest tracks are taken, and as many of the others at random: the longest may all be on what moves."""
-_STEPS, _TRIAL_STEPS, _TRIALS, _LEAST_GAIN, _LEAST_DAMPING = 60, 10, 6, 1e-5, 1e-9
+_STEPS, _TRIAL_STEPS, _TRIALS, _LEAST_GAIN, _LEAST_DAMPING = 60, 10, 6, 1e-5, 1e-6
 _RESTS_SCALES, _SORTED_OUT = 1.5, 2
+_NO_DAMPING = 1e-12
 _FEWEST_COMMON = 8
 _TILTS_DEG = (0.0, 20.0, 40.0, 60.0)
 _TURNS = 8
@@ -117,7 +118,7 @@ def fitted(
 def with_focal_sigma(camera: SimpleCamera, seen: Observed, focal: Focal) -> SimpleCamera:
     """Return the camera with how well its focal length is known, all else free."""
     equations = _equations(camera, seen, focal)
-    reduced, _ = equations.reduced(_LEAST_DAMPING)
+    reduced, _ = equations.reduced(_NO_DAMPING)
     first = np.zeros(len(reduced))
     first[0] = 1.0
     variance = seen.sigma_px**2 * float(np.linalg.lstsq(reduced, first, rcond=None)[0][0])
@@ -140,7 +141,7 @@ class _Equations:
         count = len(inverse)
         blocks = bsr_array((inverse, np.arange(count), np.arange(count + 1)), shape=(2 * count, 2 * count))
         through = self.shared @ blocks
-        views = self.views + np.diag(damping * np.diagonal(self.views) + _LEAST_DAMPING)
+        views = self.views + np.diag(damping * np.diagonal(self.views) + _NO_DAMPING)
         return views - (through @ self.shared.T).toarray(), through
 
     def solved(self, damping: float) -> tuple[np.ndarray, np.ndarray]:
@@ -151,7 +152,7 @@ class _Equations:
         return of_views, np.linalg.solve(self._damped_points(damping), rest)[:, :, 0]
 
     def _damped_points(self, damping: float) -> np.ndarray:
-        return self.points + (damping * np.einsum("nii->ni", self.points) + _LEAST_DAMPING)[:, :, None] * np.eye(2)
+        return self.points + (damping * np.einsum("nii->ni", self.points) + _NO_DAMPING)[:, :, None] * np.eye(2)
 
 
 def _cost(camera: SimpleCamera, seen: Observed, focal: Focal) -> float:
@@ -191,9 +192,11 @@ def _equations(camera: SimpleCamera, seen: Observed, focal: Focal, *, poses_only
     )
     count = 2 + per_view * views
     squares, shares = weighted.transpose(0, 2, 1) @ of_view, weighted.transpose(0, 2, 1) @ by_point
-    matrix = _summed((squares, places[:, :, None], places[:, None, :]), (count, count)).toarray()
+    flat = count * places[:, :, None] + places[:, None, :]
+    matrix = np.bincount(flat.ravel(), squares.ravel(), count * count).reshape(count, count)
     columns = 2 * seen.points[:, None] + np.arange(2)
-    shared = _summed((shares, places[:, :, None], columns[:, None, :]), (count, 2 * points))
+    values, rows, across = np.broadcast_arrays(shares, places[:, :, None], columns[:, None, :])
+    shared = csr_array((values.ravel(), (rows.ravel(), across.ravel())), shape=(count, 2 * points))
     of_points = np.zeros((points, 2, 2))
     np.add.at(of_points, seen.points, weights[:, None, None] * by_point.transpose(0, 2, 1) @ by_point)
     view_side = np.bincount(places.ravel(), (weighted.transpose(0, 2, 1) @ side).ravel(), count)
@@ -204,19 +207,13 @@ def _equations(camera: SimpleCamera, seen: Observed, focal: Focal, *, poses_only
     return _Equations(matrix, shared, of_points, view_side, point_side)
 
 
-def _summed(entries: tuple[np.ndarray, np.ndarray, np.ndarray], shape: tuple[int, int]) -> csr_array:
-    """Return a matrix in which entries of one place are summed. entries: values, rows, columns."""
-    values, rows, columns = np.broadcast_arrays(*entries)
-    return csr_array((values.ravel(), (rows.ravel(), columns.ravel())), shape=shape)
-
-
 def _moved(camera: SimpleCamera, of_views: np.ndarray, of_points: np.ndarray) -> SimpleCamera:
     views = of_views[2:].reshape(len(camera.poses), -1)
     poses = camera.poses.copy()
     poses[:, :3, :3] = Rotation.from_rotvec(views[:, :3]).as_matrix() @ camera.poses[:, :3, :3]
     if camera.kind == FLAT:
         poses[:, :3, 3] += views[:, 3:]
-    points = camera.points + np.einsum("nk,nki->ni", np.clip(of_points, -0.5, 0.5), camera.across)
+    points = camera.points + np.einsum("nk,nki->ni", of_points, camera.across)
     if camera.kind == TURNING:
         points = points / np.linalg.norm(points, axis=1, keepdims=True)
     return replace(
