@@ -77,5 +77,5 @@ def read_solve(folder: Path) -> ClipSolve | None:
         return None
     kept = read_json(folder / SOLVE_NAME, "a solved clip")
     fits = {int(number): FrameFit(**each) for number, each in kept.pop("fits").items()}
-    lists = {name: tuple(kept.pop(name)) for name in ("times_s", "keyframes", "warnings")}
-    return ClipSolve(model=read_sparse_model(folder / "solve"), fits=fits, **lists, **kept)
+    kept |= {name: tuple(kept[name]) for name in ("times_s", "keyframes", "warnings")}
+    return ClipSolve(model=read_sparse_model(folder / "solve"), fits=fits, **kept)

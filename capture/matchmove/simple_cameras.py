@@ -21,9 +21,9 @@ from capture.matchmove.flow_tracks import FlowTracks
 _OFF_PX = 1.0
 """Scale of Cauchy's weights, at a width of 1280."""
 
-_SIGMAS, _LEAST_SIGMA_PX = 3.0, 0.3
-"""Error of a feature over the median residual, and at least, for what the views know of the focal length: features that drift together are
-no independent observations."""
+_SIGMAS, _LEAST_SIGMA_PX = 12.0, 0.3
+"""Error of a feature over the median residual, and at least, for what the views know of the focal length: features drift together, and
+rolling shutters bend all of them alike, so that an iPhone's chart told 15 % too much with 3."""
 
 _DISTORTION_SIGMA = 0.02
 """Of the distance from the middle, in the corner."""
@@ -203,7 +203,8 @@ def _equations(camera: SimpleCamera, seen: Observed, focal: Focal, *, poses_only
     point_side = np.bincount(columns.ravel(), (weights[:, None, None] * by_point.transpose(0, 2, 1) @ side).ravel(), 2 * points)
     told = _told(camera, seen, focal)
     matrix[[0, 1], [0, 1]] += told
-    view_side[:2] -= 0.0 if poses_only else told * (np.log(camera.focal_px / focal.px), camera.k1)
+    if not poses_only:
+        view_side[:2] -= told * np.array([np.log(camera.focal_px / focal.px), camera.k1])
     return _Equations(matrix, shared, of_points, view_side, point_side)
 
 
@@ -259,7 +260,7 @@ def homographies(tracks: FlowTracks, frames: np.ndarray) -> list[np.ndarray] | N
         if len(there[0]) < _FEWEST_COMMON:
             return None
         cv2.setRNGSeed(0)
-        found, _ = cv2.findHomography(*there, cv2.USAC_MAGSAC, wrong_px)
+        found, _ = cv2.findHomography(there[0], there[1], cv2.USAC_MAGSAC, wrong_px)
         if found is None or not np.isfinite(found).all():
             return None
         steps.append(found)
@@ -371,8 +372,8 @@ def _posed_before_plane(
         rows = seen.views == view
         if np.count_nonzero(rows) < _FEWEST_COMMON:
             return None
-        turn, shift = np.zeros(3), np.zeros(3)
-        _, turn, shift = cv2.solvePnP(points[seen.points[rows]], seen.offsets_px[rows], matrix, None, turn, shift, True)
+        start = np.zeros(3), np.zeros(3)
+        _, turn, shift = cv2.solvePnP(points[seen.points[rows]], seen.offsets_px[rows], matrix, None, *start, True)
         poses[view, :3, :3], poses[view, :3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
     across = np.broadcast_to(across_of(normal[None])[0], (len(points), 2, 3))
     return SimpleCamera(FLAT, focal_px, 0.0, poses, points, across)

@@ -130,7 +130,8 @@ def _of_all_frames(tracks: FlowTracks, among: FlowTracks, camera: SimpleCamera) 
     resting = rests(start, seen)
     numbered = np.full(int(tracks.features.max()) + 1, -1)
     numbered[features] = np.arange(len(features))
-    poses, fits = {}, {}
+    poses: dict[int, Float64[np.ndarray, "4 4"]] = {}
+    fits: dict[int, FrameFit] = {}
     for first in range(0, tracks.frame_count, _AT_ONCE):
         part = tracks.only((tracks.frames >= first) & (tracks.frames < first + _AT_ONCE) & (numbered[tracks.features] >= 0))
         solved, found = _posed(part, numbered, resting, start, frames)
@@ -164,7 +165,9 @@ def _posed(
     rows = replace(rows, points=numbered[resting.features])
     nearest = np.abs(frames[None] - numbers[:, None]).argmin(axis=1)
     solved, _ = fitted(replace(start, poses=start.poses[nearest]), rows, Focal(start.focal_px), poses_only=True)
-    off_px, poses, fits = residuals_px(solved, rows), {}, {}
+    off_px = residuals_px(solved, rows)
+    poses: dict[int, Float64[np.ndarray, "4 4"]] = {}
+    fits: dict[int, FrameFit] = {}
     for view, number in enumerate(numbers.tolist()):
         mine = off_px[rows.views == view]
         fit = FrameFit(
