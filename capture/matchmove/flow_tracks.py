@@ -20,7 +20,7 @@ _EDGE_PX = 3.0
 
 @dataclass(frozen=True)
 class FlowTracks:
-    """Where features are seen: one row for each feature in each frame, frame after frame. size_px: (width, height) of the pictures."""
+    """Places of features: one row for each feature in each frame, frame after frame. size_px: (width, height) of the pictures."""
 
     frames: Int64[np.ndarray, " seen"]
     features: Int64[np.ndarray, " seen"]

@@ -42,7 +42,7 @@ _FOCAL_STARTS = (1.0, 0.7, 1.45)
 
 @dataclass(frozen=True)
 class Focal:
-    """What is known of the focal length before the clip is looked at. sigma: of its logarithm; 0 if it is known."""
+    """Prior knowledge of the focal length, before the clip is looked at. sigma: of its logarithm; 0 if it is known."""
 
     px: float
     sigma: float = 0.35
@@ -52,8 +52,8 @@ class Focal:
 class SimpleCamera:
     """A clip explained simply.
 
-    kind: TURNING or FLAT. poses: camera_from_world of each view; without shift if it turns. points: directions, or places on the plane, of
-    normal `across`[0] x `across`[1]. numbers: of the frames and of the features, in that order. weights: from 0 to 1, of each observation.
+    kind: TURNING or FLAT. poses: camera_from_world of each view; without shift if it turns. points: directions, or places on the plane.
+    across: two directions in which each point may move, square to it or along the plane. focal_sigma: relative.
     """
 
     kind: str
@@ -205,7 +205,7 @@ def _equations(camera: SimpleCamera, seen: Observed, focal: Focal, *, poses_only
     matrix[[0, 1], [0, 1]] += told
     if not poses_only:
         view_side[:2] -= told * np.array([np.log(camera.focal_px / focal.px), camera.k1])
-    return _Equations(matrix, shared, of_points, view_side, point_side)
+    return _Equations(views=matrix, shared=shared, points=of_points, view_side=view_side, point_side=point_side)
 
 
 def _moved(camera: SimpleCamera, of_views: np.ndarray, of_points: np.ndarray) -> SimpleCamera:
@@ -247,7 +247,13 @@ def observed(tracks: FlowTracks) -> tuple[Observed, np.ndarray, np.ndarray]:
     features, points = np.unique(tracks.features, return_inverse=True)
     middle = np.array(tracks.size_px) / 2.0
     scale_px = max(0.5, _OFF_PX * tracks.size_px[0] / 1280)
-    seen = Observed(views.astype(np.int64), points.astype(np.int64), tracks.xy_px - middle, scale_px, float(np.hypot(*middle)))
+    seen = Observed(
+        views=views.astype(np.int64),
+        points=points.astype(np.int64),
+        offsets_px=tracks.xy_px - middle,
+        scale_px=scale_px,
+        corner_px=float(np.hypot(*middle)),
+    )
     return seen, frames, features
 
 
@@ -336,7 +342,7 @@ def _started(seen: Observed, chain: list[np.ndarray], places: np.ndarray, kind: 
         turns = [_nearest_turn(np.linalg.inv(lens) @ each @ lens) for each in chain]
         poses = np.tile(np.eye(4), (len(chain), 1, 1))
         poses[:, :3, :3] = turns
-        return [SimpleCamera(kind, focal_px, 0.0, poses, rays, across_of(rays))]
+        return [SimpleCamera(kind=kind, focal_px=focal_px, k1=0.0, poses=poses, points=rays, across=across_of(rays))]
     found = []
     for normal in _normals():
         ahead = rays @ normal
@@ -376,7 +382,7 @@ def _posed_before_plane(
         _, turn, shift = cv2.solvePnP(points[seen.points[rows]], seen.offsets_px[rows], matrix, None, *start, True)
         poses[view, :3, :3], poses[view, :3, 3] = cv2.Rodrigues(turn)[0], np.ravel(shift)
     across = np.broadcast_to(across_of(normal[None])[0], (len(points), 2, 3))
-    return SimpleCamera(FLAT, focal_px, 0.0, poses, points, across)
+    return SimpleCamera(kind=FLAT, focal_px=focal_px, k1=0.0, poses=poses, points=points, across=across)
 
 
 def _only(seen: Observed, rows: Bool[np.ndarray, " seen"]) -> Observed:

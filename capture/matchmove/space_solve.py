@@ -5,6 +5,7 @@ point. The simple explanation is tried on COLMAP's own observations. If it fits 
 """
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -78,7 +79,9 @@ def rotation_only_residual_px(model: SparseModel) -> float:
     camera = model.views[0].camera
     views, points = model.observations.T.astype(np.int64)
     size_px = (camera.width_px, camera.height_px)
-    tracks = FlowTracks(views, points, model.observed_xy_px.astype(np.float64), size_px, len(model.views))
+    tracks = FlowTracks(
+        frames=views, features=points, xy_px=model.observed_xy_px.astype(np.float64), size_px=size_px, frame_count=len(model.views)
+    )
     found = explained(tracks, TURNING, Focal(camera.focal_px[0]))
     return np.inf if found is None else float(np.median(residuals_px(*found)))
 
@@ -124,9 +127,7 @@ def _with_all_frames(clip: Path, info: VideoInfo, model: SparseModel) -> ClipSol
 def _of_all(model: SparseModel, found: Mapping[int, FramePose]) -> SparseModel:
     """Return the model with a view for every frame; only keyframes have observations, and come first."""
     others = tuple(SparseView(view_name(number), pose.camera, pose.distortion) for number, pose in sorted(found.items()))
-    return SparseModel(
-        (*model.views, *others), model.points, model.errors_px, model.observations, model.observed_xy_px, left_out=model.left_out
-    )
+    return replace(model, views=(*model.views, *others))
 
 
 def _stretch(model: SparseModel, greys: list[Grey], first: int, views: Mapping[int, SparseView]) -> dict[int, FramePose]:

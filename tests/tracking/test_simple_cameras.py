@@ -51,7 +51,13 @@ def tracks_of(cameras: Sequence[Camera], points: np.ndarray, noise_px: float = 0
         features.append(inside)
         places.append(xy_px[inside])
     size_px = (cameras[0].width_px, cameras[0].height_px)
-    return FlowTracks(np.concatenate(frames), np.concatenate(features), np.concatenate(places), size_px, len(cameras))
+    return FlowTracks(
+        frames=np.concatenate(frames),
+        features=np.concatenate(features),
+        xy_px=np.concatenate(places),
+        size_px=size_px,
+        frame_count=len(cameras),
+    )
 
 
 def room_points(count: int = 600) -> np.ndarray:
