@@ -149,11 +149,11 @@ FlatPrint = CharucoBoard | Chessboard | TagGrid | FlatPicture
 def read_picture(path: Path, width_m: float) -> FlatPicture:
     """Read a picture that was printed so wide."""
     from mrbokeh.images.color import display_rgb8
-    from mrbokeh.images.image_io import read_linear
+    from mrbokeh.images.image_io import read_image
 
     if not 0.0 < width_m < float("inf"):
         raise InputError(f"--width: expected the width of the printed picture in metres, above 0, got {width_m:g}")
-    grey = cv2.cvtColor(display_rgb8(read_linear(path)), cv2.COLOR_RGB2GRAY)
+    grey = cv2.cvtColor(display_rgb8(read_image(path)), cv2.COLOR_RGB2GRAY)
     factor = min(1.0, _PICTURE_PX / max(grey.shape))
     grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA) if factor < 1.0 else grey
     return FlatPicture(np.asarray(grey, np.uint8), width_m, str(path))
@@ -280,8 +280,17 @@ class _TagFinder:
         return None
 
 
+_ENLARGED_UP_TO_PX = 640
 _RATIO, _WRONG_PX, _FEWEST_MATCHES, _FEWEST_SHARE = 0.75, 3.0, 12, 0.3
 _LEAST_SCALE = 0.05
+_SMOOTHED_PX = (0.0, 2.0)
+"""Of the print and the frame before flow: a frame blurred by motion has little in common with a sharp print."""
+
+
+def _stretched(grey: Grey) -> Grey:
+    """Return the frame with its whole range of brightness: SIFT and flow find nothing in a dim one."""
+    low, high = np.percentile(grey[::4, ::4], (1.0, 99.5))
+    return cv2.convertScaleAbs(np.clip(grey, low, high) - low, alpha=255.0 / max(high - low, 8.0))
 
 
 class _PictureFinder:
@@ -294,14 +303,17 @@ class _PictureFinder:
         self._matcher = cv2.BFMatcher(cv2.NORM_L2)
 
     def detect(self, grey: Grey) -> Corners:
-        keypoints, descriptors = self._sift.detectAndCompute(grey, None)
+        grey = _stretched(grey)
+        enlarged = 2 if max(grey.shape) <= _ENLARGED_UP_TO_PX else 1
+        searched = cv2.resize(grey, None, fx=enlarged, fy=enlarged, interpolation=cv2.INTER_CUBIC) if enlarged > 1 else grey
+        keypoints, descriptors = self._sift.detectAndCompute(searched, None)
         if descriptors is None or len(keypoints) < _FEWEST_MATCHES:
             return NO_CORNERS
         pairs = [each for each in self._matcher.knnMatch(self._descriptors, descriptors, 2) if len(each) == 2]
         good = [one for one, other in pairs if one.distance < _RATIO * other.distance]
         if len(good) < _FEWEST_MATCHES:
             return NO_CORNERS
-        there = np.array([keypoints[each.trainIdx].pt for each in good])
+        there = (np.array([keypoints[each.trainIdx].pt for each in good]) + 0.5) / enlarged - 0.5
         homography, kept = cv2.findHomography(self._places[[each.queryIdx for each in good]], there, cv2.USAC_MAGSAC, _WRONG_PX)
         if homography is None or np.count_nonzero(kept) < _FEWEST_MATCHES:
             return NO_CORNERS
@@ -311,7 +323,7 @@ class _PictureFinder:
         if len(start) < _FEWEST_MATCHES:
             return None
         homography, _ = cv2.findHomography(self._picture.points_px[start.ids] - 0.5, start.xy_px - 0.5, cv2.USAC_MAGSAC, _WRONG_PX)
-        return None if homography is None else self._laid_over(grey, homography)
+        return None if homography is None else self._laid_over(_stretched(grey), homography)
 
     def _laid_over(self, grey: Grey, frame_from_picture: np.ndarray) -> Corners | None:
         """Return the picture's points where flow from the warped picture finds them; None if most are not found nearby."""
@@ -323,14 +335,16 @@ class _PictureFinder:
         ids = np.flatnonzero(np.isfinite(start).all(axis=1) & (start > 4).all(axis=1) & (start < (width - 4, height - 4)).all(axis=1))
         if len(ids) < _FEWEST_MATCHES:
             return None
-        # Flow takes brightness as it is: the print is given the frame's.
+        # Flow takes brightness as it is: the print is given the frame's, and the frame around it.
         (middle, spread), (wanted, wanted_spread) = ((values.mean(), values.std() + 1.0) for values in (warped[seen], grey[seen]))
-        shown = np.clip((warped - middle) * (wanted_spread / spread) + wanted, 0, 255).astype(np.uint8)
-        places, good = flow(shown, grey, start[ids])
-        good &= np.linalg.norm(places - start[ids], axis=1) < 2.0 * _WRONG_PX
-        if np.count_nonzero(good) < max(_FEWEST_MATCHES, _FEWEST_SHARE * len(ids)):
-            return None
-        return Corners(ids[good], places[good])
+        shown = np.where(seen, np.clip((warped - middle) * (wanted_spread / spread) + wanted, 0, 255).astype(np.uint8), grey)
+        for sigma_px in _SMOOTHED_PX:
+            one, other = ((each if not sigma_px else cv2.GaussianBlur(each, (0, 0), sigma_px)) for each in (shown, grey))
+            places, good = flow(one, other, start[ids])
+            good &= np.linalg.norm(places - start[ids], axis=1) < 2.0 * _WRONG_PX
+            if np.count_nonzero(good) >= max(_FEWEST_MATCHES, _FEWEST_SHARE * len(ids)):
+                return Corners(ids[good], places[good])
+        return None
 
     def _warped(self, frame_from_picture: np.ndarray, size_px: tuple[int, int]) -> tuple[np.ndarray | None, np.ndarray]:
         """Return (the picture as the frame would see it, where it is seen); None where the homography folds it or leaves it tiny."""
