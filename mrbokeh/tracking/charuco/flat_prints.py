@@ -10,15 +10,15 @@ A board file says by its `kind` what is printed; without one it is a ChArUco boa
                                  first_marker = 0                  # ids go on from there, row by row from the top left
 
 Axes and places are those of `charuco.board`: the origin is the outer top left corner of the first square or tag, or of the picture. A
-chessboard's first square is black; one that looks alike after half a turn (both numbers even or both odd) keeps the way round of the frame
-before.
+chessboard's first square is black; one that looks alike after half a turn (both numbers even or both odd) is taken to begin at the top left
+of the first frame that shows it, and keeps that way round.
 """
 
 import tomllib
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import cv2
 import numpy as np
@@ -34,6 +34,7 @@ from mrbokeh.tracking.charuco.detector import NO_CORNERS, CharucoDetector, Corne
 _TAGS = "DICT_APRILTAG_36h11"
 
 
+@runtime_checkable
 class Finder(Protocol):
     """Search for a print in frames. Not to be shared between threads."""
 
@@ -238,7 +239,9 @@ class _ChessboardFinder:
         turned = Corners(np.arange(len(places)), places[::-1])
         if self._tells:
             corners = max((corners, turned), key=lambda each: self._blackness(grey, each))
-        elif self._before is not None:
+        elif self._before is None:
+            corners = min((corners, turned), key=lambda each: float(each.xy_px[0].sum()))
+        else:
             before = self._before.xy_px
             corners = min((corners, turned), key=lambda each: float(np.linalg.norm(each.xy_px - before)))
         self._before = corners
@@ -281,7 +284,7 @@ class _TagFinder:
 
 
 _ENLARGED_UP_TO_PX = 640
-_RATIO, _WRONG_PX, _FEWEST_MATCHES, _FEWEST_SHARE = 0.75, 3.0, 12, 0.3
+_RATIO, _WRONG_PX, _FEWEST_MATCHES, _FEWEST_SHARE, _SURE_SHARE = 0.75, 3.0, 12, 0.3, 0.6
 _LEAST_SCALE = 0.05
 _SMOOTHED_PX = (0.0, 2.0)
 """Of the print and the frame before flow: a frame blurred by motion has little in common with a sharp print."""
@@ -301,9 +304,12 @@ class _PictureFinder:
         keypoints, self._descriptors = self._sift.detectAndCompute(picture.grey, None)
         self._places = np.array([each.pt for each in keypoints])
         self._matcher = cv2.BFMatcher(cv2.NORM_L2)
+        self._before: np.ndarray | None = None
 
     def detect(self, grey: Grey) -> Corners:
         grey = _stretched(grey)
+        if self._before is not None and (near := self._laid_over(grey, self._before, _SURE_SHARE)) is not None:
+            return near
         enlarged = 2 if max(grey.shape) <= _ENLARGED_UP_TO_PX else 1
         searched = cv2.resize(grey, None, fx=enlarged, fy=enlarged, interpolation=cv2.INTER_CUBIC) if enlarged > 1 else grey
         keypoints, descriptors = self._sift.detectAndCompute(searched, None)
@@ -325,8 +331,8 @@ class _PictureFinder:
         homography, _ = cv2.findHomography(self._picture.points_px[start.ids] - 0.5, start.xy_px - 0.5, cv2.USAC_MAGSAC, _WRONG_PX)
         return None if homography is None else self._laid_over(_stretched(grey), homography)
 
-    def _laid_over(self, grey: Grey, frame_from_picture: np.ndarray) -> Corners | None:
-        """Return the picture's points where flow from the warped picture finds them; None if most are not found nearby."""
+    def _laid_over(self, grey: Grey, frame_from_picture: np.ndarray, least_share: float = _FEWEST_SHARE) -> Corners | None:
+        """Return the picture's points where flow from the warped picture finds them; None if too few are found nearby."""
         height, width = grey.shape
         warped, seen = self._warped(frame_from_picture, (width, height))
         if warped is None:
@@ -342,7 +348,8 @@ class _PictureFinder:
             one, other = ((each if not sigma_px else cv2.GaussianBlur(each, (0, 0), sigma_px)) for each in (shown, grey))
             places, good = flow(one, other, start[ids])
             good &= np.linalg.norm(places - start[ids], axis=1) < 2.0 * _WRONG_PX
-            if np.count_nonzero(good) >= max(_FEWEST_MATCHES, _FEWEST_SHARE * len(ids)):
+            if np.count_nonzero(good) >= max(_FEWEST_MATCHES, least_share * len(ids)):
+                self._before = frame_from_picture
                 return Corners(ids[good], places[good])
         return None
 
