@@ -32,7 +32,7 @@ EVERYDAY = {
     "refocus": "focus out f-number lens overwrite",
     "transfer": "out depth f-number focus focus-at lens overwrite",
     "check": "against virtual sharp",
-    "track clip": "board picture width out calibrate camera overwrite",
+    "track clip": "board poster width out calibrate camera overwrite",
     "track convert": "size format overwrite",
     "viewfinder": "source demo scene board lens lan",
     "viewfinder calibrate-phone": "source phone phone-camera board out",

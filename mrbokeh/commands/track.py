@@ -41,7 +41,7 @@ class IntrinsicsOptions:
 
 @dataclass(frozen=True)
 class PrintOptions:
-    """The flat print in the clip. width: of the picture, in metres."""
+    """The flat print in the clip. width: of the poster, in metres."""
 
     board: Annotated[
         Path | None,
@@ -49,22 +49,22 @@ class PrintOptions:
             metavar="BOARD.json", help="A board, as `mrbokeh viewfinder board` writes it, or a .toml: ChArUco, plain chessboard or tags."
         ),
     ] = None
-    picture: Annotated[
+    poster: Annotated[
         Path | None, typer.Option(metavar="POSTER.png", help="In place of a board: any flat picture with detail, as it was printed.")
     ] = None
-    width: Annotated[float | None, typer.Option(metavar="METRES", help="How wide the print of --picture is.")] = None
+    width: Annotated[float | None, typer.Option(metavar="METRES", help="How wide the print of --poster is.")] = None
 
     def __post_init__(self) -> None:
-        if (self.board is None) == (self.picture is None):
-            raise InputError("expected either --board BOARD.json or --picture POSTER.png, which lies flat in the clip: give one of them")
-        if (self.picture is None) != (self.width is None):
-            raise InputError("--picture and --width METRES, how wide it was printed, go together: give both")
+        if (self.board is None) == (self.poster is None):
+            raise InputError("expected either --board BOARD.json or --poster POSTER.png, which lies flat in the clip: give one of them")
+        if (self.poster is None) != (self.width is None):
+            raise InputError("--poster and --width METRES, how wide it was printed, go together: give both")
 
     def read(self) -> "FlatPrint":
         from mrbokeh.tracking.charuco.flat_prints import read_picture, read_print
 
-        if self.picture is not None and self.width is not None:
-            return read_picture(self.picture, self.width)
+        if self.poster is not None and self.width is not None:
+            return read_picture(self.poster, self.width)
         assert self.board is not None
         return read_print(self.board)
 
@@ -100,12 +100,12 @@ def track(
 
     Example: mrbokeh track clip clip.mp4 --board board.json --calibrate --out track.json
 
-    Example: mrbokeh track clip clip.mp4 --picture poster.png --width 0.594 --calibrate --out track.json
+    Example: mrbokeh track clip clip.mp4 --poster poster.png --width 0.594 --calibrate --out track.json
     """
     from mrbokeh.tracking.camera_track.board_track import TrackSettings, calibrate_clip, track_board
     from mrbokeh.tracking.camera_track.formats import format_of_name
 
-    require_safe_outputs((out,), (clip, shown.board, shown.picture, known.camera), result.overwrite)
+    require_safe_outputs((out,), (clip, shown.board, shown.poster, known.camera), result.overwrite)
     if result.format_ is None:
         format_of_name(out)
     if known.calibrate == (known.camera is not None):

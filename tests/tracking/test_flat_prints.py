@@ -86,8 +86,8 @@ def off_px(corners_m: np.ndarray, found: Camera, true: Camera) -> float:
 
 @pytest.mark.parametrize("kind", PRINTS)
 def test_prints_are_tracked_and_what_is_hidden_is_not(kind: str, tmp_path: Path) -> None:
-    """Worst place of each frame to within 1 px (tags: 2), RMS of the corners below 0.4 px; two frames in which somebody stands before it are
-    bridged, and seen as hidden."""
+    """Worst place of each frame to within 1 px (tags: 2), RMS of the corners below 0.4 px; two frames in which it is hidden are
+    bridged."""
     make: Callable[[], tuple[FlatPrint, np.ndarray]] = PRINTS[kind]
     printed, drawn = make()
     greys = [np.full(SIZE_PX[::-1], 90, np.uint8) if n in HIDDEN else frame(printed, drawn, n) for n in range(FRAMES)]
@@ -151,4 +151,4 @@ def test_board_files_say_what_they_are(tmp_path: Path) -> None:
     refused("in metres, above 0", read_picture, tmp_path / "even.png", -1.0)
     clip = ("clip", tmp_path / "clip.mp4", "--out", tmp_path / "track.json", "--calibrate")
     refused("either --board", printed_by, app, *clip)
-    refused("go together", printed_by, app, *clip, "--picture", tmp_path / "even.png")
+    refused("go together", printed_by, app, *clip, "--poster", tmp_path / "even.png")
