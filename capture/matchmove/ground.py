@@ -1,11 +1,17 @@
-"""The ground of a match-move: a plane through points of the model around picked pixels, with the first pick as origin."""
+"""The world of a match-move: a ground of y = 0 with y down, an origin on it, and the length of a metre.
 
-from dataclasses import dataclass
+The ground is a plane through points of the model around picked pixels; the flat scene itself; or, under a camera that only turns, the level
+plane that its horizon tells.
+"""
+
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 from jaxtyping import Float64
 
+from capture.matchmove.clip_solve import ClipSolve
+from capture.matchmove.keyframes import view_name
 from capture.poses.sparse_model import SparseModel, SparseView
 from mrbokeh.system.errors import InputError
 
@@ -26,6 +32,14 @@ class GroundPicks:
 
 
 @dataclass(frozen=True)
+class Horizon:
+    """Two pixels of one frame, in it or beyond its edges, in which level directions are seen."""
+
+    frame: int
+    xy_px: Float64[np.ndarray, "2 2"]
+
+
+@dataclass(frozen=True)
 class Ruler:
     """Two pixels of one frame on the ground, and their distance there."""
 
@@ -40,8 +54,71 @@ def on_ground(model: SparseModel, view: SparseView, picks: GroundPicks) -> Spars
     Raises InputError if too few points of the model lie between the picks, or no plane holds half of them.
     """
     points = _points_between(model, view, picks)
-    normal, offset = _plane(points, view.centre, picks)
-    origin, along = (_on_plane(view, xy_px, normal, offset) for xy_px in picks.xy_px[:2])
+    return _moved_to(model, view, picks.xy_px[:2], *_plane(points, view.centre, picks))
+
+
+def on_own_plane(solve: ClipSolve, picks: GroundPicks | None = None) -> SparseModel:
+    """Move a flat scene to a world with y down whose ground it is.
+
+    The origin is at the first pick, x towards the second; without picks it is in the middle of the first frame, x to the right there, and
+    the unit the distance to it from there.
+    """
+    model = solve.model
+    normal, offset = _through(model.points.astype(np.float64), model.views[0].centre)
+    if picks is not None:
+        return _moved_to(model, model.view(view_name(picks.frame)), picks.xy_px[:2], normal, offset)
+    view = model.view(view_name(min(solve.fits)))
+    middle_px = np.array(view.camera.principal_px)
+    origin = _on_plane(view, middle_px, normal, offset)
+    moved = _moved_to(model, view, middle_px + np.array([[0.0, 0.0], [0.1 * view.camera.width_px, 0.0]]), normal, offset)
+    return replace(moved.times(1.0 / float(np.linalg.norm(origin - view.centre))), metres_per_unit=None)
+
+
+_TALL_M, _LOOKS_DOWN_DEG = 1.5, 10.0
+_AHEAD_SHARE = 0.75
+
+
+def upright(
+    solve: ClipSolve, horizon: Horizon | None, picks: GroundPicks | None, height_m: float | None
+) -> tuple[SparseModel, tuple[str, ...]]:
+    """Stand a camera that only turns over level ground; returns what was guessed, too, in words.
+
+    The origin is at the first pick, x towards the second; without picks it is before the middle of the first frame, x to the right.
+    """
+    model, first = solve.model, solve.model.view(view_name(min(solve.fits)))
+    assumed = []
+    if horizon is None:
+        down = _looking_down(first)
+        assumed.append(f"the first frame to be level and to look down by {_LOOKS_DOWN_DEG:g} degrees (--horizon FRAME:X,Y/X,Y)")
+    else:
+        down = _below(model.view(view_name(horizon.frame)), horizon)
+    if height_m is None:
+        assumed.append(f"the camera to be {_TALL_M:g} m above the ground (--camera-height METRES)")
+    height = height_m or _TALL_M
+    view, ends_px = first, np.array([[0.5, _AHEAD_SHARE], [0.6, _AHEAD_SHARE]]) * (first.camera.width_px, first.camera.height_px)
+    if picks is not None:
+        view, ends_px = model.view(view_name(picks.frame)), picks.xy_px[:2]
+    moved = _moved_to(model, view, ends_px, -down, -height)
+    return replace(moved, metres_per_unit=None if height_m is None else 1.0), tuple(assumed)
+
+
+def _looking_down(view: SparseView) -> Float64[np.ndarray, "3"]:
+    """Return what is down, in the world, if a view is level and looks down a little."""
+    angle = np.radians(_LOOKS_DOWN_DEG)
+    return view.camera.camera_from_world[:3, :3].T @ np.array([0.0, np.cos(angle), np.sin(angle)])
+
+
+def _below(view: SparseView, horizon: Horizon) -> Float64[np.ndarray, "3"]:
+    rays = view.unproject(horizon.xy_px, np.ones(2)) - view.centre
+    down = np.cross(rays[0], rays[1])
+    if not np.linalg.norm(down) > 0.0:
+        raise InputError("--horizon: its two pixels must differ")
+    return down / np.linalg.norm(down) * np.sign(down @ view.camera.camera_from_world[1, :3] or 1.0)
+
+
+def _moved_to(model: SparseModel, view: SparseView, ends_px: np.ndarray, normal: np.ndarray, offset: float) -> SparseModel:
+    """Move the model to where a plane is y = 0, the origin at the first of two pixels of a view, x towards the second."""
+    origin, along = (_on_plane(view, xy_px, normal, offset) for xy_px in ends_px)
     x = along - origin
     if np.linalg.norm(x) == 0.0:
         raise InputError("--ground: the first two pixels must differ, they say where x points")
@@ -89,8 +166,13 @@ def _plane(points: Float64[np.ndarray, "points 3"], centre: np.ndarray, picks: G
             f"--ground: only {100 * kept.mean():.0f} % of the model's points between the pixels of frame {picks.frame} lie on one plane: "
             f"pick pixels with nothing but flat ground between them"
         )
-    middle = points[kept].mean(axis=0)
-    normal = np.linalg.svd(points[kept] - middle)[2][2]
+    return _through(points[kept], centre)
+
+
+def _through(points: Float64[np.ndarray, "points 3"], centre: np.ndarray) -> tuple[Float64[np.ndarray, "3"], float]:
+    """Return (normal towards the camera, offset) of the plane through points, by least squares."""
+    middle = points.mean(axis=0)
+    normal = np.linalg.svd(points - middle, full_matrices=False)[2][2]
     normal = normal if normal @ (centre - middle) > 0 else -normal
     return normal, float(normal @ middle)
 
@@ -114,6 +196,16 @@ def parse_ground(text: str) -> GroundPicks:
     if len(picks.xy_px) < 3 or picks.frame < 0:
         raise InputError(f"{expected}, got {text!r}")
     return picks
+
+
+def parse_horizon(text: str) -> Horizon:
+    """Parse FRAME:X,Y/X,Y."""
+    try:
+        frame, ends = text.split(":")
+        one, other = ends.split("/")
+        return Horizon(int(frame), np.array([_pixel(one), _pixel(other)], np.float64))
+    except ValueError:
+        raise InputError(f"--horizon must be FRAME:X,Y/X,Y such as 0:0,300/1900,320, got {text!r}") from None
 
 
 def parse_ruler(text: str) -> Ruler:

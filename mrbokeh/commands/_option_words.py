@@ -14,7 +14,7 @@ EVERYDAY = {
     "capture process": "out max-width board prefer overwrite",
     "capture poses": "overwrite images out mapper",
     "capture plan": "near far image-width focal-length f-number sensor-width out",
-    "capture matchmove": "out board overwrite",
+    "capture matchmove": "out ground ruler overwrite",
     "capture solve": "out picture height length line focal-length sensor-width overwrite",
     "capture scale": "ruler distance-at nearest board distance",
     "capture dataset": "out licence test overwrite",
@@ -32,7 +32,7 @@ EVERYDAY = {
     "refocus": "focus out f-number lens overwrite",
     "transfer": "out depth f-number focus focus-at lens overwrite",
     "check": "against virtual sharp",
-    "track clip": "board out calibrate camera overwrite",
+    "track clip": "board poster width out calibrate camera overwrite",
     "track convert": "size format overwrite",
     "viewfinder": "source demo scene board lens lan",
     "viewfinder calibrate-phone": "source phone phone-camera board out",
@@ -57,7 +57,7 @@ PANELS = {
     "The camera": "backlash check exposure-time far-steps focus-level focus-steps home iso live near-steps planned-distances "
     "reverse-focus settle spot sweep-step timeout white-balance",
     "Tracking": "camera-model cameras delay focus-from freed lens-table longest-gap map mapper max-image-size metres-per-unit opentrackio "
-    "phone phone-camera pose rig smooth steadier",
+    "phone phone-camera pose rig smooth steadier horizon camera-height width",
     "The page": "captures interface lan max-rate pictures port project qr tls tls-key webcam",
     "The result": "proxy constant-rate encoding format leaks no-distortion ocio output-space overwrite preview save-deep save-depth "
     "save-layer sheet virtual-only allow-absent strict",
@@ -68,7 +68,7 @@ PANELS = {
 METAVARS = {
     "MM": "focal-length sensor-width sensor-height petzval-radius square marker",
     "N": "f-number",
-    "METRES": "baseline near far near-distance light-distance depth-scale",
+    "METRES": "baseline width camera-height near far near-distance light-distance depth-scale",
     "PX": "image-width max-width max-image-size residual diameter longest-motion tile-px overlap-px focal-px steadier",
     "DEGREES": "turn pitch roll rotation shutter",
     "SECONDS": "settle timeout time scene-begin readout segment seconds",

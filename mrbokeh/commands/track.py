@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from mrbokeh.optics.camera import Camera
     from mrbokeh.tracking.camera_track.board_track import BoardTrack
     from mrbokeh.tracking.camera_track.track import CameraTrack, Distortion, TrackOptions
+    from mrbokeh.tracking.charuco.flat_prints import FlatPrint
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, help="The camera of every frame of a clip, and its files.")
 
@@ -39,6 +40,36 @@ class IntrinsicsOptions:
 
 
 @dataclass(frozen=True)
+class PrintOptions:
+    """The flat print in the clip. width: of the poster, in metres."""
+
+    board: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="BOARD.json", help="A board, as `mrbokeh viewfinder board` writes it, or a .toml: ChArUco, plain chessboard or tags."
+        ),
+    ] = None
+    poster: Annotated[
+        Path | None, typer.Option(metavar="POSTER.png", help="In place of a board: any flat picture with detail, as it was printed.")
+    ] = None
+    width: Annotated[float | None, typer.Option(metavar="METRES", help="How wide the print of --poster is.")] = None
+
+    def __post_init__(self) -> None:
+        if (self.board is None) == (self.poster is None):
+            raise InputError("expected either --board BOARD.json or --poster POSTER.png, which lies flat in the clip: give one of them")
+        if (self.poster is None) != (self.width is None):
+            raise InputError("--poster and --width METRES, how wide it was printed, go together: give both")
+
+    def read(self) -> "FlatPrint":
+        from mrbokeh.tracking.charuco.flat_prints import read_picture, read_print
+
+        if self.poster is not None and self.width is not None:
+            return read_picture(self.poster, self.width)
+        assert self.board is not None
+        return read_print(self.board)
+
+
+@dataclass(frozen=True)
 class SmoothingOptions:
     """Gaps to bridge, and smoothing of poses."""
 
@@ -58,27 +89,28 @@ class ResultOptions:
 @app.command("clip")
 @grouped
 def track(
-    clip: Annotated[Path, typer.Argument(metavar="CLIP", help="Video in which the board lies still.")],
-    board: Annotated[Path, typer.Option(metavar="BOARD.json", help="The board, as `mrbokeh viewfinder board` writes it, or a .toml.")],
+    clip: Annotated[Path, typer.Argument(metavar="CLIP", help="Video in which the print lies still.")],
     out: OutOption,
+    shown: PrintOptions,
     known: IntrinsicsOptions,
     smoothing: SmoothingOptions,
     result: ResultOptions,
 ) -> None:
-    """Track a clip by the printed board in it; the world of the track is the board's, in metres.
+    """Track a clip by the printed board, or any flat picture, in it; the world of the track is the print's, in metres.
 
     Example: mrbokeh track clip clip.mp4 --board board.json --calibrate --out track.json
+
+    Example: mrbokeh track clip clip.mp4 --poster poster.png --width 0.594 --calibrate --out track.json
     """
     from mrbokeh.tracking.camera_track.board_track import TrackSettings, calibrate_clip, track_board
     from mrbokeh.tracking.camera_track.formats import format_of_name
-    from mrbokeh.tracking.charuco.board import read_board
 
-    require_safe_outputs((out,), (clip, board, known.camera), result.overwrite)
+    require_safe_outputs((out,), (clip, shown.board, shown.poster, known.camera), result.overwrite)
     if result.format_ is None:
         format_of_name(out)
     if known.calibrate == (known.camera is not None):
         raise InputError("expected either --camera CAMERA.json or --calibrate, which finds the camera from the clip: give one of them")
-    printed = read_board(board)
+    printed = shown.read()
     if known.camera is not None:
         intrinsics, distortion = _intrinsics(known.camera)
     else:

@@ -22,7 +22,7 @@ WORK = {
     "dataset": ("capture.dataset.writer.write_dataset", "{0} --out {0}/set --licence CC0", "finished stacks are kept in {0}/set"),
     "matchmove": (
         "capture.matchmove.clip_matchmove.matchmove_clip", "{0}/clip.mkv --out {0}/track.json",
-        "keyframes and COLMAP's files, as far as they are finished, are kept in {0}/track_matchmove",
+        "keyframes and what was solved, as far as it is finished, are kept in {0}/track_matchmove",
     ),
 }  # fmt: skip
 
@@ -34,7 +34,8 @@ def test_what_is_kept_and_how_to_go_on(command: str, tmp_path: Path, monkeypatch
     monkeypatch.setattr(import_module(module), name, Mock(side_effect=KeyboardInterrupt))
     filmed(tmp_path / "clip.mkv", [np.zeros((24, 32, 3), np.float32)])
     given = ["capture", command, *arguments.format(tmp_path).split()]
-    for more, told in (([], "the same command goes on from there"), (["--overwrite"], "with --overwrite it begins again")):
+    goes_on, again = "the same command goes on from there", "with --overwrite it begins again"
+    for more, told in (([], goes_on), (["--overwrite"], goes_on if command == "matchmove" else again)):
         done = mrbokeh(*given, *more)
         assert (done.returncode, done.stderr) == (130, f"stopped: {kept.format(tmp_path)}; {told}\n")
 

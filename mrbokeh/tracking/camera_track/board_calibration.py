@@ -10,8 +10,8 @@ from jaxtyping import Float64
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.track import Distortion
-from mrbokeh.tracking.charuco.board import CharucoBoard
 from mrbokeh.tracking.charuco.detector import Corners
+from mrbokeh.tracking.charuco.flat_prints import FlatPrint
 
 FEWEST_CORNERS = 8
 """Corners that a frame must show."""
@@ -48,7 +48,7 @@ class Calibration:
     views: int
 
 
-def calibrated(board: CharucoBoard, seen: Sequence[Corners], width_px: int, height_px: int) -> Calibration:
+def calibrated(board: FlatPrint, seen: Sequence[Corners], width_px: int, height_px: int) -> Calibration:
     """Calibrate a camera from the corners of a board in the frames of a clip.
 
     seen: corners as read in frames of that size, not aligned with the print, whose homography would hide distortion.
@@ -77,7 +77,7 @@ def calibrated(board: CharucoBoard, seen: Sequence[Corners], width_px: int, heig
     return best[1]
 
 
-def _solved(board: CharucoBoard, views: Sequence[Corners], size_px: tuple[int, int], freed: int) -> tuple[float, Calibration] | None:
+def _solved(board: FlatPrint, views: Sequence[Corners], size_px: tuple[int, int], freed: int) -> tuple[float, Calibration] | None:
     """Return (Schwarz's criterion, calibration); None if a parameter is left open."""
     points = [board.corners_m[each.ids].astype(np.float32) for each in views]
     pixels = [(each.xy_px - 0.5).astype(np.float32).reshape(-1, 1, 2) for each in views]
@@ -124,7 +124,7 @@ def _focal_sigma(rms_px: float, others_px: list[float], count: int) -> float:
     return abs(_PROBES[1] - 1.0) / float(np.sqrt(worse)) if worse > 0.0 else np.inf
 
 
-def _spread(seen: Sequence[Corners], board: CharucoBoard) -> list[Corners]:
+def _spread(seen: Sequence[Corners], board: FlatPrint) -> list[Corners]:
     """Return up to 40 views that differ most in where they see the board's outline, each time the farthest from those taken."""
     if len(seen) <= _MOST_VIEWS:
         return list(seen)
@@ -137,7 +137,7 @@ def _spread(seen: Sequence[Corners], board: CharucoBoard) -> list[Corners]:
     return [seen[index] for index in taken]
 
 
-def _outline_px(corners: Corners, board: CharucoBoard) -> Float64[np.ndarray, "8"]:
+def _outline_px(corners: Corners, board: FlatPrint) -> Float64[np.ndarray, "8"]:
     """Return where the board's four outer corners lie; 0 if the view does not tell."""
     homography, _ = cv2.findHomography(1000.0 * board.corners_m[corners.ids, :2], corners.xy_px, cv2.USAC_MAGSAC, 2.0)
     if homography is None:

@@ -19,8 +19,8 @@ from scipy.linalg import solveh_banded
 from scipy.spatial.transform import Rotation
 
 from mrbokeh.optics.camera import Camera
-from mrbokeh.tracking.charuco.board import CharucoBoard
 from mrbokeh.tracking.charuco.detector import Corners
+from mrbokeh.tracking.charuco.flat_prints import FlatPrint
 
 Pose = Float64[np.ndarray, "4 4"]
 Values = Float64[np.ndarray, "frames channels"]
@@ -117,7 +117,7 @@ class Observation:
     corners: Corners
 
 
-def steadied(observed: Mapping[int, Observation], board: CharucoBoard, camera: Camera, extra_px: float = 0.0) -> dict[int, Pose]:
+def steadied(observed: Mapping[int, Observation], board: FlatPrint, camera: Camera, extra_px: float = 0.0) -> dict[int, Pose]:
     """Return camera_from_world of all frames from the first to the last that was observed, smoothed as far as their scatter allows.
 
     extra_px: RMS by which they may move further.
@@ -138,7 +138,7 @@ def steadied(observed: Mapping[int, Observation], board: CharucoBoard, camera: C
     return steady
 
 
-def residual_px(observed: Mapping[int, Observation], poses: Mapping[int, Pose], board: CharucoBoard, camera: Camera) -> float:
+def residual_px(observed: Mapping[int, Observation], poses: Mapping[int, Pose], board: FlatPrint, camera: Camera) -> float:
     """Return the RMS distance of all observed corners from where the poses put them."""
     squares = []
     for number, each in observed.items():

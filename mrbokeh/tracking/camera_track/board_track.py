@@ -20,9 +20,8 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.board_calibration import Calibration, calibrated
 from mrbokeh.tracking.camera_track.board_smoothing import Observation, residual_px, steadied
 from mrbokeh.tracking.camera_track.track import DISTORTION_NAMES, CameraTrack, Distortion, TrackedFrame
-from mrbokeh.tracking.charuco.board import CharucoBoard
-from mrbokeh.tracking.charuco.board_alignment import aligned_corners
-from mrbokeh.tracking.charuco.detector import NO_CORNERS, CharucoDetector, Corners, Grey, flow
+from mrbokeh.tracking.charuco.detector import NO_CORNERS, Corners, Grey, flow
+from mrbokeh.tracking.charuco.flat_prints import FlatPrint, finder_of
 from mrbokeh.tracking.charuco.pose_branches import PoseFit, fits_of_shot
 from mrbokeh.tracking.charuco.pose_from_points import FEWEST_POINTS, opencv_matrix, poses_from_plane
 from mrbokeh.video.clip import probe, read_display_frames
@@ -113,8 +112,8 @@ def opencv_coefficients(distortion: Distortion | None) -> Float64[np.ndarray, "8
 class RollingCorners:
     """Corners of frame after frame; `all` also fills the frames before the board comes back into sight."""
 
-    def __init__(self, board: CharucoBoard) -> None:
-        self._board, self._detector = board, CharucoDetector(board)
+    def __init__(self, board: FlatPrint) -> None:
+        self._finder = finder_of(board)
 
     def all(self, greys: Iterable[Grey]) -> list[Corners]:
         """Return the corners of each frame; none if the board is neither seen nor carried."""
@@ -124,7 +123,7 @@ class RollingCorners:
         unconfirmed = 0
         for grey in greys:
             carried = self._carried(before, grey, found[-1]) if before is not None and unconfirmed < _CARRIED_FRAMES else NO_CORNERS
-            corners, confirmed = self._in_frame(grey, self._detector.detect(grey), carried)
+            corners, confirmed = self._in_frame(grey, self._finder.detect(grey), carried)
             found.append(corners)
             unconfirmed = 0 if confirmed else unconfirmed + 1
             if len(corners) < FEWEST_POINTS:
@@ -138,7 +137,7 @@ class RollingCorners:
     def _in_frame(self, grey: Grey, read: Corners, carried: Corners) -> tuple[Corners, bool]:
         """Return (corners, whether reading or the print confirms them)."""
         start = read.with_more(carried)
-        aligned = aligned_corners(self._board, grey, start)
+        aligned = self._finder.aligned(grey, start)
         if aligned is not None:
             return aligned, True
         return start, len(read) >= FEWEST_POINTS
@@ -197,18 +196,18 @@ class BoardTrack:
     unsure: tuple[int, ...] = ()
 
 
-def calibrate_clip(clip: Path, board: CharucoBoard) -> Calibration:
+def calibrate_clip(clip: Path, board: FlatPrint) -> Calibration:
     """Calibrate intrinsics and distortion from the frames of the clip itself."""
     info = probe(clip)
     step = max(1, (info.frame_count or _CALIBRATED_FROM) // _CALIBRATED_FROM)
-    detector = CharucoDetector(board)
+    finder = finder_of(board)
     greys = islice(read_greys(clip, info.width_px, info.height_px), 0, None, step)
-    seen = [detector.detect(grey) for grey, _ in with_progress(greys, "calibrating", (info.frame_count or 0) // step)]
+    seen = [finder.detect(grey) for grey, _ in with_progress(greys, "calibrating", (info.frame_count or 0) // step)]
     return calibrated(board, seen, info.width_px, info.height_px)
 
 
 def track_board(
-    clip: Path, board: CharucoBoard, camera: Camera, distortion: Distortion | None = None, settings: TrackSettings | None = None
+    clip: Path, board: FlatPrint, camera: Camera, distortion: Distortion | None = None, settings: TrackSettings | None = None
 ) -> BoardTrack:
     """Track a clip by its board.
 
@@ -229,8 +228,8 @@ def track_board(
     fits = poses_of(corners, board, camera, times_s)
     if len(fits) < 2:
         raise InputError(
-            f"the board ({board.squares_text} squares, {board.dictionary}) was found in {len(fits)} of {len(corners)} frames of {clip}: "
-            f"check that --board is the one in the picture, and that it is lit and sharp"
+            f"{board.described} was found in {len(fits)} of {len(corners)} frames of {clip}: "
+            f"check that it is the one in the clip, and that it is lit and sharp"
         )
     if sum(fit.is_certain for fit in fits.values()) < 2:
         raise InputError(
@@ -240,7 +239,7 @@ def track_board(
     return _judged(corners, fits, _Shot(board, camera, distortion, tuple(times_s)), settings)
 
 
-def poses_of(corners: Sequence[Corners], board: CharucoBoard, camera: Camera, times_s: Sequence[float]) -> dict[int, PoseFit]:
+def poses_of(corners: Sequence[Corners], board: FlatPrint, camera: Camera, times_s: Sequence[float]) -> dict[int, PoseFit]:
     """Return the pose of each frame; of two poses that explain a frame alike the one that fits the whole shot is taken."""
     found = {number: poses_from_plane(board.corners_m[each.ids], each.xy_px, camera) for number, each in enumerate(corners)}
     return fits_of_shot({number: each for number, each in found.items() if each is not None}, times_s)
@@ -248,7 +247,7 @@ def poses_of(corners: Sequence[Corners], board: CharucoBoard, camera: Camera, ti
 
 @dataclass(frozen=True)
 class _Shot:
-    board: CharucoBoard
+    board: FlatPrint
     camera: Camera
     distortion: Distortion | None
     times_s: tuple[float, ...]

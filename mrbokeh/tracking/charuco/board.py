@@ -124,6 +124,11 @@ class CharucoBoard:
         """Return the squares for messages: 8x6, or 4x3 and 9x5."""
         return " and ".join(f"{columns}x{rows}" for columns, rows in (grid.squares for grid in self.grids))
 
+    @property
+    def described(self) -> str:
+        """Return what it is, for messages."""
+        return f"the board ({self.squares_text} squares, {self.dictionary})"
+
     def begins_white(self, grid: int) -> bool:
         """Return whether the top left square of a grid is white."""
         return self.legacy and self.grids[grid].squares[1] % 2 == 0
