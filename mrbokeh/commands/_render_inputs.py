@@ -121,10 +121,10 @@ def _whole_layer(path: Path) -> Layer:
     from mrbokeh.stacks.exr_layers.render_channels import RenderChannels, joined, layer_of
 
     render, objects = RenderChannels.read(path), carried_cryptomatte(path)
-    name = render.colour_layer()
+    layer, name = layer_of(render), render.colour_layer()
     taken = {*(joined(name, each) for each in "RGBA"), render.depth_name(name), *(objects.channels if objects else ())}
     others = sorted((render.channels.keys() & set(render.stored)) - taken)
-    return replace(layer_of(render), extra={each: render.plane(each).astype(np.float32)[..., None] for each in others})
+    return replace(layer, extra={each: render.plane(each).astype(np.float32)[..., None] for each in others})
 
 
 def _picture(rgb: Path, depth: Path, near_far_m: tuple[float, float] | None, sources: SharpOptions) -> Layer:

@@ -163,6 +163,12 @@ LARGEST_ALPHA_ERROR = 0.1
 """Filters of renderers overshoot by a few hundredths."""
 
 
+def require_alpha(path: Path | str, alpha: Float32[np.ndarray, "height width"]) -> None:
+    """Raise InputError if alpha lies outside of 0 to 1 by more than a filter's overshoot."""
+    if alpha.min(initial=0.0) < -LARGEST_ALPHA_ERROR or alpha.max(initial=0.0) > 1.0 + LARGEST_ALPHA_ERROR:
+        raise InputError(f"{path}: expected alpha from 0 to 1, but A goes from {alpha.min():g} to {alpha.max():g}")
+
+
 def read_layer(path: Path | str, *, extra: bool = False) -> Layer:
     """Read a layer from an EXR with R, G, B and, if present, A and Z (or depth.Z), in one part or several.
 
@@ -176,8 +182,7 @@ def read_layer(path: Path | str, *, extra: bool = False) -> Layer:
     channels = {name: pixels for part in [*reversed(of_one_view), colour] for name, pixels in part.channels.items()}
     rgb = in_rec709(ExrPart(channels).stacked("RGB"), stated_primaries(colour, parts), path)
     alpha = channels.get("A", np.ones(rgb.shape[:2])).astype(np.float32)
-    if alpha.min(initial=0.0) < -LARGEST_ALPHA_ERROR or alpha.max(initial=0.0) > 1.0 + LARGEST_ALPHA_ERROR:
-        raise InputError(f"{path}: expected alpha from 0 to 1, but A goes from {alpha.min():g} to {alpha.max():g}")
+    require_alpha(path, alpha)
     depth_name = next((name for name in _DEPTH_NAMES if name in channels), None)
     depth = (np.zeros(rgb.shape[:2]) if depth_name is None else channels[depth_name]).astype(np.float32)
     require_depth_ahead(path, str(depth_name), depth[alpha > 0])

@@ -229,6 +229,8 @@ class ProcessExecutor:
         finally:
             for worker in workers:
                 worker.stop()
+            for worker in workers:
+                worker.process.join()
         if tally.missing:
             raise InputError(
                 f"worker processes died {deaths} times in a row without finishing a segment (too little memory?): "
@@ -262,7 +264,6 @@ class _Worker:
         """Let the worker leave after its frame, without half files."""
         with suppress(OSError):
             self.pipe.send(None)
-        self.process.join()
 
 
 class _StopWorkingError(Exception):
@@ -290,7 +291,7 @@ def _work(pipe: Any, tasks: Sequence[SegmentTask]) -> None:
     try:
         work_off(tasks, tell)
     except _StopWorkingError:
-        pass
+        os._exit(0)  # nothing is left to do, and Ctrl-C waits for it
     except Exception as error:  # told by the parent
         pipe.send(error)
 

@@ -22,7 +22,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.renderers.onnx_network import OnnxNetwork
 from mrbokeh.renderers.scatter_reference import ScatterReference
-from mrbokeh.system.atomic_files import write_json
+from mrbokeh.system.atomic_files import write_json, writing_alone
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.focus_pull import parse_focus_keys
 from mrbokeh.video.clip import read_frames
@@ -210,6 +210,13 @@ def test_facts_of_the_lens_may_stand_in_options(clip: Path, settings: list[str],
     refused("there is no depth", run, clip, *facts, "--focus-at", "1,1", "--out", tmp_path / "no.mkv")
     monkeypatch.setattr("mrbokeh.renderers.choose.make_renderer", lambda _, **__: object.__new__(OnnxNetwork))
     refused("a network blurs as the lens", run, clip, *facts, "--renderer", "my.onnx", "--out", tmp_path / "no.mkv")
+
+
+def test_several_runs_may_write_one_result(clip: Path, settings: list[str], tmp_path: Path) -> None:
+    """Other commands keep one another out by this lock; those of a clip share its segments (tests/shots)."""
+    with writing_alone(tmp_path / "out.mkv"):
+        done = mrbokeh("video", clip, *settings, "--workers", 1, "--frames", "0-1", "--out", tmp_path / "out.mkv")
+    assert done.returncode == 0, done.stderr
 
 
 def test_the_focus_is_pulled(clip: Path, settings: list[str], tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from mrbokeh.images.exr_io import Channels, ExrPart, in_rec709, read_exr, stated_primaries
-from mrbokeh.images.image_io import require_depth_ahead, require_numbers
+from mrbokeh.images.image_io import require_alpha, require_depth_ahead, require_numbers
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.motion import with_motion
 from mrbokeh.system.errors import InputError
@@ -233,6 +233,7 @@ def layer_of(render: RenderChannels) -> Layer:
     alpha_name = joined(name, "A")
     alpha = render.plane(alpha_name).astype(np.float32) if alpha_name in render.channels else np.ones(rgb.shape[:2], np.float32)
     require_numbers(render.path, {"colour": rgb, "alpha": alpha})
+    require_alpha(render.path, alpha)
     rgb = in_rec709(rgb, render.primaries, render.path)
     depth_name, is_seen = render.depth_name(name), (alpha > 0) | (rgb != 0).any(axis=2)
     depth_m = render.plane(depth_name).astype(np.float32)
