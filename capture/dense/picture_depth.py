@@ -3,6 +3,7 @@
 Writes DIR/depth/NAME.exr (Z, `confidence`) for each placed picture, and NAME.png, the picture beside its depth.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,18 +12,19 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.poses.colmap_job import JOB_NAME, ColmapJob, job_from_json
-from capture.poses.sparse_model import POSES_NAME, SparseModel, SparseView, read_sparse_model
-from mrbokeh.depth.views.still_scene import PosedPicture, StillScene
+from capture.poses.sparse_model import POSES_NAME, SparseView, read_sparse_model
+from mrbokeh.depth.views.still_scene import PosedPicture, StillScene, cameras_digest
 from mrbokeh.distortion import LensDistortion
 from mrbokeh.figures.stack_pictures import nearness_codes
 from mrbokeh.images.color import display_rgb8, srgb_to_linear
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.picture_codec import write_stored
-from mrbokeh.system.atomic_files import read_json
+from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 
 DEPTH_FOLDER = "depth"
+_RECORD = "depth.json"
 
 
 @dataclass(frozen=True)
@@ -40,7 +42,7 @@ def is_reconstruction(folder: Path) -> bool:
 
 
 def deepen_pictures(folder: Path, *, overwrite: bool = False, device: str | None = None) -> PicturesWithDepth:
-    """Write the depth of every placed picture of a reconstruction that has none yet. device: of torch, for the sweeps."""
+    """Write the depth of every placed picture of a reconstruction that has none by these poses yet. device: of torch, for the sweeps."""
     model = read_sparse_model(folder)
     metric = model.metres_per_unit is not None
     model = model.scaled() if metric else model
@@ -48,17 +50,21 @@ def deepen_pictures(folder: Path, *, overwrite: bool = False, device: str | None
     if len(model.views) < 2:
         raise InputError(f"{folder} has {len(model.views)} placed picture, but depth needs two or more: photograph more viewpoints")
     out = folder / DEPTH_FOLDER
-    wanted = [view for view in model.views if overwrite or not _file(out, view).exists()]
+    record = {"poses": cameras_digest((view.name, view.camera, view.distortion) for view in model.views), "metric": metric}
+    current = (out / _RECORD).exists() and read_json(out / _RECORD, "what depth was made from") == record
+    wanted = [view for view in model.views if overwrite or not (current and _file(out, view).exists())]
     if wanted:
-        _write(folder, job, model, wanted, out, device)
+        scene = StillScene([_picture(folder, job, view).small() for view in model.views], str(folder), device)
+        for path in [] if current else [_file(out, view) for view in model.views]:
+            path.unlink(missing_ok=True)
+        out.mkdir(parents=True, exist_ok=True)
+        write_json(out / _RECORD, record)
+        _write(scene, ((view, _picture(folder, job, view)) for view in wanted), out, len(wanted))
     return PicturesWithDepth(out, tuple(view.name for view in model.views), metric)
 
 
-def _write(folder: Path, job: ColmapJob, model: SparseModel, wanted: list[SparseView], out: Path, device: str | None) -> None:
-    scene = StillScene([_picture(folder, job, view).small() for view in model.views], str(folder), device)
-    out.mkdir(parents=True, exist_ok=True)
-    for view in track(wanted, "depth of pictures"):
-        picture = _picture(folder, job, view)
+def _write(scene: StillScene, pictures: Iterable[tuple[SparseView, PosedPicture]], out: Path, count: int) -> None:
+    for view, picture in track(pictures, "depth of pictures", count):
         found = scene.depth_of(picture)
         _file(out, view).parent.mkdir(parents=True, exist_ok=True)
         colours = nearness_codes((1.0 / found.depth).astype(np.float32), found.confidence)

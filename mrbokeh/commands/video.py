@@ -3,6 +3,7 @@
 Options alone say what the shot is: what makes its frames, where they go, and which of the clip they are.
 """
 
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
@@ -35,7 +36,7 @@ from mrbokeh.shots.proxies import proxy_recipe
 from mrbokeh.shots.render_shot import SequenceTarget, VideoTarget, render_shot
 from mrbokeh.shots.shot import SEGMENT_S, Shot, Target
 from mrbokeh.stacks.photograph import SensorOrientation, lens_for_orientation
-from mrbokeh.system.atomic_files import require_safe_outputs
+from mrbokeh.system.atomic_files import require_safe_outputs, writing_alone
 from mrbokeh.system.channel import guess, say, tell, warn
 from mrbokeh.system.console import kept_when_interrupted, progress_bars
 from mrbokeh.system.errors import InputError
@@ -189,7 +190,7 @@ def recipe_of(
         mode=virtual.mode or (DEFAULT_MODE if taken.matte is None else "between"),
         camera=_camera(source, virtual),
         focus=pull,
-        depth=_depth(taken, virtual),
+        depth=_depth(taken, virtual, source.path),
         exact_depth=taken.exact_depth,
         matte=None if taken.matte is None else MatteFiles(taken.matte.resolve()),
         near_m=taken.near_distance,
@@ -203,14 +204,14 @@ def recipe_of(
     return recipe
 
 
-def _depth(taken: ClipOptions, virtual: VirtualOptions) -> DepthFiles | None:
+def _depth(taken: ClipOptions, virtual: VirtualOptions, clip: Path) -> DepthFiles | None:
     near_far_m = near_far_of(taken.disparity, taken.depth)
     if taken.depth is None:
         return None
     if is_auto(taken.depth):
-        if near_far_m is not None or virtual.camera is None:
-            raise InputError("--depth auto needs the track of the moving camera, --camera TRACK, and no --disparity")
-        return DepthFiles(_depth_folder(virtual.camera) / DEPTH_NAME, with_holes=True)
+        if near_far_m is not None or taken.steady_depth or virtual.camera is None:
+            raise InputError("--depth auto needs the moving camera, --camera TRACK, and neither --disparity nor --steady-depth")
+        return DepthFiles(_depth_folder(virtual.camera, clip) / DEPTH_NAME, with_holes=True)
     # A filter over time takes numbers only.
     with_holes = not (taken.exact_depth or taken.steady_depth)
     return DepthFiles(taken.depth.resolve(), taken.steady_depth, near_far_m, with_holes=with_holes)
@@ -221,9 +222,10 @@ def is_auto(depth: Path | None) -> bool:
     return depth is not None and str(depth) == "auto"
 
 
-def _depth_folder(camera: Path) -> Path:
+def _depth_folder(camera: Path, clip: Path) -> Path:
     """Return where the depth of a tracked clip is kept: beside the track."""
-    return camera.resolve().with_name(f"{camera.stem}_depth")
+    name = re.sub(r"\W+", "_", re.sub(r"%0?\d*d|#+", "", clip.stem)).strip("_")
+    return camera.resolve().with_name(f"{camera.stem}_{name}_depth")
 
 
 def _found_depth(source: PictureSource, camera: Path, taken: "Sequence[int]", first_number: int) -> None:
@@ -232,10 +234,13 @@ def _found_depth(source: PictureSource, camera: Path, taken: "Sequence[int]", fi
     from mrbokeh.tracking.camera_track.formats import read_track
     from mrbokeh.tracking.camera_track.track import TrackOptions
 
-    size_px, folder = (source.info.width_px, source.info.height_px), _depth_folder(camera)
-    found = ClipDepth(source, read_track(camera, TrackOptions(size_px=size_px)), folder, first_number)
+    size_px, folder = (source.info.width_px, source.info.height_px), _depth_folder(camera, source.path)
+    track = read_track(camera, TrackOptions(size_px=size_px))
+    if not track.metric:
+        say(f"the lengths of {camera.name} may not be metres: depth is in its unit, as places in a scene and Z of layers have to be")
+    found = ClipDepth(source, track, folder, first_number)
     began_s = monotonic()
-    with kept_when_interrupted(f"finished depth is kept in {folder}"):
+    with writing_alone(folder), kept_when_interrupted(f"finished depth is kept in {folder}"):
         made = found.write(taken)
     if made:
         took_s = (monotonic() - began_s) / made
@@ -372,7 +377,8 @@ def video(
 
     Example: mrbokeh video clip.mov --scene scene.toml --camera track.json --focus-pull 0:1.2,48:3.5 --lens lens.json --out out.mp4
     """
-    depth_files = () if is_auto(taken.depth) else (taken.depth,)
+    finds_depth = is_auto(taken.depth) and virtual.camera is not None
+    depth_files = (_depth_folder(virtual.camera, clip) / DEPTH_NAME,) if finds_depth and virtual.camera else (taken.depth,)
     require_safe_outputs((out,), (clip, *depth_files, taken.matte, *virtual.files, rendering.distortion, lens), overwrite=True)
     require_missing_known(taken.missing)
     source = open_source(clip, taken.rate, colour.of_plate, taken.missing)

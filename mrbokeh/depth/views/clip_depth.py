@@ -1,4 +1,4 @@
-"""Depth of every frame of a clip whose camera is tracked, kept beside the track: depth.000012.exr with Z and `confidence`.
+"""Depth of every frame of a clip whose camera is tracked, kept in a folder beside the track: depth.000012.exr with Z and `confidence`.
 
 Keyframes are evenly spread over the motion of the camera; what is swept of them serves all frames (`still_scene`).
 """
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from mrbokeh.depth.views import DEPTH_NAME
-from mrbokeh.depth.views.still_scene import PosedPicture, StillScene, apart_in_widths
+from mrbokeh.depth.views.still_scene import PosedPicture, StillScene, apart_in_widths, cameras_digest
 from mrbokeh.depth.views.view_points import common_points, in_view
 from mrbokeh.distortion import LensDistortion
 from mrbokeh.images.exr_io import ExrPart, write_exr
@@ -25,7 +25,7 @@ from mrbokeh.system.console import track as with_progress
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
 from mrbokeh.video.image_sequence import numbered
-from mrbokeh.video.picture_source import PictureSource
+from mrbokeh.video.picture_source import PictureSource, written_frames
 
 _RECORD = "depth.json"
 _VERSION = 1
@@ -50,18 +50,21 @@ class ClipDepth:
     def write(self, taken: Sequence[int], device: str | None = None) -> int:
         """Write those of the frames (counted from 0) that are not there yet, and return how many those were.
 
-        Files that another clip or track has left are replaced. Frames that the track lacks are left out. device: of torch, for sweeps.
-        Raises InputError if the camera stays in one place.
+        What was made of another clip or track is replaced. device: of torch, for sweeps. Raises InputError if the camera stays in one
+        place, if the track lacks one of the frames, or if the folder holds anything else.
         """
-        record = self._record()
-        if self.folder.is_dir() and self._recorded() != record:
-            for stale in self.folder.glob("depth.*.exr"):
-                stale.unlink()
-        tracked = set(self._tracked())
-        wanted = [index for index in taken if index in tracked and not self._file(index).exists()]
+        record, found = self._record(), self._tracked()
+        if lost := [self.first_number + index for index in taken if index not in found]:
+            raise InputError(f"{self.source.path}: the track has no camera for {written_frames(lost)}: leave those out of --frames")
+        stale = [] if self._recorded() == record else sorted(self.folder.glob("depth.*.exr"))
+        if stale and not (self.folder / _RECORD).exists():
+            raise InputError(f"{self.folder} holds files of something else ({stale[0].name}), where depth is to go: move them away")
+        wanted = [index for index in taken if stale or not self._file(index).exists()]
         if not wanted:
             return 0
         scene = StillScene([picture.small() for picture in self._pictures(self._keyframes())], str(self.source.path), device)
+        for path in stale:
+            path.unlink()
         self.folder.mkdir(parents=True, exist_ok=True)
         write_json(self.folder / _RECORD, record)
         pictures = self._pictures(wanted)
@@ -78,10 +81,15 @@ class ClipDepth:
         return read_json(path, "what depth was made from") if path.exists() else None
 
     def _record(self) -> dict[str, Any]:
-        cameras = [(n, self.track.frames[n].camera, self.track.frames[n].coefficients) for n in self.track.numbers]
-        told = repr([(n, c.focal_px, c.principal_px, c.camera_from_world.round(9).tolist(), bent) for n, c, bent in cameras])
-        clip = str(self.source.path.resolve())
-        return {"version": _VERSION, "clip": clip, "frames": len(self.source.times_s), "track": hashlib.sha256(told.encode()).hexdigest()}
+        frames = self.track.frames
+        files = dict.fromkeys(self.source.file_of(index) or self.source.path for index in range(len(self.source.times_s)))
+        stamps = [(str(path.resolve()), path.stat().st_size, path.stat().st_mtime_ns) for path in files if path.exists()]
+        return {
+            "version": _VERSION,
+            "clip": hashlib.sha256(repr(stamps).encode()).hexdigest(),
+            "track": cameras_digest((n, frames[n].camera, frames[n].coefficients) for n in self.track.numbers),
+            "first_number": self.first_number,
+        }
 
     def _tracked(self) -> list[int]:
         """Return the clip's frames that the track has, counted from 0."""

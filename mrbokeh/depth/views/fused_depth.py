@@ -62,6 +62,7 @@ def _carried(view: SweepView, source: ViewDepth) -> tuple[Plane, Plane]:
 
 def _without_specks(dioptre: Plane, tolerance: float) -> Plane:
     """Return the map without islands of a few pixels that no neighbour shares."""
-    levels = np.clip(np.round(dioptre * (8.0 / tolerance)), 0, 32000).astype(np.int16)
+    # Unknown pixels (level 0) lie far from the farthest surface, or specks beside them would count as parts of them.
+    levels = np.where(dioptre > 0, np.clip(100.0 + np.round(dioptre * (8.0 / tolerance)), 100.0, 32000.0), 0.0).astype(np.int16)
     cv2.filterSpeckles(levels, 0, _SPECK_PX, 12)
     return np.where(levels > 0, dioptre, np.float32(0.0))

@@ -6,7 +6,8 @@ around it, and brought to its own pixels along its own edges. What moves by itse
 Lengths are those of the cameras, metres or not.
 """
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -92,8 +93,8 @@ class StillScene:
         points = common_points([each.view for each in small])
         if len(points) < _FEWEST_POINTS:
             raise InputError(
-                f"{what}: depth needs a camera that moves sideways before things with texture, but its {len(small)} views have only "
-                f"{len(points)} points in common that show parallax: give depth by --depth, or film while walking sideways"
+                f"{what}: depth needs a camera that moves sideways before things with texture, but of its {len(small)} views only "
+                f"{len(points)} points show parallax: go sideways while you film or photograph"
             )
         inside, depth = (np.array(each) for each in zip(*(in_view(each.camera, points) for each in small), strict=True))
         # Settings of sweeps are in dioptres: as if the nearest things stood at 1 m.
@@ -165,6 +166,12 @@ def _without_holes(dioptre: Plane, guide: Guide, tolerance: float) -> Plane:
     weights = np.where(seeds, np.float32(1.0), np.maximum(sharp, _SAY_OF_NEAREST))
     smooth = interpolate(nearest, weights, guide.root, _SMOOTH_PX**2, _EDGE_OF_COLOUR)
     return np.where(known, dioptre, sharp * nearest + (1.0 - sharp) * smooth).astype(np.float32)
+
+
+def cameras_digest(cameras: Iterable[tuple[object, Camera, object]]) -> str:
+    """Return a text that changes with the cameras that depth is found by: (name or number, camera, distortion) of each."""
+    told = [(name, each.focal_px, each.principal_px, each.camera_from_world.round(9).tolist(), bent) for name, each, bent in cameras]
+    return hashlib.sha256(repr(told).encode()).hexdigest()
 
 
 def apart_in_widths(one: Camera, other: Camera, depth: float) -> float:

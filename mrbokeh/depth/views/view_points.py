@@ -25,7 +25,7 @@ _LEAST_ANGLE_RAD = np.deg2rad(1.0)
 _PAIRS_TO_AGREE = 3
 _BESIDE, _LOOKED_AT = 0.02, 6
 """Share of the distance to the nearest camera within which two points are one; how many neighbours of a point are looked at."""
-_OUTERMOST = 0.5
+_OUTERMOST, _FARTHEST = 0.5, 1e-3
 _MARGIN = 0.1
 _FEWEST_IN_VIEW = 12
 
@@ -113,13 +113,15 @@ def in_view(camera: Camera, points: Points) -> tuple[Bool[np.ndarray, " points"]
 
 
 def dioptre_range(camera: Camera, points: Points) -> tuple[float, float] | None:
-    """Return (farthest, nearest) in 1 / depth of the points in a picture, a little widened; None if it shows too few."""
+    """Return (farthest, nearest) in 1 / depth of a picture, a little beyond its nearest points; None if it shows too few.
+
+    It goes on almost to infinity, for points so far away show no parallax, and none is among them.
+    """
     inside, depth = in_view(camera, points)
     if np.count_nonzero(inside) < _FEWEST_IN_VIEW:
         return None
-    farthest, nearest = np.percentile(1.0 / depth[inside], [_OUTERMOST, 100.0 - _OUTERMOST])
-    spare = _MARGIN * (nearest - farthest)
-    return max(float(farthest - spare), 0.0), float(nearest + spare)
+    nearest = (1.0 + _MARGIN) * float(np.percentile(1.0 / depth[inside], 100.0 - _OUTERMOST))
+    return _FARTHEST * nearest, nearest
 
 
 def best_neighbours(index: int, cameras: Sequence[Camera], points: Points, most: int) -> list[int]:
