@@ -38,9 +38,10 @@ _TURNS = 8
 _TRIED_VIEWS = 8
 _BEST_TILTS, _FITTED = 2, 4
 _FOCAL_STARTS = (1.0, 0.7, 1.45)
-_FACE_ON_DEG, _AS_WELL = 10.0, 1.4
-"""A plane seen face on is taken where it leaves hardly more than a tilted one: rolling shutters and distortion pass for a tilt where a
-camera hardly turns. Of an old DSLR's chart, which is seen face on, it leaves 0.42 px, one tilted by 33 degrees 0.32."""
+_FACE_ON_DEG, _BENT_SCALES = 10.0, 0.6
+"""A plane seen face on is taken where it leaves hardly more than a tilted one, in scales of Cauchy's weights, squares added: rolling
+shutters and distortion, which bend pictures by as much, pass for a tilt where a camera hardly turns. Of an old DSLR's chart, which is
+seen face on, it leaves 0.42 px at a width of 640, one tilted by 33 degrees 0.32."""
 
 
 @dataclass(frozen=True)
@@ -301,8 +302,8 @@ def explained(tracks: FlowTracks, kind: str, focal: Focal) -> tuple[SimpleCamera
     if not face_on or _tilt_deg(best) < _FACE_ON_DEG:
         return best, seen
     plain, _ = fitted(min(face_on, key=lambda each: each[1])[0], seen, focal)
-    as_well = _median_px(plain, seen) < _AS_WELL * _median_px(best, seen) and _tilt_deg(plain) < _FACE_ON_DEG
-    return (plain if as_well else best), seen
+    as_well = _median_px(plain, seen) < np.hypot(_median_px(best, seen), _BENT_SCALES * seen.scale_px)
+    return (plain if as_well and _tilt_deg(plain) < _FACE_ON_DEG else best), seen
 
 
 def _median_px(camera: SimpleCamera, seen: Observed) -> float:
