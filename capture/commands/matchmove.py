@@ -28,6 +28,8 @@ HELP = "\n\n".join(
     )
 )
 
+_SHORTEST_MM, _LONGEST_MM, _HIGHEST_M = 5.0, 2000.0, 20_000.0
+
 
 def matchmove_command(
     clip: Annotated[Path, typer.Argument(metavar="CLIP", help="video of a scene at rest")],
@@ -62,9 +64,10 @@ def matchmove_command(
     page = out.with_name(f"{out.stem}.html")
     require_safe_outputs((out, page), (clip, board), overwrite)
     format_of_name(out)
-    for name, value in (("--focal-length", focal_length), ("--camera-height", camera_height)):
-        if value is not None and not 0.0 < value < float("inf"):
-            raise InputError(f"expected {name} above 0, got {value:g}")
+    if focal_length is not None and not _SHORTEST_MM <= focal_length <= _LONGEST_MM:
+        raise InputError(f"--focal-length: expected {_SHORTEST_MM:g} to {_LONGEST_MM:g} mm of full frame, got {focal_length:g}")
+    if camera_height is not None and not 0.0 < camera_height <= _HIGHEST_M:
+        raise InputError(f"--camera-height: expected metres above 0, at most {_HIGHEST_M:g}, got {camera_height:g}")
     settings = MatchmoveSettings(
         keyframes=keyframes,
         camera_model=camera_model,
@@ -108,4 +111,4 @@ def _tell(out: Path, page: Path, made: "Matchmove", told_by: str | None) -> None
     if solve.warnings:
         warn(f"this track may be wrong: {'; '.join(solve.warnings)}; look at the grid in {page} before you trust it")
     else:
-        say(f"{page} shows a grid in it, and the frames that fit worst")
+        say(f"{page} shows how each frame fits")
