@@ -323,10 +323,12 @@ class _Asked:
     def heights(self) -> list[float | str] | None:
         """Return the heights of GLBs: metres, or texts such as "120px"; one, or one for each."""
         value = self.request.get("height")
+        if value is None:
+            return None
         each = value if isinstance(value, list) else [value]
-        if value is not None and not all(isinstance(one, str) or _is_number(one) for one in each):
+        if not all(isinstance(one, str) or _is_number(one) for one in each):
             raise InputError(f'height of a request: expected metres or "120px", or a list of them, got {str(value)[:80]}')
-        return None if value is None else each
+        return each
 
     def picture_and_depth(self) -> tuple[Any, Any]:
         """Return picture and depth; of an EXR alone both, by whatever names its program gives them."""

@@ -123,16 +123,15 @@ def test_mistakes_are_one_sentence(
 
 @pytest.mark.parametrize("key", ["picture", "depth", "lens", "f_number", "focus", "insert", "slice", "at_pixel", "height", "mode", "out"])
 def test_values_that_nobody_means_are_no_faults(key: str, tmp_path: Path, scene: tuple[np.ndarray, np.ndarray]) -> None:
-    """Refused by what the key expects, or never looked at; in this process, for there are many."""
+    """Refused by what the key expects, else in the end, for what is inserted has no colour; in this process, for there are many."""
     scene[0].tofile(tmp_path / "mrbokeh-rgb")
     memory = {"memory": str(tmp_path / "mrbokeh-rgb"), "shape": [10**9, 10**9], "dtype": "float32"}
-    request = {"what": "composite", "depth": str(tmp_path / "z.exr"), "lens": "fast-50", "insert": [str(tmp_path / "layer.exr")]}
-    write_layer(tmp_path / "layer.exr", Layer(0.5 * scene[0], np.full(SIZE, 0.5, np.float32), np.full(SIZE, 2.0, np.float32)))
-    request |= {"picture": str(tmp_path / "sharp.exr"), "out": str(tmp_path / "o.exr"), "overwrite": True}
+    request = {"what": "composite", "depth": str(tmp_path / "z.exr"), "lens": "fast-50", "insert": [str(tmp_path / "z.exr")]}
+    request |= {"picture": str(tmp_path / "sharp.exr"), "out": str(tmp_path / "o.exr")}
     blurring = Blurring()
     for value in (True, -1, 1e300, float("nan"), 10**400, "\0", "a" * 5000, [], ["a", "b"], [[1, 2, 3]], {"a": 1}, memory, str(tmp_path)):
         status, answer = _answered(blurring, {**request, key: value})
-        assert status in (200, 400) and "\n" not in answer.get("error", ""), (value, answer)
+        assert status == 400 and "\n" not in answer["error"], (value, answer)
 
 
 def test_strangers_and_broken_requests_are_sent_away(connection: str) -> None:
