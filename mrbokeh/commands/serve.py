@@ -186,8 +186,9 @@ def _work(queue: "Queue[_Job]", blurring: "Blurring") -> None:
 
 def _answered(blurring: "Blurring", request: dict[str, Any]) -> tuple[int, dict[str, Any]]:
     """Return HTTP status and answer; whatever goes wrong becomes a sentence."""
-    begun_s = perf_counter()
+    begun_s, quiet = perf_counter(), channel().quiet
     with apart() as heard:
+        heard.quiet = quiet
         try:
             answer = blurring.answer(request)
         except Exception as error:
