@@ -40,6 +40,8 @@ _KEPT_RENDERERS = 8
 _COMMON = ("what", "picture", "depth", "lens", "focal_length_mm", "f_number", "sensor_width_mm", "focus", "renderer", "exact_depth", "out")
 _KEYS = {"render": (*_COMMON, "overwrite"), "composite": (*_COMMON, "overwrite", "insert", "slice", "at_pixel", "height", "mode")}
 _DTYPES = ("float32", "float16")
+_LARGEST = 1e9
+"""Millimetres, metres and pixels of requests are smaller; squares of more would not be numbers."""
 
 app = typer.Typer(add_completion=False)
 
@@ -91,7 +93,7 @@ def _require_free(path: Path) -> None:
     if not isinstance(document, dict) or document.get("format") != FORMAT:
         raise InputError(f"{path} is no connection file of an earlier `mrbokeh serve`: give --connection another name")
     with suppress(Refused):
-        ask({}, str(path))
+        ask({}, str(path), longest_s=5.0)
         raise InputError(f"another `mrbokeh serve` is running by {path}: use that, or give this one --connection OTHER.json")
 
 
@@ -116,7 +118,7 @@ class _Job:
 
 class _Listening(ThreadingHTTPServer):
     daemon_threads = True
-    allow_reuse_address = False  # on Windows another process could listen at the same port
+    allow_reuse_address = os.name != "nt"  # there another process could listen at the same port
     token: str
     queue: "Queue[_Job]"
 
@@ -184,8 +186,9 @@ def _work(queue: "Queue[_Job]", blurring: "Blurring") -> None:
 
 def _answered(blurring: "Blurring", request: dict[str, Any]) -> tuple[int, dict[str, Any]]:
     """Return HTTP status and answer; whatever goes wrong becomes a sentence."""
-    begun_s = perf_counter()
+    begun_s, quiet = perf_counter(), channel().quiet
     with apart() as heard:
+        heard.quiet = quiet
         try:
             answer = blurring.answer(request)
         except Exception as error:
@@ -222,11 +225,11 @@ class Blurring:
                 asked.inserted(),
                 used,
                 depth_m=asked.source("depth") if "depth" in request else None,
-                slice_index=request.get("slice"),
+                slice_index=asked.slice_index(),
                 focus=focus,
-                at_pixel=request.get("at_pixel"),
-                height=request.get("height"),
-                mode=request.get("mode"),
+                at_pixel=asked.pixels(),
+                height=asked.heights(),
+                mode=asked.text("mode") or None,
                 renderer=renderer,
                 exact_depth=asked.exact_depth,
             )
@@ -275,7 +278,7 @@ class _Asked:
 
     def text(self, key: str) -> str:
         value = self.request.get(key) or ""
-        if not isinstance(value, str):
+        if not isinstance(value, str) or "\0" in value:
             raise InputError(f"{key} of a request: expected a text, got {str(value)[:80]}")
         return value
 
@@ -300,6 +303,34 @@ class _Asked:
             return float(value[0]), float(value[1])
         return self._number("focus")
 
+    def slice_index(self) -> int | None:
+        value = self.request.get("slice")
+        if value is not None and type(value) is not int:
+            raise InputError(f"slice of a request: expected a whole number, got {str(value)[:80]}")
+        return value
+
+    def pixels(self) -> list[tuple[float, float]] | None:
+        """Return the pixels on which GLBs stand: [x, y], or one for each."""
+        value = self.request.get("at_pixel")
+        pairs = [value] if isinstance(value, list) and value and not isinstance(value[0], list) else value
+        if pairs is None:
+            return None
+        if not isinstance(pairs, list) or not all(
+            isinstance(each, list) and len(each) == 2 and all(map(_is_number, each)) for each in pairs
+        ):
+            raise InputError(f"at_pixel of a request: expected [x, y] or a list of them, got {str(value)[:80]}")
+        return [(float(x_px), float(y_px)) for x_px, y_px in pairs]
+
+    def heights(self) -> list[float | str] | None:
+        """Return the heights of GLBs: metres, or texts such as "120px"; one, or one for each."""
+        value = self.request.get("height")
+        if value is None:
+            return None
+        each = value if isinstance(value, list) else [value]
+        if not all(isinstance(one, str) or _is_number(one) for one in each):
+            raise InputError(f'height of a request: expected metres or "120px", or a list of them, got {str(value)[:80]}')
+        return each
+
     def picture_and_depth(self) -> tuple[Any, Any]:
         """Return picture and depth; of an EXR alone both, by whatever names its program gives them."""
         from mrbokeh.stacks.exr_layers.render_channels import RenderChannels, layer_of
@@ -309,7 +340,9 @@ class _Asked:
             layer = layer_of(RenderChannels.read(picture))
             return layer.rgb, layer.depth_m
         picture = picture if isinstance(picture, np.ndarray) else _read(picture)
-        if isinstance(depth, int | float) and not isinstance(depth, bool):
+        if isinstance(depth, int | float):
+            if not _is_number(depth) or depth <= 0:
+                raise InputError(f"depth of a request: expected metres above 0, or depth by the pixel, got {str(depth)[:80]}")
             return picture, np.full(picture.shape[:2], depth, np.float32)
         if depth is None:
             raise InputError("a picture in memory needs depth of the same size: give depth in memory too, a file, or metres")
@@ -333,7 +366,7 @@ class _Asked:
 
     def _source(self, key: str, given: Any) -> np.ndarray | Path:
         """Return the path of a file, or the array that lies in memory."""
-        if isinstance(given, str) and given:
+        if isinstance(given, str) and given and "\0" not in given:
             return Path(given)
         if not isinstance(given, dict) or set(given) != {"memory", "shape", "dtype"}:
             raise InputError(f'{key} of a request: expected a file, or {{"memory", "shape", "dtype"}}, got {str(given)[:80]}')
@@ -360,12 +393,14 @@ class _Asked:
                 return str(memory)
 
             return write_memory
-        if not isinstance(out, str) or not out:
+        if not isinstance(out, str) or not out or "\0" in out:
             raise InputError(f'out of a request: expected a file or {{"memory": FILE}}, got {str(out)[:80]}')
         require_suffix(out, (".exr", *INTEGER_SUFFIXES), "out of a request")
         inserted = self.request.get("insert")
         named = [self.request.get(key) for key in ("picture", "depth", "lens")] + (inserted if isinstance(inserted, list) else [])
-        require_safe_outputs((out,), [each for each in named if isinstance(each, str)], bool(self.request.get("overwrite")))
+        require_safe_outputs(
+            (out,), [each for each in named if isinstance(each, str) and "\0" not in each], bool(self.request.get("overwrite"))
+        )
 
         def write_file(rgb: np.ndarray) -> str:
             if Path(out).suffix.lower() == ".exr":  # as `write_image` does, without the tenth of a second that ZIP takes
@@ -386,7 +421,7 @@ def _read(picture: Path) -> np.ndarray:
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(value, int | float) and not isinstance(value, bool) and -_LARGEST < value < _LARGEST
 
 
 def _memory(key: str, given: dict[str, Any]) -> Path:
@@ -394,7 +429,7 @@ def _memory(key: str, given: dict[str, Any]) -> Path:
     from mrbokeh.system.errors import require_file
 
     path = Path(str(given.get("memory")))
-    if not path.name.startswith(PREFIX):
+    if not path.name.startswith(PREFIX) or "\0" in str(path):
         raise InputError(f"{key} of a request: expected memory in a file whose name begins with {PREFIX}, got {path}")
     require_file(path, f"{key} of the request, numbers without a header,")
     return path

@@ -286,7 +286,8 @@ def _show(scene: Any, path: str) -> None:
         bpy.data.images.remove(before)
     image.name = BLURRED
     # Since Blender 5.0 the compositor's nodes are a group of their own.
-    tree = getattr(scene, "compositing_node_group", None) or (scene.node_tree if getattr(scene, "use_nodes", False) else None)
+    has_group = hasattr(scene, "compositing_node_group")
+    tree = scene.compositing_node_group if has_group else scene.node_tree if scene.use_nodes else None
     if tree is not None:
         node = tree.nodes.get(BLURRED) or tree.nodes.new("CompositorNodeImage")
         node.name, node.label, node.image = BLURRED, BLURRED, image

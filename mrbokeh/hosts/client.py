@@ -5,8 +5,6 @@ import json
 import os
 import tempfile
 
-LONGEST_S = 3600.0
-
 
 class Refused(Exception):  # noqa: N818
     """A request that was not answered with a picture; the message is one sentence for the user."""
@@ -17,7 +15,7 @@ def connection_file() -> str:
     return os.environ.get("MRBOKEH_SERVER") or os.path.join(os.path.expanduser("~"), ".mrbokeh-server.json")
 
 
-def ask(request: dict, connection: str = "") -> dict:
+def ask(request: dict, connection: str = "", longest_s: float = 3600.0) -> dict:
     """Send a request (docs/hosts.md) and return the answer when it is finished; an empty one asks whether the server is there.
 
     connection: the file that the server wrote, if not `connection_file()`. Raises Refused.
@@ -30,7 +28,7 @@ def ask(request: dict, connection: str = "") -> dict:
     except (OSError, ValueError, KeyError, TypeError):
         raise Refused("no mrbokeh server is running (" + path + " does not name one): start `mrbokeh serve` in a terminal") from None
     body, headers = json.dumps(request).encode("utf-8"), {"Authorization": "Bearer " + token, "Content-Type": "application/json"}
-    caller = http.client.HTTPConnection("127.0.0.1", port, timeout=LONGEST_S)
+    caller = http.client.HTTPConnection("127.0.0.1", port, timeout=longest_s)
     try:
         caller.request("POST", "/", body, headers)
         answer = json.loads(caller.getresponse().read().decode("utf-8"))

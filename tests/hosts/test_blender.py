@@ -1,7 +1,7 @@
 """The add-on for Blender: its camera mathematics against closed forms and against Blender's own projection, and what it asks the server.
 
 Files in data/blender were written by Blender 4.2.23 through the add-on. Where the package bpy is installed, or MRBOKEH_BPY_PYTHON names
-a Python that has it, the add-on runs in Blender itself: 4.5.15 when this was written.
+a Python that has it, the add-on runs in Blender itself: 4.2.23, 4.5.15 and 5.0.1 when this was written.
 """
 
 import importlib.util
@@ -317,7 +317,14 @@ scene.camera.location, scene.camera.rotation_euler = (0.0, -2.0, 0.6), (math.rad
 dof = scene.camera.data.dof
 dof.focus_distance, dof.aperture_fstop, dof.use_dof = 3.0, 0.25, True
 scene.render.engine, scene.cycles.samples, scene.cycles.use_denoising = "CYCLES", 64, False
-scene.render.resolution_x, scene.render.resolution_y, scene.use_nodes = 320, 180, True
+scene.render.resolution_x, scene.render.resolution_y = 320, 180
+if hasattr(scene, "compositing_node_group"):
+    tree = scene.compositing_node_group = bpy.data.node_groups.new("compositor", "CompositorNodeTree")
+    tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+    tree.links.new(tree.nodes.new("CompositorNodeRLayers").outputs["Image"], tree.nodes.new("NodeGroupOutput").inputs["Image"])
+else:
+    scene.use_nodes = True
+    tree = scene.node_tree
 addon.register()
 
 def refused(word):
@@ -339,7 +346,7 @@ scene.render.image_settings.file_format = "OPEN_EXR"
 bpy.data.images["Render Result"].save_render(sys.argv[2] + ".own.exr", scene=scene)
 theirs = pixels(bpy.data.images.load(sys.argv[2] + ".own.exr"))
 assert bpy.ops.render.mrbokeh_blur(render_first=True) == {"FINISHED"} == bpy.ops.render.mrbokeh_blur()
-assert scene.render.image_settings.file_format == "OPEN_EXR" and scene.node_tree.nodes["mrbokeh blur"].image.name == "mrbokeh blur"
+assert scene.render.image_settings.file_format == "OPEN_EXR" and tree.nodes["mrbokeh blur"].image.name == "mrbokeh blur"
 assert [image.name for image in bpy.data.images].count("mrbokeh blur") == 1 and bpy.data.images["mrbokeh blur"].packed_file
 bpy.data.images["Render Result"].save_render(sys.argv[2] + ".sharp.exr", scene=scene)
 sharp = pixels(bpy.data.images.load(sys.argv[2] + ".sharp.exr"))

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import mrbokeh
+from mrbokeh.commands.serve import Blurring, _answered
 from mrbokeh.hosts.client import Refused, ask, blurred
 from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
 from mrbokeh.images.image_io import write_image, write_layer
@@ -118,6 +119,19 @@ def test_mistakes_are_one_sentence(
         ask(placed, connection)
     assert "\n" not in str(refused.value) and "fault of mrbokeh" not in str(refused.value) and not (tmp_path / "new.exr").exists()
     assert "mrbokeh" in ask({}, connection)
+
+
+@pytest.mark.parametrize("key", ["picture", "depth", "lens", "f_number", "focus", "insert", "slice", "at_pixel", "height", "mode", "out"])
+def test_values_that_nobody_means_are_no_faults(key: str, tmp_path: Path, scene: tuple[np.ndarray, np.ndarray]) -> None:
+    """Refused by what the key expects, else in the end, for what is inserted has no colour; in this process, for there are many."""
+    scene[0].tofile(tmp_path / "mrbokeh-rgb")
+    memory = {"memory": str(tmp_path / "mrbokeh-rgb"), "shape": [10**9, 10**9], "dtype": "float32"}
+    request = {"what": "composite", "depth": str(tmp_path / "z.exr"), "lens": "fast-50", "insert": [str(tmp_path / "z.exr")]}
+    request |= {"picture": str(tmp_path / "sharp.exr"), "out": str(tmp_path / "o.exr")}
+    blurring = Blurring()
+    for value in (True, -1, 1e300, float("nan"), 10**400, "\0", "a" * 5000, [], ["a", "b"], [[1, 2, 3]], {"a": 1}, memory, str(tmp_path)):
+        status, answer = _answered(blurring, {**request, key: value})
+        assert status == 400 and "\n" not in answer["error"], (value, answer)
 
 
 def test_strangers_and_broken_requests_are_sent_away(connection: str) -> None:

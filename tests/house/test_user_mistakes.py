@@ -27,7 +27,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.renderers.onnx_sessions import open_session
 from mrbokeh.scene.gltf.gltf_loader import load_glb
-from mrbokeh.system.errors import InputError
+from mrbokeh.system.errors import InputError, mistake_in
 from mrbokeh.video.writer import VideoWriter
 from tests.support.command_line import mrbokeh, printed_by
 from tests.support.refusals import refused
@@ -120,7 +120,7 @@ def test_the_system_s_refusals_are_sentences(card: Path) -> None:
     told = refusal("lens", "new", card / "lens.json", "--focal-length", 50, "--f-number", 2, "--focus", 1)
     assert "Traceback" not in told and str(card) in told
     refused = PermissionError(13, "Permission denied", str(card.with_name(".out.77.part.exr")))
-    assert cli._refused(refused).startswith(f"{card.parent}: permission denied")
+    assert mistake_in(refused).startswith(f"{card.parent}: permission denied")
 
 
 def test_an_interrupt_that_became_another_error_is_still_an_interrupt(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
