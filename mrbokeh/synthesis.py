@@ -5,8 +5,11 @@ it is whole: a folder (a FocalStack), a shard of a WebDataset (.tar), or a file 
 settings only, so that the same bytes come from any number of workers, and a run that was stopped goes on.
 """
 
+import hashlib
 import io
 import json
+import re
+import shutil
 import tarfile
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
@@ -71,53 +74,73 @@ def sources_in(folder: Path) -> tuple[list[Source], list[str]]:
     """Return (pictures with their depth, names of files without a partner).
 
     They are merged focal stacks; or pairs of files with equal names in rgb/ and depth/ (or such words); or, in one folder, NAME.png with
-    NAME_depth.exr. Raises InputError without one.
+    NAME_depth.exr. Raises InputError without one, and where two would have one name.
     """
     if not folder.is_dir():
         raise InputError(f"expected a folder of pictures with depth at {folder}, but there is none")
-    if any(folder.rglob(FILE_NAME)):
-        merged = [stack.folder for stack in find_focal_stacks(folder) if stack.merged]
-        return [Source("_".join(each.relative_to(folder).parts) or each.name, each, None) for each in merged], []
-    below = {each.name.lower(): each for each in folder.iterdir() if each.is_dir()}
-    pictures, depths = (next((below[word] for word in words if word in below), None) for words in (_PICTURES, _DEPTHS))
-    if pictures is not None and depths is not None:
-        shown = {path.stem: path for path in _files(pictures)}
-        known = {path.stem: path for path in _files(depths)}
-    else:
-        shown, known = _split(_files(folder))
-    found = [Source(name, shown[name], known[name]) for name in sorted(shown.keys() & known.keys())]
+    found, alone = _stacks_in(folder) if any(folder.rglob(FILE_NAME)) else _pairs_in(folder)
     if not found:
         raise InputError(
             f"{folder} holds no picture with depth: expected rgb/NAME.png with depth/NAME.exr, NAME.png with NAME_depth.exr beside it, or "
             f"merged focal stacks"
         )
-    return found, sorted(path.name for names in (shown, known) for name, path in names.items() if name not in shown.keys() & known.keys())
+    names = [each.name for each in found]
+    if twice := sorted({name for name in names if names.count(name) > 1}):
+        raise InputError(f"{folder}: more than one picture would be called {twice[0]} (dots count as _): rename one")
+    return sorted(found, key=lambda each: each.name), alone
+
+
+def _stacks_in(folder: Path) -> tuple[list[Source], list[str]]:
+    stacks = find_focal_stacks(folder)
+    merged = [stack.folder for stack in stacks if stack.merged]
+    names = ["_".join(each.relative_to(folder).parts) or each.name for each in merged]
+    found = [Source(_named(name), each, None) for name, each in zip(names, merged, strict=True)]
+    return found, [stack.folder.name for stack in stacks if not stack.merged]
+
+
+def _pairs_in(folder: Path) -> tuple[list[Source], list[str]]:
+    below = {each.name.lower(): each for each in folder.iterdir() if each.is_dir()}
+    pictures, depths = (next((below[word] for word in words if word in below), None) for words in (_PICTURES, _DEPTHS))
+    if pictures is not None and depths is not None:
+        shown, known = ([(path.stem, path) for path in _files(each)] for each in (pictures, depths))
+    else:
+        shown, known = _split(_files(folder))
+    of_name = dict(known)
+    found = [Source(_named(name), path, of_name[name]) for name, path in shown if name in of_name]
+    used = {path for each in found for path in (each.photo, each.depth)}
+    return found, [path.name for _, path in (*shown, *known) if path not in used]
+
+
+def _named(stem: str) -> str:
+    """Return the name of a sample: in a WebDataset all after the first dot is the name of a field."""
+    return stem.replace(".", "_")
 
 
 def _files(folder: Path) -> list[Path]:
     return sorted(path for path in folder.iterdir() if path.is_file() and path.suffix.lower() in _SUFFIXES)
 
 
-def _split(files: Sequence[Path]) -> tuple[dict[str, Path], dict[str, Path]]:
-    """Return pictures and depths by the names that they have in common."""
-    shown: dict[str, Path] = {}
-    known: dict[str, Path] = {}
+def _split(files: Sequence[Path]) -> tuple[list[tuple[str, Path]], list[tuple[str, Path]]]:
+    """Return pictures and depths, each with the name that they have in common."""
+    shown: list[tuple[str, Path]] = []
+    known: list[tuple[str, Path]] = []
     for path in files:
-        name, _, word = path.stem.replace("-", "_").rpartition("_")
-        if name and word.lower() in _OF_DEPTH:
-            known[name] = path
-        else:
-            shown[name if name and word.lower() in _OF_PICTURE else path.stem] = path
+        name, word = re.fullmatch(r"(?:(.*)[-_])?([^-_]*)", path.stem, re.DOTALL).groups()  # type: ignore[union-attr]
+        is_depth, is_picture = name and word.lower() in _OF_DEPTH, name and word.lower() in _OF_PICTURE
+        (known if is_depth else shown).append((name if is_depth or is_picture else path.stem, path))
     return shown, known
 
 
-def synthesize(folder: Path, out: Path, wanted: Synthesis, workers: int) -> tuple[int, dict[str, str]]:
+def synthesize(sources: Sequence[Source], folder: Path, out: Path, wanted: Synthesis, workers: int) -> tuple[int, dict[str, str]]:
     """Make what is missing of a set, and return (samples that it has now, why others have none, by name).
 
     Raises InputError if OUT was made with other settings, or if nothing can be made.
     """
-    sources, _ = sources_in(folder)
-    _claim(out, wanted, folder)
+    if any(one == other or one in other.parents for one, other in ((folder.resolve(), out.resolve()), (out.resolve(), folder.resolve()))):
+        raise InputError(f"{out} and {folder} lie in one another: give --out a place of its own")
+    _claim(out, wanted, folder, sources)
+    for left in (*out.glob(".shard.*"), *out.glob(".h5.*"), *out.glob(".*.part")):
+        shutil.rmtree(left, ignore_errors=True)
     size = wanted.shard if wanted.format == "webdataset" else 1
     parts = [sources[first : first + size] for first in range(0, len(sources), size)]
     missing = [(index, part) for index, part in enumerate(parts) if not _part_path(out, wanted, index, part).exists()]
@@ -128,8 +151,19 @@ def synthesize(folder: Path, out: Path, wanted: Synthesis, workers: int) -> tupl
             failed |= why
             bars.advance(task, count)
     if len(failed) == len(sources):
+        (out / RECORD).unlink()
         raise InputError(f"{folder}: no picture could be blurred: {next(iter(failed.values()))}")
     return len(sources) - len(failed), failed
+
+
+def remove_set(out: Path) -> None:
+    """Remove what an earlier run has made, and nothing else."""
+    for name in read_json(out / RECORD, "what a set was made with")["samples"]:
+        shutil.rmtree(out / name, ignore_errors=True)
+        (out / f"{name}.h5").unlink(missing_ok=True)
+    for shard in out.glob("[0-9]" * 6 + ".tar"):
+        shard.unlink()
+    write_json(out / RECORD, {"samples": {}})
 
 
 def _made(
@@ -144,17 +178,30 @@ def _made(
         yield from ((running[done], done.result()) for done in as_completed(running))
 
 
-def _claim(out: Path, wanted: Synthesis, folder: Path) -> None:
-    """Note what the set is made of, or raise InputError if it holds another."""
-    record = json.loads(json.dumps({"source": str(folder.resolve()), **asdict(wanted)}, default=str))
+def _claim(out: Path, wanted: Synthesis, folder: Path, sources: Sequence[Source]) -> None:
+    """Note what the set is made of, or raise InputError if it holds another. New pictures may come, but not into shards."""
+    samples = {each.name: [_stamp(path) for path in (each.photo, each.depth) if path is not None] for each in sources}
+    lens = None if wanted.lens is None or not wanted.lens.exists() else _stamp(wanted.lens)
+    record = json.loads(json.dumps({"lens_file": lens, **asdict(wanted)}, default=str))
     if (out / RECORD).exists():
-        if read_json(out / RECORD, "what a set was made with") != record:
+        earlier = read_json(out / RECORD, "what a set was made with")
+        before = earlier.get("samples", {})
+        kept = samples if wanted.format == "webdataset" else {name: samples.get(name, each) for name, each in before.items()}
+        is_same = kept == before
+        if not is_same or earlier.get("settings", record) != record:
             raise InputError(f"{out} was made with other settings or pictures (see {RECORD} in it): give another --out, or --overwrite")
-        return
-    if out.exists() and any(out.iterdir()):
+        samples = before | samples
+    elif out.exists() and any(out.iterdir()):
         raise InputError(f"{out} holds files of something else: give a new folder as --out")
     out.mkdir(parents=True, exist_ok=True)
-    write_json(out / RECORD, record)
+    write_json(out / RECORD, {"source": str(folder.resolve()), "settings": record, "samples": samples})
+
+
+def _stamp(path: Path) -> str:
+    """Return what changes with a file, of a folder with the files in it."""
+    files = sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else [path]
+    told = [(each.name, each.stat().st_size, each.stat().st_mtime_ns) for each in files]
+    return hashlib.sha256(repr(told).encode()).hexdigest()
 
 
 def _part_path(out: Path, wanted: Synthesis, index: int, part: Sequence[Source]) -> Path:
@@ -163,7 +210,7 @@ def _part_path(out: Path, wanted: Synthesis, index: int, part: Sequence[Source])
 
 
 def _make_part(out: Path, wanted: Synthesis, index: int, part: Sequence[Source]) -> dict[str, str]:
-    """Make a part, and return why samples of it have failed, by name; a part without samples is not written."""
+    """Make a part, and return why samples of it have failed, by name; a shard is written whole or not at all."""
     path, failed = _part_path(out, wanted, index, part), {}
     if wanted.format == "folders":
         failed = _failures(part, lambda source: _write_folder(source, wanted, path))
@@ -172,8 +219,10 @@ def _make_part(out: Path, wanted: Synthesis, index: int, part: Sequence[Source])
     else:
         with tempfile.TemporaryDirectory(dir=out, prefix=".shard.") as scratch:
             failed = _failures(part, lambda source: _write_folder(source, wanted, Path(scratch) / source.name))
-            if len(failed) < len(part):
+            if not failed:
                 _write_shard(sorted(Path(scratch).iterdir()), path)
+    if failed and len(part) > 1:
+        failed |= {each.name: f"its shard waits for {', '.join(failed)}" for each in part if each.name not in failed}
     return failed
 
 
@@ -227,7 +276,7 @@ def _write_shard(folders: Sequence[Path], path: Path) -> None:
                     if file.name == FILE_NAME
                     else f"{'_'.join(file.relative_to(folder).with_suffix('').parts).replace('.', '_')}.exr"
                 )
-                entry = tarfile.TarInfo(f"{folder.name.replace('.', '_')}.{name}")
+                entry = tarfile.TarInfo(f"{folder.name}.{name}")
                 entry.size = file.stat().st_size
                 tar.addfile(entry, io.BytesIO(file.read_bytes()))
 

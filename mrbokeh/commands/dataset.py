@@ -64,11 +64,11 @@ def synthesize(
 
     Example: mrbokeh dataset synthesize rgbd/ --lens double-gauss-50 --disparity 0.5:8 --out set/
     """
-    import shutil
-
     from mrbokeh.depth.depth_map import DepthSettings, parse_near_far, parse_stereo
+    from mrbokeh.optics.lens import Lens
     from mrbokeh.renderers.choose import lens_and_renderer
-    from mrbokeh.synthesis import FORMATS, RECORD, Synthesis, sources_in
+    from mrbokeh.stacks.focus_places import FocusLookup, parse_focus
+    from mrbokeh.synthesis import FORMATS, RECORD, Synthesis, remove_set, sources_in
     from mrbokeh.synthesis import synthesize as make
     from mrbokeh.system.console import kept_when_interrupted
     from mrbokeh.system.resources import cores
@@ -76,9 +76,9 @@ def synthesize(
     if wanted.format not in FORMATS:
         raise InputError(f"--format must be one of {', '.join(FORMATS)}, got {wanted.format!r}")
     facts.on(*lens_and_renderer(lens, wanted.renderer))
-    _, alone = sources_in(rgbd)
-    if wanted.overwrite and (out / RECORD).exists():
-        shutil.rmtree(out)
+    sources, alone = sources_in(rgbd)
+    if wanted.focus is not None and not set("@#") & set(wanted.focus):
+        parse_focus(wanted.focus, FocusLookup(Lens.default()))
     settings = Synthesis(
         lens=None if lens is None else lens.resolve() if lens.exists() else lens,
         facts=tuple(facts.given.items()),
@@ -93,8 +93,10 @@ def synthesize(
         slices=wanted.slices,
         format=wanted.format,
     )
+    if wanted.overwrite and (out / RECORD).exists():
+        remove_set(out)
     with kept_when_interrupted(f"finished samples are kept in {out}", wanted.overwrite):
-        made, failed = make(rgbd, out, settings, wanted.workers or cores())
+        made, failed = make(sources, rgbd, out, settings, wanted.workers or cores())
     for name, why in failed.items():
         warn(f"left out {name}: {why}")
     if alone:

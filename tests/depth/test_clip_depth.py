@@ -46,9 +46,22 @@ def test_depth_is_kept_by_frame_numbers_and_made_once(clip: Path, views: TracedV
     assert (np.abs(found["depth.001003.exr"]["Z"] / views.depth_m[2] - 1.0) < 0.02).mean() > 0.9
     assert {"Z", "confidence"} == set(found["depth.001003.exr"])
     assert clip_depth.write([1, 2]) == 0
+    with pytest.raises(InputError, match="no camera for 1006"):
+        replace(clip_depth, first_number=FIRST + 2).write([0, 3])
     other = replace(clip_depth, track=replace(clip_depth.track, frames={n: clip_depth.track.frames[n] for n in range(FIRST, FIRST + 4)}))
     assert other.write([1]) == 1
     assert [path.name for path in clip_depth.folder.glob("*.exr")] == ["depth.001002.exr"], "depth of another track goes"
+    still = CameraTrack(dict.fromkeys(range(FIRST, FIRST + 5), clip_depth.track.frames[FIRST]), "-y")
+    with pytest.raises(InputError, match="moves sideways"):
+        replace(clip_depth, track=still).write([1])
+    assert [path.name for path in clip_depth.folder.glob("*.exr")] == ["depth.001002.exr"], "what there is stays where nothing new is made"
+
+
+def test_files_of_others_are_left_alone(clip: Path, views: TracedViews) -> None:
+    (clip.parent / "mine").mkdir()
+    (clip.parent / "mine" / "depth.beauty.exr").touch()
+    with pytest.raises(InputError, match=r"something else \(depth.beauty.exr\)"):
+        ClipDepth(open_source(clip, "25"), track_of(views), clip.parent / "mine", FIRST).write([1])
 
 
 def test_keyframes_lie_evenly_along_the_motion() -> None:
@@ -66,7 +79,7 @@ def test_keyframes_lie_evenly_along_the_motion() -> None:
     ("given", "told"),
     [
         (("--layer", "layer.exr", "--depth", "auto"), "--camera TRACK"),
-        (("--layer", "layer.exr", "--depth", "auto", "--camera", "track.json", "--disparity", "1:9"), "no --disparity"),
+        (("--layer", "layer.exr", "--depth", "auto", "--camera", "track.json", "--disparity", "1:9"), "neither --disparity"),
         (("--layer", "layer.exr", "--depth", "auto", "--camera", "track.json", "--first-number", "1"), "--first-number"),
     ],
 )

@@ -85,6 +85,17 @@ def test_what_moves_by_itself_has_the_depth_behind_it() -> None:
     assert np.median(found.depth[on_card]) == pytest.approx(1.6, abs=0.1)
 
 
+def test_what_is_too_far_for_parallax_lies_far_behind() -> None:
+    """A wall at 60 m, before which 22 cm give 0.6 px of parallax: it was part of the card at 0.8 m while no plane so far was swept."""
+    behind = replace(wall(1.6), corner_m=(-75.0, -75.0, 60.0), edge_u_m=(150.0, 0.0, 0.0), edge_v_m=(0.0, 150.0, 0.0))
+    far = traced((behind, card(0.8, -0.1, 0.12)), PLACES_M[:5])
+    posed = pictures(far)
+    found = StillScene([each.small() for each in posed], "a far wall").depth_of(posed[2]).depth
+    on_wall = far.depth_m[2] > 10.0
+    assert np.median(found[on_wall]) > 10.0
+    assert np.median(found[~on_wall]) == pytest.approx(0.8, rel=0.02)
+
+
 def test_a_camera_that_only_turns_is_refused(views: TracedViews) -> None:
     with pytest.raises(InputError, match="moves sideways"):
         StillScene([pictures(views)[0].small()] * 3, "clip.mp4")

@@ -111,6 +111,56 @@ def test_folders_of_pictures_and_of_depth_pair_by_name(tmp_path: Path) -> None:
     assert alone == ["b.jpg", "c.exr"]
 
 
+def test_names_pair_by_their_last_word(tmp_path: Path) -> None:
+    for name in ("my-photo_rgb.png", "my-photo_depth.exr", "a.b.png", "a.b-depth.exr", "alone.png"):
+        (tmp_path / name).touch()
+    found, alone = sources_in(tmp_path)
+    assert [each.name for each in found] == ["a_b", "my-photo"]
+    assert alone == ["alone.png"]
+    for name in ("a_b.png", "a_b_depth.exr"):
+        (tmp_path / name).touch()
+    with pytest.raises(InputError, match="called a_b"):
+        sources_in(tmp_path)
+
+
+def test_overwrite_takes_away_only_what_was_made(rgbd: Path, tmp_path: Path) -> None:
+    synthesize(rgbd, tmp_path / "set")
+    (tmp_path / "set" / "notes.txt").write_text("mine")
+    with pytest.raises(InputError):
+        synthesize(rgbd, tmp_path / "set", "--overwrite", "--focus", "0.8:x")
+    assert len(find_focal_stacks(tmp_path / "set")) == 3
+    synthesize(rgbd, tmp_path / "set", "--overwrite", "--focus", "0.8,1.5")
+    assert {len(stack) for stack in find_focal_stacks(tmp_path / "set")} == {2}
+    assert (tmp_path / "set" / "notes.txt").read_text() == "mine"
+
+
+def test_a_set_within_its_pictures_is_refused(rgbd: Path, tmp_path: Path) -> None:
+    shutil.copytree(rgbd, tmp_path / "set" / "rgbd")
+    for source, out in ((tmp_path / "set" / "rgbd", tmp_path / "set"), (tmp_path / "set", tmp_path / "set" / "made")):
+        shutil.copytree(rgbd, source, dirs_exist_ok=True)
+        with pytest.raises(InputError, match="lie in one another"):
+            synthesize(source, out)
+    assert (tmp_path / "set" / "rgbd" / "pear_rgb.exr").is_file()
+
+
+def test_a_shard_waits_for_a_picture_that_fails(rgbd: Path, tmp_path: Path) -> None:
+    """And is made when that is mended; of other pictures than before it is not."""
+    source, out = tmp_path / "rgbd", tmp_path / "set"
+    shutil.copytree(rgbd, source)
+    write_image(source / "fig_rgb.exr", np.ones((8, 8, 3), np.float32))
+    write_exr(source / "fig_depth.exr", ExrPart({"Z": np.ones((8, 8), np.float32)}))  # the same everywhere: no range of focus
+    with pytest.raises(InputError, match=r"the same everywhere|waits for fig"):
+        synthesize(source, out, "--format", "webdataset")
+    assert not list(out.glob("*.tar"))
+    for left in source.glob("fig*"):
+        left.unlink()
+    assert "3 samples" in synthesize(source, out, "--format", "webdataset")
+    shutil.copy(source / "pear_rgb.exr", source / "apricot_rgb.exr")
+    shutil.copy(source / "pear_depth.exr", source / "apricot_depth.exr")
+    with pytest.raises(InputError, match="other settings or pictures"):
+        synthesize(source, out, "--format", "webdataset")
+
+
 @pytest.mark.parametrize(
     ("options", "told"),
     [

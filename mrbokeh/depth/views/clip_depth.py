@@ -24,8 +24,8 @@ from mrbokeh.system.channel import say
 from mrbokeh.system.console import track as with_progress
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
-from mrbokeh.video.image_sequence import numbered
-from mrbokeh.video.picture_source import PictureSource, written_frames
+from mrbokeh.video.image_sequence import numbered, written_frames
+from mrbokeh.video.picture_source import PictureSource
 
 _RECORD = "depth.json"
 _VERSION = 1
@@ -53,8 +53,8 @@ class ClipDepth:
         What was made of another clip or track is replaced. device: of torch, for sweeps. Raises InputError if the camera stays in one
         place, if the track lacks one of the frames, or if the folder holds anything else.
         """
-        record, found = self._record(), self._tracked()
-        if lost := [self.first_number + index for index in taken if index not in found]:
+        record, tracked = self._record(), self._tracked()
+        if lost := [self.first_number + index for index in taken if index not in tracked]:
             raise InputError(f"{self.source.path}: the track has no camera for {written_frames(lost)}: leave those out of --frames")
         stale = [] if self._recorded() == record else sorted(self.folder.glob("depth.*.exr"))
         if stale and not (self.folder / _RECORD).exists():
