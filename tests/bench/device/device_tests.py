@@ -17,7 +17,7 @@ from tests.support.torch_device import VARIABLE
 ROOT = Path(__file__).resolve().parents[3]
 FILES = (
     "tests/renderers/test_torch_polygon.py",
-    "tests/views/test_plane_sweep_torch.py",
+    "tests/depth/test_plane_sweep_torch.py",
     "tests/renderers/test_torch_spreadlets.py",
     "tests/psf_models/test_torch_tracing.py",
     "tests/renderers/test_torch_reconstruction.py",
