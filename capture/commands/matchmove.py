@@ -95,7 +95,7 @@ def matchmove_command(
 def _tell(out: Path, page: Path, made: "Matchmove", told_by: str | None) -> None:
     solve = made.solve
     say(f"solved as {solve.why}")
-    guess(f"nothing tells it: mrbokeh takes {' and '.join(made.assumed)}" if made.assumed else "")
+    guess(f"the clip does not tell how the camera was held: mrbokeh takes {' and '.join(made.assumed)}" if made.assumed else "")
     count, lost = len(solve.times_s), solve.lost
     scale = "scale arbitrary" if told_by is None else f"in metres, by --{told_by}"
     lost_told = f", {len(lost)} lost ({', '.join(map(str, lost[:8]))}{', ...' if len(lost) > 8 else ''})" if lost else ""

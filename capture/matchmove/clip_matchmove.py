@@ -91,6 +91,12 @@ def matchmove_clip(clip: Path, work: Path, settings: MatchmoveSettings | None = 
     if settings.picked_frames and not 0 <= min(settings.picked_frames) <= max(settings.picked_frames) < len(solve.times_s):
         last = len(solve.times_s) - 1
         raise InputError(f"{clip} has frames 0 to {last}, but pixels or places were given of {sorted(settings.picked_frames)}")
+    for name, picks in (("--ground", settings.ground), ("--ruler", settings.ruler)):
+        if picks is not None and not ((picks.xy_px >= 0) & (picks.xy_px <= (info.width_px, info.height_px))).all():
+            outside = "/".join(f"{x:g},{y:g}" for x, y in picks.xy_px)
+            raise InputError(
+                f"{name}: {outside} lies outside of the picture ({info.width_px}x{info.height_px} px): give pixels of the clip"
+            )
     return _standing(solve, settings, work / "images")
 
 

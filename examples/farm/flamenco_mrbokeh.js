@@ -5,6 +5,7 @@ const JOB_TYPE = {
         { key: "frames", type: "string", required: true, default: "1001-1050", description: "Frames as the files are numbered" },
         { key: "chunk_size", type: "int32", default: 10, description: "Frames of one task" },
         { key: "plate", type: "string", required: true, description: "plate.%04d.exr on the shared storage" },
+        { key: "rate", type: "string", default: "24", description: "Frames per second, as in the plate's headers if they state it" },
         { key: "layer", type: "string", required: true, description: "cg.%04d.exr" },
         { key: "lens", type: "string", required: true, description: "lens.json, a bank or a network" },
         { key: "out", type: "string", required: true, description: "comp.%04d.exr" },
@@ -17,7 +18,7 @@ function compileJob(job) {
         const task = author.Task(`mrbokeh-${chunk}`, "misc");
         task.addCommand(author.Command("exec", {
             exe: "mrbokeh",
-            args: ["video", settings.plate, "--layer", settings.layer, "--lens", settings.lens, "--frames", chunk, "--out", settings.out,
+            args: ["video", settings.plate, "--rate", settings.rate, "--layer", settings.layer, "--lens", settings.lens, "--frames", chunk, "--out", settings.out,
                 "--overwrite", "--json"],
         }));
         job.addTask(task);

@@ -282,7 +282,10 @@ class FlickerScore:
         score, own = float(np.mean(self.changes)), float(np.mean(self.own_changes))
         report.measures |= {"flicker": score, "flicker of the plate": own}
         if score - own > limit:
-            text = f"the mean change between frames where the plate stands still is {score:.3%}, the plate's own {own:.3%}"
+            text = (
+                f"the mean change between frames where the plate stands still is {score:.3%}, the plate's own {own:.3%}; "
+                f"virtual things that move there count too"
+            )
             report.findings.append(Finding(check="flicker", where="all frames", text=text, value=score - own, limit=limit))
         self._judge_pops(report, limit)
 

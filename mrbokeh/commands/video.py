@@ -26,6 +26,7 @@ from mrbokeh.compositing.choose import DEFAULT_MODE
 from mrbokeh.compositing.plate_look.finishing import LookOptions
 from mrbokeh.depth.views import DEPTH_NAME
 from mrbokeh.images.carried_exr import CarriedExr
+from mrbokeh.images.exr_io import ATTRIBUTE, headers_of
 from mrbokeh.renderers.choose import BY_NAME, lens_and_renderer
 from mrbokeh.shots.composite_recipe import CompositeRecipe
 from mrbokeh.shots.executors import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
@@ -43,7 +44,7 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import cores
 from mrbokeh.video.clip import has_alpha_apart
 from mrbokeh.video.encodings import with_alpha
-from mrbokeh.video.image_sequence import STOP, ImageSequence, is_pattern, numbers_of, require_all_there, require_missing_known
+from mrbokeh.video.image_sequence import STOP, ImageSequence, is_pattern, numbered, numbers_of, require_all_there, require_missing_known
 from mrbokeh.video.picture_source import PictureSource, numbers_taken, open_source, parse_rate
 from mrbokeh.video.proxy_source import ProxySource, parse_proxy
 
@@ -385,6 +386,9 @@ def video(
     recipe = recipe_of(source, lens, facts, taken, virtual, rendering, look, blur, virtual_only=result.virtual_only)
     if lens_and_renderer(lens, blur.renderer)[0] is None and not {"focal_length_mm", "f_number"} <= facts.given.keys():
         guess(f"no whole lens is stated, so that this one is taken: {recipe.stated_lens.described}")
+    if lens is not None and not lens.exists() and blur.focus is blur.focus_at is blur.focus_pull is None:
+        guess(f"{lens} is focused at {recipe.stated_lens.focus_distance_m:.3g} m, for nothing tells it (--focus METRES)")
+    _tell_layer_spaces(virtual, colour, shot_numbers=_numbers(source, taken))
     scale, whole, plate = parse_proxy(result.proxy), recipe, source
     if scale < 1:
         recipe, source = proxy_recipe(recipe, source.info, scale), ProxySource.of(source, scale)
@@ -405,6 +409,16 @@ def video(
     frames = len(shot.taken)
     told = f"wrote {out} ({source.info.width_px}x{source.info.height_px} px, {frames} frame{'' if frames == 1 else 's'}, {note})"
     tell(told, known=recipe.stated_lens.facts, frames=frames, size_px=(source.info.width_px, source.info.height_px))
+
+
+def _tell_layer_spaces(virtual: VirtualOptions, colour: ColourOptions, shot_numbers: "Sequence[int]") -> None:
+    """Say which layers state no primaries, where spaces are named: they are not in the space of the plate."""
+    if colour.input_space is None and colour.output_space is None:
+        return
+    for path in virtual.layer or ():
+        first = numbered(path, shot_numbers[0])
+        if first.is_file() and not any(ATTRIBUTE in header for header in headers_of(first)):
+            say(f"{first.name} states no primaries (chromaticities): its colours are taken for linear Rec.709")
 
 
 def _alpha_lost(clip: Path, source: PictureSource, target: Target) -> str | None:

@@ -8,9 +8,9 @@ import pytest
 from mrbokeh.depth.views.dense_depth import DenseSettings, dense_depth
 from mrbokeh.depth.views.plane_sweep import Matching, plane_sweep
 from mrbokeh.depth.views.sweep_view import SweepView
+from tests.depth.test_plane_sweep import turned_view
 from tests.support.plane_sweep_scenes import card, traced, wall
 from tests.support.refusals import refused
-from tests.depth.test_plane_sweep import turned_view
 
 torch = pytest.importorskip("torch")
 

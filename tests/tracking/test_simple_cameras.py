@@ -179,6 +179,10 @@ def test_a_drawn_pan_is_solved_once_and_stood_again(tmp_path: Path, monkeypatch:
     assert "in metres, by --camera-height" in again
     heights = [-read_track(out).at(number).camera.world_from_camera[2, 3] for number in range(16)]
     assert heights == pytest.approx([2.0] * 16)
+    before = out.read_bytes()
+    outside = ("--ground", "0:100,250/600,250/300,280", "--overwrite")
+    refused("600,250/300,280 lies outside", printed_by, app, "matchmove", clip, "--out", out, *outside)
+    assert out.read_bytes() == before
     refused("sees no lengths", printed_by, app, "matchmove", clip, "--out", out, "--distance", "0,3,1", "--overwrite")
     with pytest.raises(BaseException, match="solved again"):
         printed_by(app, "matchmove", clip, "--out", out, "--focal-length", 40, "--overwrite")

@@ -5,6 +5,7 @@ import os
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 
 from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.compositing.plate import plate_of
-from mrbokeh.images.exr_io import ExrPart, write_exr
+from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
 from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer
@@ -217,6 +218,15 @@ def test_several_runs_may_write_one_result(clip: Path, settings: list[str], tmp_
     with writing_alone(tmp_path / "out.mkv"):
         done = mrbokeh("video", clip, *settings, "--workers", 1, "--frames", "0-1", "--out", tmp_path / "out.mkv")
     assert done.returncode == 0, done.stderr
+
+
+def test_a_lens_of_the_library_says_where_it_is_focused(clip: Path, settings: list[str], capfd: pytest.CaptureFixture[str]) -> None:
+    """Which no file of the clip does; and layers without primaries say as what they are taken."""
+    part = read_exr(settings[1])[0]
+    write_exr(settings[1], replace(part, attributes={}))
+    given = (clip, "--layer", settings[1], "--lens", "fast-50", "--frames", "0", "--output-space", "ACEScg")
+    told = run(*given, "--out", clip.with_name("out.%04d.exr")) + capfd.readouterr().err
+    assert "fast-50 is focused at 2 m" in told and "layer.exr states no primaries" in told
 
 
 def test_the_focus_is_pulled(clip: Path, settings: list[str], tmp_path: Path) -> None:

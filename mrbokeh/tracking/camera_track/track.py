@@ -163,7 +163,7 @@ class CameraTrack:
             within = "but not all of them" if len(numbers) <= numbers[-1] - numbers[0] else "which is all"
             raise InputError(
                 f"the camera track has frames {numbers[0]} to {numbers[-1]} ({within}), not frame {frame}: "
-                f"track that part too, or take frames that it has"
+                f"track that part too, take frames that it has, or shift its numbers: mrbokeh track convert --frame-offset"
             )
         return self.frames[frame]
 
