@@ -275,6 +275,15 @@ def target_of(out: Path, source: PictureSource, recipe: CompositeRecipe, colour:
     return VideoTarget(path=out.resolve(), encoding=encoding, audio_from=sound, space=colour.of_result, even_rate=even_rate)
 
 
+def segment_frames(frames: int, most: int) -> int:
+    """Return the frames of a segment, so that two or four workers end together: three segments would leave one of two idle for a third.
+
+    It depends on the shot alone, for several machines may share it.
+    """
+    segments = -(-frames // most)
+    return -(-frames // (segments if segments < 3 else -(-segments // 4) * 4))
+
+
 def shot_of(source: PictureSource, recipe: CompositeRecipe, target: Target, taken: ClipOptions, segment_s: float) -> Shot:
     numbers, first = _numbers(source, taken), _first_number(source, taken)
     return Shot(
@@ -282,7 +291,7 @@ def shot_of(source: PictureSource, recipe: CompositeRecipe, target: Target, take
         recipe=recipe,
         target=target,
         taken=[number - first for number in numbers],
-        segment_frames=max(1, round(segment_s * source.info.frame_rate)),
+        segment_frames=segment_frames(len(numbers), max(1, round(segment_s * source.info.frame_rate))),
     )
 
 

@@ -19,6 +19,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
+from mrbokeh.commands.video import segment_frames
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.shots.composite_recipe import CompositeRecipe
@@ -100,7 +101,9 @@ def rate_of(clip: Path, recipe: MakerRecipe, executor: Executor, encoding: str =
     """(frames per second, largest memory in MB) of a whole run, from the start of the processes to the joined file."""
     out = clip.with_name(f"out.{'mp4' if encoding.startswith('h26') else 'mov'}")
     source = open_source(clip)
-    shot = Shot(source, recipe, VideoTarget(out, encoding), range(len(source.times_s)), round(SEGMENT_S * RATE))
+    shot = Shot(
+        source, recipe, VideoTarget(out, encoding), range(len(source.times_s)), segment_frames(len(source.times_s), round(SEGMENT_S * RATE))
+    )
     with Memory() as memory:
         started_s = time.perf_counter()
         render_shot(shot, executor)

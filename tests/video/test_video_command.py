@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mrbokeh.commands.video import segment_frames
 from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.compositing.plate import plate_of
 from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
@@ -227,6 +228,13 @@ def test_a_lens_of_the_library_says_where_it_is_focused(clip: Path, settings: li
     given = (clip, "--layer", settings[1], "--lens", "fast-50", "--frames", "0", "--output-space", "ACEScg")
     told = run(*given, "--out", clip.with_name("out.%04d.exr")) + capfd.readouterr().err
     assert "fast-50 is focused at 2 m" in told and "layer.exr states no primaries" in told
+
+
+@pytest.mark.parametrize(
+    ("frames", "most", "expected"), [(150, 50, 38), (100, 50, 50), (12, 3, 3), (12, 50, 12), (600, 50, 50), (1, 50, 1)]
+)
+def test_segments_are_even_for_two_and_for_four_workers(frames: int, most: int, expected: int) -> None:
+    assert segment_frames(frames, most) == expected
 
 
 def test_the_focus_is_pulled(clip: Path, settings: list[str], tmp_path: Path) -> None:
