@@ -67,9 +67,9 @@ def synthesize(
     from mrbokeh.depth.depth_map import DepthSettings, parse_near_far, parse_stereo
     from mrbokeh.optics.lens import Lens
     from mrbokeh.renderers.choose import lens_and_renderer
+    from mrbokeh.shots.synthesis import FORMATS, RECORD, Synthesis, remove_set, sources_in
+    from mrbokeh.shots.synthesis import synthesize as make
     from mrbokeh.stacks.focus_places import FocusLookup, parse_focus
-    from mrbokeh.synthesis import FORMATS, RECORD, Synthesis, remove_set, sources_in
-    from mrbokeh.synthesis import synthesize as make
     from mrbokeh.system.console import kept_when_interrupted
     from mrbokeh.system.resources import cores
 

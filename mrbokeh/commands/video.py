@@ -3,10 +3,8 @@
 Options alone say what the shot is: what makes its frames, where they go, and which of the clip they are.
 """
 
-import re
 from dataclasses import dataclass, replace
 from pathlib import Path
-from time import monotonic
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -24,12 +22,12 @@ from mrbokeh.commands._insertion_options import (
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.compositing.choose import DEFAULT_MODE
 from mrbokeh.compositing.plate_look.finishing import LookOptions
-from mrbokeh.depth.views import DEPTH_NAME
 from mrbokeh.images.carried_exr import CarriedExr
 from mrbokeh.images.exr_io import ATTRIBUTE, headers_of
 from mrbokeh.renderers.choose import BY_NAME, lens_and_renderer
 from mrbokeh.shots.composite_recipe import CompositeRecipe
 from mrbokeh.shots.executors import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
+from mrbokeh.shots.found_depth import find_depth, found_depth_files
 from mrbokeh.shots.frame_sources import CameraFile, ClipLook, DepthFiles, FocusPulled, MatteFiles
 from mrbokeh.shots.inputs import Moment
 from mrbokeh.shots.layer_sources import LayerFiles, sources_by_depth, with_cryptomatte
@@ -37,7 +35,7 @@ from mrbokeh.shots.proxies import proxy_recipe
 from mrbokeh.shots.render_shot import SequenceTarget, VideoTarget, render_shot
 from mrbokeh.shots.shot import SEGMENT_S, Shot, Target
 from mrbokeh.stacks.photograph import SensorOrientation, lens_for_orientation
-from mrbokeh.system.atomic_files import require_safe_outputs, writing_alone
+from mrbokeh.system.atomic_files import require_safe_outputs
 from mrbokeh.system.channel import guess, say, tell, warn
 from mrbokeh.system.console import kept_when_interrupted, progress_bars
 from mrbokeh.system.errors import InputError
@@ -212,7 +210,7 @@ def _depth(taken: ClipOptions, virtual: VirtualOptions, clip: Path) -> DepthFile
     if is_auto(taken.depth):
         if near_far_m is not None or taken.steady_depth or virtual.camera is None:
             raise InputError("--depth auto needs the moving camera, --camera TRACK, and neither --disparity nor --steady-depth")
-        return DepthFiles(_depth_folder(virtual.camera, clip) / DEPTH_NAME, with_holes=True)
+        return DepthFiles(found_depth_files(virtual.camera, clip), with_holes=True)
     # A filter over time takes numbers only.
     with_holes = not (taken.exact_depth or taken.steady_depth)
     return DepthFiles(taken.depth.resolve(), taken.steady_depth, near_far_m, with_holes=with_holes)
@@ -221,31 +219,6 @@ def _depth(taken: ClipOptions, virtual: VirtualOptions, clip: Path) -> DepthFile
 def is_auto(depth: Path | None) -> bool:
     """Return whether depth is to be found from the clip itself."""
     return depth is not None and str(depth) == "auto"
-
-
-def _depth_folder(camera: Path, clip: Path) -> Path:
-    """Return where the depth of a tracked clip is kept: beside the track."""
-    name = re.sub(r"\W+", "_", re.sub(r"%0?\d*d|#+", "", clip.stem)).strip("_")
-    return camera.resolve().with_name(f"{camera.stem}_{name}_depth")
-
-
-def _found_depth(source: PictureSource, camera: Path, taken: "Sequence[int]", first_number: int) -> None:
-    """Find the depth of the frames that are taken, as far as it is not kept from an earlier run."""
-    from mrbokeh.depth.views.clip_depth import ClipDepth
-    from mrbokeh.tracking.camera_track.formats import read_track
-    from mrbokeh.tracking.camera_track.track import TrackOptions
-
-    size_px, folder = (source.info.width_px, source.info.height_px), _depth_folder(camera, source.path)
-    track = read_track(camera, TrackOptions(size_px=size_px))
-    if not track.metric:
-        say(f"the lengths of {camera.name} may not be metres: depth is in its unit, as places in a scene and Z of layers have to be")
-    found = ClipDepth(source, track, folder, first_number)
-    began_s = monotonic()
-    with writing_alone(folder), kept_when_interrupted(f"finished depth is kept in {folder}"):
-        made = found.write(taken)
-    if made:
-        took_s = (monotonic() - began_s) / made
-        say(f"depth of {made} frames lies in {folder} ({took_s:.1f} s a frame); what moves by itself has that of what is behind it")
 
 
 def _focus_at_fact(recipe: CompositeRecipe, source: PictureSource, first: int, place: str) -> tuple[str, float]:
@@ -388,7 +361,7 @@ def video(
     Example: mrbokeh video clip.mov --scene scene.toml --camera track.json --focus-pull 0:1.2,48:3.5 --lens lens.json --out out.mp4
     """
     finds_depth = is_auto(taken.depth) and virtual.camera is not None
-    depth_files = (_depth_folder(virtual.camera, clip) / DEPTH_NAME,) if finds_depth and virtual.camera else (taken.depth,)
+    depth_files = (found_depth_files(virtual.camera, clip),) if finds_depth and virtual.camera else (taken.depth,)
     require_safe_outputs((out,), (clip, *depth_files, taken.matte, *virtual.files, rendering.distortion, lens), overwrite=True)
     require_missing_known(taken.missing)
     source = open_source(clip, taken.rate, colour.of_plate, taken.missing)
@@ -405,7 +378,7 @@ def video(
     shot = shot_of(source, recipe, target, taken, work.segment)
     target.require_new(shot, result.overwrite or shot.was_begun)
     if is_auto(taken.depth) and virtual.camera is not None:
-        _found_depth(plate, virtual.camera, shot.taken, recipe.first_number)
+        find_depth(plate, virtual.camera, shot.taken, recipe.first_number)
     if blur.focus_at is not None:
         focused = _focus_at_fact(whole, plate, shot.taken[0], blur.focus_at)
         shot = replace(shot, recipe=replace(recipe, facts=(*recipe.facts, focused)))

@@ -13,7 +13,7 @@ from tests.house.test_style import FILES, PACKAGES, ROOT, nodes
 LEVELS = (
     {"cli"},
     {"commands"},
-    {"shots", "synthesis"},
+    {"shots"},
     {"compositing", "refocus", "demo"},
     {"scene", "depth", "checks", "figures", "lens_measuring", "hosts"},
     {"renderers", "stacks", "distortion"},

@@ -15,8 +15,8 @@ from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.images.layer import opaque
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.choose import lens_and_renderer
+from mrbokeh.shots.synthesis import MADE, sources_in
 from mrbokeh.stacks.focal_stack import find_focal_stacks
-from mrbokeh.synthesis import MADE, sources_in
 from mrbokeh.system.errors import InputError
 from tests.support.command_line import printed_by
 
