@@ -1,6 +1,6 @@
 """Ray-traced focal stacks with a known lens, to train on: heart, ring, bladed and round bokeh (Mandl et al. 2024, section 4.1).
 
-    python -m datasets_scripts.bokeh_stacks OUT --shape heart [--size small|full --pull 48]
+    python -m datasets_scripts.bokeh_stacks OUT --shape heart [--size small|medium|full --pull 48]
     mrbokeh train fit OUT --out RUN
 
 OUT is a data set with a manifest (`mrbokeh.stacks.focal_stack_dataset`): OUT/SCENE/view_NN/ are focal stacks with all-in-focus picture and
@@ -80,10 +80,9 @@ class StackView:
 
     def defocused(self, opening: Opening) -> tuple[Picture, float]:
         """Return (picture, its noise floor in dB: the PSNR that a perfect method would reach)."""
-        size = self._plan.size
+        samples, lamp_rays = self._plan.rays(f"{self._scene}/{self._plan.view_name(self._view)}")
         first, second = (
-            tracer.traced(opening, self._plan.samples // 2).rgb + tracer.lamp_light(opening, size.lamp_rays // 2)
-            for tracer in self._tracers
+            tracer.traced(opening, samples // 2).rgb + tracer.lamp_light(opening, lamp_rays // 2) for tracer in self._tracers
         )
         return 0.5 * (first + second), float(psnr(first, second) + _MEAN_OVER_DIFFERENCE_DB)
 
@@ -189,7 +188,7 @@ def _summary(dataset: FocalStackDataset) -> str:
 def main(
     out: Annotated[Path, typer.Argument(help="Folder for the set.")],
     shape: Annotated[str, typer.Option(help=f"Opening of the lens: {', '.join(SHAPES)}.")],
-    size: Annotated[str, typer.Option(help=f"{' or '.join(SIZES)}; docs/datasets.md says how long they take.")] = "small",
+    size: Annotated[str, typer.Option(help=f"{', '.join(SIZES)}; docs/datasets.md says how long they take.")] = "small",
     scenes: Annotated[str, typer.Option(help="Only these, with commas between: a share of the work.")] = "",
     samples: Annotated[int, typer.Option(help="Camera rays per pixel, 0 for those of the size.")] = 0,
     pull: Annotated[int, typer.Option(help="Also OUT.pull: one test view at so many focus distances.")] = 0,

@@ -5,6 +5,7 @@ Openings are the four of Neural Bokeh's synthetic sets (Mandl et al. 2024, Figur
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -65,6 +66,7 @@ SHAPES: dict[str, Callable[[], BokehShape]] = {
 }
 
 
+@lru_cache(maxsize=len(SHAPES))
 def bokeh_shape(name: str) -> BokehShape:
     if name not in SHAPES:
         raise InputError(f"expected a shape out of {', '.join(SHAPES)}, got {name!r}")
@@ -73,7 +75,11 @@ def bokeh_shape(name: str) -> BokehShape:
 
 @dataclass(frozen=True)
 class StackSize:
-    """Extent of a set. samples: camera rays per pixel, in two halves, best powers of two; each lamp sends out lamp_rays."""
+    """Extent of a set. samples: camera rays per pixel, in two halves, best powers of two; each lamp sends out lamp_rays.
+
+    fewer_in_training: so many times fewer rays for the slices of training stacks. Their noise has no mean, so that a network that fits
+    many of them learns the same (Lehtinen et al. 2018, Noise2Noise); sharp pictures and slices to test on keep all rays.
+    """
 
     scenes: tuple[str, ...]
     views: int
@@ -83,9 +89,10 @@ class StackSize:
     f_number: float
     samples: int
     lamp_rays: int
+    fewer_in_training: int = 1
 
     def __post_init__(self) -> None:
-        least = min(self.views, self.focuses, self.samples // 2, self.lamp_rays // 2)
+        least = min(self.views, self.focuses, self.samples // self.fewer_in_training // 2, self.lamp_rays // self.fewer_in_training // 2)
         if least < 1 or min(self.width_px, self.height_px) < _SMALLEST_PX or not self.scenes:
             raise InputError(
                 f"a set needs scenes, at least one view and one focus, pictures of at least {_SMALLEST_PX}x{_SMALLEST_PX} px and 2 "
@@ -105,6 +112,17 @@ SIZES = {
         f_number=1.1,
         samples=128,
         lamp_rays=1 << 16,
+    ),
+    "medium": StackSize(
+        scenes=tuple(f"{kind}_{number}" for number in (1, 2, 3) for kind in KINDS),
+        views=15,
+        focuses=10,
+        width_px=192,
+        height_px=112,
+        f_number=1.1,
+        samples=128,
+        lamp_rays=1 << 16,
+        fewer_in_training=4,
     ),
     "full": StackSize(
         scenes=tuple(f"{kind}_{number}" for number in (1, 2, 3) for kind in KINDS),
@@ -131,10 +149,10 @@ class StacksPlan:
     def opening(self) -> BokehShape:
         return bokeh_shape(self.shape)
 
-    @property
-    def samples(self) -> int:
-        """Rays per pixel: twice as many where a stop takes two thirds of them."""
-        return self.size.samples * (1 if self.opening.stop is None else 2)
+    def rays(self, name: str) -> tuple[int, int]:
+        """Return (rays per pixel, rays of each lamp) of a stack's slices: twice as many per pixel where a stop takes two thirds of them."""
+        fewer = self.size.fewer_in_training if self.parts().get(name) == "train" else 1
+        return self.size.samples * (1 if self.opening.stop is None else 2) // fewer, self.size.lamp_rays // fewer
 
     @property
     def names(self) -> list[str]:

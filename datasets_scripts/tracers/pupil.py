@@ -6,7 +6,7 @@ middle and open on the right. An aperture's outlines cannot say it, since they a
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -51,6 +51,7 @@ class PupilTable:
         return np.stack([x, y], axis=1)
 
 
+@lru_cache(maxsize=8)
 def pupil_table(aperture: Aperture) -> PupilTable:
     """Return the table of an aperture that passes all or nothing at every point: outlines of weight +1 and stops of weight -1."""
     if not all(abs(weight) == 1.0 for weight in aperture.weights):
@@ -148,6 +149,9 @@ class OpenShares:
 
         column, row = self.places(field_x, field_y)
         return map_coordinates(self.table, [row, column], order=1, mode="nearest")
+
+
+open_shares = lru_cache(maxsize=4)(OpenShares)
 
 
 def _span(y: Float[np.ndarray, " lines"], centre_x: float, centre_y: float, radius: float) -> tuple[np.ndarray, np.ndarray]:

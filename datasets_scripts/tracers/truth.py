@@ -10,13 +10,12 @@ ray counts 1 over the share of the pupil that is open for its point, so that not
 """
 
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from datasets_scripts.tracers.pupil import FieldStop, OpenShares
+from datasets_scripts.tracers.pupil import FieldStop, OpenShares, open_shares
 from datasets_scripts.tracers.truth_scene import PackedScene
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import Camera
@@ -58,11 +57,11 @@ class Opening:
         """Whether the opening changes over the frame."""
         return bool(self.aperture.cat_eye) or self.stop is not None
 
-    @cached_property
+    @property
     def shares(self) -> OpenShares:
         """Shares of the pupil that rim and stop leave open; only if there is a stop."""
         assert self.stop is not None
-        return OpenShares(self.stop, self.aperture.cat_eye)
+        return open_shares(self.stop, self.aperture.cat_eye)
 
 
 @dataclass(frozen=True, eq=False)
