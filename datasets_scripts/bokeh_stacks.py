@@ -81,9 +81,7 @@ class StackView:
     def defocused(self, opening: Opening) -> tuple[Picture, float]:
         """Return (picture, its noise floor in dB: the PSNR that a perfect method would reach)."""
         samples, lamp_rays = self._plan.rays(f"{self._scene}/{self._plan.view_name(self._view)}")
-        first, second = (
-            tracer.traced(opening, samples // 2).rgb + tracer.lamp_light(opening, lamp_rays // 2) for tracer in self._tracers
-        )
+        first, second = (tracer.traced(opening, samples // 2).rgb + tracer.lamp_light(opening, lamp_rays // 2) for tracer in self._tracers)
         return 0.5 * (first + second), float(psnr(first, second) + _MEAN_OVER_DIFFERENCE_DB)
 
     def _make_slice(self, index: int) -> None:

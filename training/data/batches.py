@@ -12,7 +12,7 @@ import copy
 import functools
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
 
@@ -260,16 +260,29 @@ def draw_share(
     *,
     depth_noise: float = 0.0,
     largest_coc_px: float = float("inf"),
+    device: torch.device | None = None,
+    kept: dict[int, Batch] | None = None,
 ) -> Iterator[Batch]:
     """Yield the pictures of a step, one by one, for process `number` of `count`: `drawing.size` for each process, from one sequence.
 
     rng is advanced when this returns. While the caller computes, the pictures of the next calls are read in the background, provided
     that they draw alike with this rng; otherwise they only wait longer.
     depth_noise: how badly depth is made worse (`training.data.batches`; the drawing must be noisy), up to diameters of largest_coc_px.
+    kept: of whole pictures, which stay on the device once they are there.
     """
+
+    def batch_of(crop: Crop) -> Batch:
+        if kept is not None and crop.window.index in kept:
+            return kept[crop.window.index]
+        batch = _single(_pair(drawing.pairs, crop, depth_noise, largest_coc_px))
+        batch = batch if device is None else batch.to(device)
+        if kept is not None:
+            kept[crop.window.index] = batch
+        return batch
+
     crops = drawing.draw_share(rng, number, count)
     drawing.pairs.expect(itertools.chain((crop.window for crop in crops), drawing.next_windows(rng, number, count)))
-    return (_single(_pair(drawing.pairs, crop, depth_noise, largest_coc_px)) for crop in crops)
+    return (batch_of(crop) for crop in crops)
 
 
 def stack_pairs(pairs: Sequence[Pair]) -> Batch:
@@ -305,6 +318,12 @@ def _single(pair: Pair) -> Batch:
         lens=lens,
         saturated=saturated,
     )
+
+
+def joined_by_size(batches: Iterable[Batch]) -> Iterator[Batch]:
+    """Yield neighbours of one size as one batch."""
+    for _, same in itertools.groupby(batches, key=lambda each: (each.rgb.shape, each.saturated is None)):
+        yield _joined(list(same))
 
 
 def _joined(batches: Sequence[Batch]) -> Batch:

@@ -155,6 +155,10 @@ class PairSet:
         """Tell whether all pairs stay in memory once they are read."""
         return sum(self._bytes(index, self.size_px(index)[0]) for index in range(len(self))) <= self._cache.limit_bytes
 
+    @functools.cached_property
+    def one_size(self) -> bool:
+        return len({self.size_px(index) for index in range(len(self))}) == 1
+
     def window(self, index: int, rows: slice) -> Window:
         """Return what to read for some rows: just these, or the whole picture if all of them fit."""
         return self._window(index, slice(0, self.size_px(index)[0]) if self.all_fit else rows)

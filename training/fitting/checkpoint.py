@@ -19,8 +19,9 @@ from torch import Tensor
 
 from mrbokeh.system.atomic_files import atomic_path
 from mrbokeh.system.errors import InputError
+from training.data.batches import Batch
 from training.fitting.settings import TrainSettings
-from training.networks.network import BlurNetwork
+from training.networks.network import BlurNetwork, split
 
 TABLE_NAME = "curve.csv"
 PICTURE_NAME = "curve.png"
@@ -87,6 +88,14 @@ class Learner:
     def learning_rate(self) -> float:
         """Return the learning rate of the last step."""
         return float(self._optimizer.param_groups[0]["lr"])
+
+    def record_steps(self, batch: Batch) -> None:
+        """Record the kernels of one pass for pictures of this size, forward and backward, to start them all at once (CUDA graphs)."""
+        network = self.network
+        with torch.no_grad():
+            x = network.encode(batch.rgb, batch.coc_px, batch.place, batch.lens)
+            x = x if network.grid is None else split(x, network.grid)
+        network.tiles = torch.cuda.make_graphed_callables(network.tiles, (x,))
 
     def begin(self, rate_factor: float) -> None:
         """Start a step at this fraction of the peak learning rate, without gradients."""

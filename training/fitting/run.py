@@ -20,7 +20,7 @@ from rich.progress import Progress as Bars
 
 from mrbokeh.system.console import progress_bars
 from mrbokeh.system.errors import InputError
-from training.data.batches import Batch, Drawing, draw_share
+from training.data.batches import Batch, Drawing, draw_share, joined_by_size
 from training.fitting.checkpoint import FILE_NAME as CHECKPOINT_NAME
 from training.fitting.checkpoint import Learner, Progress, read_checkpoint, restore_checkpoint
 from training.fitting.distributed import Ranks
@@ -93,6 +93,11 @@ class Run:
         self._halo_px = math.ceil(task.facts.largest_coc_px / 2.0)
         # The rim of a crop that wide does not count; at least half of each side has to.
         self._crop_px = self.settings.crop_px and max(self.settings.crop_px, 4 * self._halo_px)
+        whole = not self._crop_px and self.settings.depth_noise == 0.0
+        self._on_gpu = ranks.device.type == "cuda"
+        # Whole pictures that all fit stay on the GPU; where they are of one size, the kernels of a step are recorded as well.
+        self._kept: dict[int, Batch] | None = {} if self._on_gpu and whole and task.pairs.all_fit else None
+        self._is_recorded = False
         self._interruption = Interruption(alone=ranks.count == 1)
         self._stopped_by: int | None = None
         self._started_s = time.monotonic() - self.progress.elapsed_s
@@ -160,12 +165,13 @@ class Run:
         return {"description": description, "completed": min(progress.elapsed_s, budget_s), "total": budget_s}
 
     def _step(self, rate_factor: float) -> None:
-        """Make one update from `batch` pictures of each process, one after the other.
+        """Make one update from `batch` pictures of each process: one after the other, or on a GPU those of one size together.
 
         One picture uses few of the network's bins, all together most of them.
         """
         self.learner.begin(rate_factor)
-        mean_loss = self._agree(sum(self._learn_from(batch) for batch in self._draw()))
+        batches = joined_by_size(self._draw()) if self._on_gpu else self._draw()
+        mean_loss = self._agree(sum(self._learn_from(batch) for batch in batches))
         self.learner.apply(self.progress.step)
         self.progress.took_step(mean_loss, self.settings.batch * self.ranks.count)
 
@@ -185,14 +191,19 @@ class Run:
             noisy=noise > 0.0,
         )
         place, most_px = (self.ranks.number, self.ranks.count), self.task.facts.largest_coc_px
-        for batch in draw_share(drawing, self._rng, *place, depth_noise=noise, largest_coc_px=most_px):
-            yield batch.to(self.ranks.device)
+        yield from draw_share(
+            drawing, self._rng, *place, depth_noise=noise, largest_coc_px=most_px, device=self.ranks.device, kept=self._kept
+        )
 
     def _learn_from(self, batch: Batch) -> float:
-        """Add the gradients of one picture."""
+        """Add the gradients of one picture, or of several of one size."""
         facts, settings = self.task.facts, self.settings
+        share = len(batch.rgb) / settings.batch
+        if self._kept is not None and not self._is_recorded and settings.precision == "float32" and self.task.pairs.one_size:
+            self.learner.record_steps(batch)
+            self._is_recorded = True
         with self.learner.autocast():
-            error = loss(self.learner.network, batch, facts.radiance_scale, facts.largest_coc_px, settings) / settings.batch
+            error = loss(self.learner.network, batch, facts.radiance_scale, facts.largest_coc_px, settings) * share
         self.learner.backward(error)
         return error.item()
 

@@ -1,9 +1,9 @@
-"""Depthwise convolutions with a fast gradient on the CPU, and the kernels with which networks start.
+"""Depthwise convolutions with a fast gradient, and the kernels with which networks start.
 
 Blur of d pixels needs kernels d + 1 wide, and PyTorch's own gradient with respect to depthwise weights grows on a CPU much faster than
 the convolution itself: one of 35 x 35 over 128 x 128 pixels took 170 times as long backward as forward. The gradient of a kernel is the
 correlation of the input with the gradient of the output, of which only the kernel's own pixels are needed, and that of the input
-is a convolution. Fourier transforms give both in about the time of the convolution forward.
+is a convolution. Fourier transforms give both in about the time of the convolution forward. On a GPU they give all three.
 """
 
 import math
@@ -13,13 +13,14 @@ from typing import Any
 import numpy as np
 import scipy.fft
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional
 
 from mrbokeh.optics.aperture import Aperture
 
 LEAST_SIZE = 9
 """Width of kernels from which on the transforms are faster (half the time at 9, a twentieth at 21, less than a hundredth at 35)."""
+LEAST_SIZE_ON_GPU = 5
 _CHANNELS_AT_ONCE = 64  # bounds the memory of the transforms
 FLAT_SHARE, FLAT_SHARE_IN_FOCUS = 0.05, 0.005  # of a fresh kernel, so that every one of its pixels can learn
 # Several bases of a bin must begin apart, or they would all learn the same: discs clipped from different sides, as cat-eyes are, on
@@ -31,15 +32,27 @@ def depthwise(maps: Tensor, kernels: Tensor, bias: Tensor | None = None, padding
     """Convolve every channel of (B, C, H, W) with its own (C, 1, k, k): `functional.conv2d` with C groups, in value and in gradient."""
     if not _worth_it(maps, kernels):
         return functional.conv2d(maps, kernels, bias, padding=padding, groups=kernels.shape[0])
-    blurred: Tensor = _Depthwise.apply(maps, kernels, padding)
+    blurred: Tensor = (_Depthwise if maps.device.type == "cpu" else _TransformedDepthwise).apply(maps, kernels, padding)
     return blurred if bias is None else blurred + bias[:, None, None]
 
 
+def pointwise(maps: Tensor, convolution: nn.Conv2d) -> Tensor:
+    """Return a 1x1 convolution in groups; on a GPU that learns as one product of matrices, since grouped ones are slow backward there."""
+    if maps.device.type == "cpu" or torch.compiler.is_exporting() or not torch.is_grad_enabled():
+        return convolution(maps)  # type: ignore[no-any-return]
+    batch, _, height, width = maps.shape
+    weight = convolution.weight.view(convolution.groups, -1, convolution.in_channels // convolution.groups)
+    product = weight @ maps.reshape(batch, convolution.groups, -1, height * width)
+    result = product.view(batch, -1, height, width)
+    return result if convolution.bias is None else result + convolution.bias[:, None, None]
+
+
 def _worth_it(maps: Tensor, kernels: Tensor) -> bool:
-    """Tell whether Fourier transforms pay: on a CPU, in single precision, with wide kernels, and if a gradient is needed at all."""
+    """Tell whether Fourier transforms pay: in single precision, with wide kernels, and if a gradient is needed at all."""
     if torch.compiler.is_exporting() or not (torch.is_grad_enabled() and kernels.requires_grad):
         return False
-    return kernels.shape[-1] >= LEAST_SIZE and maps.device.type == "cpu" and not torch.is_autocast_enabled("cpu")
+    least = LEAST_SIZE if maps.device.type == "cpu" else LEAST_SIZE_ON_GPU
+    return kernels.shape[-1] >= least and not torch.is_autocast_enabled(maps.device.type)
 
 
 class _Depthwise(torch.autograd.Function):
@@ -69,8 +82,7 @@ def _gradients(
     With out(p) = sum over o of maps(p + o - padding) kernel(o), that of maps(q) is sum over o of gradient(q + padding - o) kernel(o), and
     that of kernel(o) the sum over p of maps(p + o - padding) gradient(p).
     """
-    size, (height, width) = kernels.shape[-1], maps.shape[-2:]
-    lengths = [scipy.fft.next_fast_len(length + 2 * padding, real=True) for length in (height, width)]
+    size, (height, width), lengths = kernels.shape[-1], maps.shape[-2:], _lengths(maps, padding)
     error = torch.fft.rfft2(gradient.contiguous(), s=lengths)
     of_maps = of_kernels = None
     if wanted[0]:
@@ -80,6 +92,37 @@ def _gradients(
         seen = torch.fft.rfft2(functional.pad(maps.contiguous(), (padding,) * 4), s=lengths)
         of_kernels = torch.fft.irfft2((seen * error.conj()).sum(dim=0), s=lengths)[:, :size, :size]
     return of_maps, of_kernels
+
+
+def _lengths(maps: Tensor, padding: int) -> list[int]:
+    return [scipy.fft.next_fast_len(length + 2 * padding, real=True) for length in maps.shape[-2:]]
+
+
+class _TransformedDepthwise(torch.autograd.Function):
+    """The convolution and its gradients by transforms alone; spectra of the way forward serve the way back.
+
+    Transforms as long as the padded input hold no wrap-around where every pixel of a kernel lies within it.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, maps: Tensor, kernels: Tensor, padding: int) -> Tensor:
+        lengths, (height, width) = _lengths(maps, padding), maps.shape[-2:]
+        seen = torch.fft.rfft2(functional.pad(maps.contiguous(), (padding,) * 4), s=lengths)
+        spectra = torch.fft.rfft2(kernels[:, 0], s=lengths)
+        ctx.save_for_backward(seen, spectra)
+        ctx.lengths, ctx.sizes, ctx.padding = lengths, (height, width, kernels.shape[-1]), padding
+        out = torch.fft.irfft2(seen * spectra.conj(), s=lengths)
+        rows, columns = (length + 2 * padding - kernels.shape[-1] + 1 for length in (height, width))
+        return out[..., :rows, :columns].contiguous()
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:  # type: ignore[override]
+        (seen, spectra), (height, width, size), padding = ctx.saved_tensors, ctx.sizes, ctx.padding
+        error = torch.fft.rfft2(gradient.contiguous(), s=ctx.lengths)
+        whole = torch.fft.irfft2(error * spectra, s=ctx.lengths)
+        of_maps = whole[..., padding : padding + height, padding : padding + width]
+        of_kernels = torch.fft.irfft2((seen * error.conj()).sum(dim=0), s=ctx.lengths)[:, None, :size, :size]
+        return of_maps.contiguous(), of_kernels.contiguous(), None
 
 
 def disc_kernel(size: int, diameter_px: float) -> Tensor:

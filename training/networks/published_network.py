@@ -13,7 +13,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from training.networks.kernels import depthwise, disc_kernel
+from training.networks.kernels import depthwise, disc_kernel, pointwise
 from training.networks.network_settings import NetworkSettings
 
 
@@ -42,12 +42,12 @@ class PublishedTiles(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         batch, _, height, width = x.shape
-        state = self.c1(x.contiguous(memory_format=torch.channels_last) if self._side_by_side(x) else x)
+        state = pointwise(x.contiguous(memory_format=torch.channels_last) if self._side_by_side(x) else x, self.c1)
         for block in self.blocks:
             state = block(state)
         per_tile = (batch, self.tile_count, -1, height, width)
         joined = torch.cat([state.reshape(per_tile), x.reshape(per_tile)[:, :, :3]], dim=2)
-        y = self.c2(joined.reshape(batch, -1, height, width))
+        y = pointwise(joined.reshape(batch, -1, height, width), self.c2)
         return torch.tanh(y) if self.activation == "tanh" else y
 
     def _side_by_side(self, x: Tensor) -> bool:
@@ -90,7 +90,8 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         change = self._convolved(self.second, torch.relu(self._convolved(self.first, x)))
-        return self.mix(torch.relu(x + change))
+        state = torch.relu(x + change)
+        return pointwise(state, self.mix) if isinstance(self.mix, nn.Conv2d) else state
 
     def _convolved(self, convolution: nn.Conv2d, x: Tensor) -> Tensor:
         padded = self._padded(x)
