@@ -36,7 +36,7 @@ from training.evaluation.methods import (
 from training.fitting import train
 from training.fitting.objective import learning_rate_factor
 from training.fitting.run import Run
-from training.fitting.run_folder import load_run
+from training.fitting.run_folder import first_network, load_run
 from training.fitting.settings import TrainSettings, demo_settings
 from training.networks.network_settings import NetworkSettings
 
@@ -48,7 +48,7 @@ DEMO_WORDS = ["--preset", "demo", "--threads", "1", "--held-out", "view_2"]
 PUBLISHED = TrainSettings(network=NetworkSettings(tile_px=32, overlap_px=8), epochs=4, threads=1, validate_every_s=0.0)
 
 
-def make_stack(folder: Path, seed: int, size: tuple[int, int] = SIZE) -> FocalStack:
+def make_stack(folder: Path, seed: int, size: tuple[int, int] = SIZE, lens: Lens = LENS) -> FocalStack:
     """A textured wall, slanted from 0.5 m to 0.8 m, with three lights of radiance 20, photographed by the reference renderer.
 
     The wall has no depth edges, so that the reference renderer is exact up to its pixels.
@@ -59,11 +59,11 @@ def make_stack(folder: Path, seed: int, size: tuple[int, int] = SIZE) -> FocalSt
     rgb = (0.6 * coarse + 0.2 * rng.random((height, width, 3))).astype(np.float32)
     rgb[rng.integers(4, height - 4, 3), rng.integers(4, width - 4, 3)] = 20.0
     depth_m = np.broadcast_to(1.0 / np.linspace(1 / 0.5, 1 / 0.8, width), size).astype(np.float32)
-    stack = FocalStack(folder, tuple(Slice(f"slice_{i}.exr", each) for i, each in enumerate(FOCUS_M)), LENS, registered=True, merged=True)
+    stack = FocalStack(folder, tuple(Slice(f"slice_{i}.exr", each) for i, each in enumerate(FOCUS_M)), lens, registered=True, merged=True)
     folder.mkdir(parents=True)
     write_merged(folder, rgb, np.zeros_like(depth_m), np.ones_like(depth_m), depth_m)
     for i in range(len(FOCUS_M)):
-        write_image(folder / f"slice_{i}.exr", scatter_reference(rgb, stack.coc_px(i, depth_m), LENS.aperture), half=False)
+        write_image(folder / f"slice_{i}.exr", scatter_reference(rgb, stack.coc_px(i, depth_m), lens.aperture), half=False)
     write_focal_stack(stack)
     return stack
 
@@ -116,6 +116,29 @@ def test_the_network_learns_the_lens_and_a_finished_run_is_left_alone(scene: Pat
     assert train.fit(training_data([scene]), run, DEMO_LIKE, ["view_2"]).finished
     assert (run / "network.pt").read_bytes() == before
     refused("other settings \\(seed\\)", train.fit, training_data([scene]), run, dataclasses.replace(DEMO_LIKE, seed=1), ["view_2"])
+
+
+def test_a_run_starts_from_another_one_and_learns_a_lens_of_its_family_sooner(run: Path, tmp_path: Path) -> None:
+    """Of a blade less, seen in one stack: as many steps afresh are worse, and the first look is at the other run's network."""
+    lens = dataclasses.replace(LENS, aperture=Aperture.blades(5, 0.2))
+    wall = make_stack(tmp_path / "wall", 7, lens=lens)
+    data = training_data([wall.folder])
+    few = dataclasses.replace(DEMO_LIKE, epochs=6, start_from=str(run), learning_rate=0.005)
+    tuned = train.fit(data, tmp_path / "tuned", few)
+    afresh = train.fit(data, tmp_path / "afresh", dataclasses.replace(few, start_from=None, learning_rate=DEMO_LIKE.learning_rate))
+    assert tuned.curve[-1].held_out_psnr_db > afresh.curve[-1].held_out_psnr_db + 1.0
+    assert load_run(tmp_path / "tuned")[2].radiance_scale == load_run(run)[2].radiance_scale
+    before, task = load_run(run)[0].state_dict(), first_network(few, load_run(run)[2]).state_dict()
+    assert all(torch.equal(before[name], task[name]) for name in before)
+
+
+def test_a_run_does_not_start_from_one_that_knows_less_blur_or_has_another_shape(scene: Path, run: Path, tmp_path: Path) -> None:
+    near = make_stack(tmp_path / "near", 7, lens=dataclasses.replace(LENS, f_number=2.0))
+    few = dataclasses.replace(DEMO_LIKE, start_from=str(run))
+    refused("has learned blur of up to .* px: give smaller", train.fit, training_data([near.folder]), tmp_path / "out", few)
+    wider = dataclasses.replace(few, network=dataclasses.replace(few.network, width=3))
+    refused("another shape .* train afresh", train.fit, training_data([scene]), tmp_path / "out", wider)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.slow

@@ -47,6 +47,10 @@ def fit_command(
             help="Stack to keep for testing (repeat for more), instead of the split of the data set; of scenes else a fifth is drawn."
         ),
     ] = None,
+    start_from: Annotated[
+        Path | None,
+        typer.Option("--from", help="A finished run to tune to these pictures, by default for 5 minutes: its settings and weights."),
+    ] = None,
     settings_file: Annotated[Path | None, typer.Option("--settings", help="A settings.json to start from instead of a preset.")] = None,
     choices: Annotated[
         list[str] | None,
@@ -75,6 +79,8 @@ def fit_command(
 
     Example: mrbokeh train fit scenes/attic --preset demo --minutes 2.5 --held-out view_3 --out runs/attic
 
+    Example: mrbokeh train fit another_50mm/view_1 --from runs/50mm --out runs/another
+
     Example: mrbokeh train fit lens_50mm --set network.tile_px=96 --set network.overlap_px=24 --set loss_scope=tile --out runs/tiles
 
     Example: torchrun --nproc-per-node 4 -m training fit lens_50mm --set precision=bfloat16 --out runs/50mm
@@ -84,7 +90,7 @@ def fit_command(
     budget: dict[str, Any] = {"minutes": minutes, "epochs": epochs} if minutes is not None or epochs is not None else {}
     given = {"threads": threads, "device": device, "seed": seed}
     try:
-        settings = with_overrides(_begun_with(preset, settings_file), choices or ())
+        settings = with_overrides(_begun_with(preset, settings_file, start_from), choices or ())
         settings = replace(settings, **budget | {name: value for name, value in given.items() if value is not None})
         if _number("RANK") == 0:
             _require_run(out)
@@ -136,9 +142,13 @@ def _number(name: str) -> int:
     return int(os.environ.get(name, "0"))
 
 
-def _begun_with(preset: Preset, settings_file: Path | None) -> "TrainSettings":
-    from training.fitting.settings import PRESETS, load_settings
+def _begun_with(preset: Preset, settings_file: Path | None, start_from: Path | None) -> "TrainSettings":
+    from training.fitting.settings import PRESETS, load_settings, tuned_settings
 
+    if start_from is not None and settings_file is not None:
+        raise InputError("--from takes the settings of its run, so --settings cannot be given with it: leave one of them out")
+    if start_from is not None:
+        return tuned_settings(start_from)
     return PRESETS[preset]() if settings_file is None else load_settings(settings_file)
 
 

@@ -26,7 +26,7 @@ from training.fitting.checkpoint import Learner, Progress, read_checkpoint, rest
 from training.fitting.distributed import Ranks
 from training.fitting.objective import learning_rate_factor, loss
 from training.fitting.record import Record, Task
-from training.fitting.run_folder import build_network
+from training.fitting.run_folder import first_network
 from training.fitting.settings import TrainSettings
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -86,7 +86,7 @@ class Run:
     def __init__(self, task: Task, ranks: Ranks, afresh: bool = False) -> None:
         self.task, self.settings, self.ranks = task, task.settings, ranks
         torch.set_num_threads(self.settings.threads or max(1, (os.cpu_count() or 1) // ranks.local_count))
-        self.learner = Learner(build_network(self.settings, task.facts), self.settings, ranks.device)
+        self.learner = Learner(first_network(self.settings, task.facts), self.settings, ranks.device)
         self._rng = np.random.default_rng(self.settings.seed)
         self.progress = Progress() if afresh else self._restored()
         self._record = Record(task, self.learner, self.progress, self._rng)

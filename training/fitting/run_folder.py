@@ -86,6 +86,21 @@ def build_network(settings: TrainSettings, facts: RunFacts) -> BlurNetwork:
         )
 
 
+def first_network(settings: TrainSettings, facts: RunFacts) -> BlurNetwork:
+    """Build the network that training begins with: a fresh one, or that of the run which the settings start from."""
+    network = build_network(settings, facts)
+    if settings.start_from is not None:
+        before = load_run(Path(settings.start_from))[0]
+        try:
+            network.load_state_dict(before.state_dict())
+        except RuntimeError:
+            raise InputError(
+                f"the network of {settings.start_from} has another shape than this run's: expected its settings of the network and, of a "
+                f"tiled one, pictures of its size, {facts.width_px}x{facts.height_px} px: train afresh"
+            ) from None
+    return network
+
+
 def save_network(folder: Path, network: BlurNetwork) -> None:
     with atomic_path(folder / NETWORK_NAME) as temporary:
         torch.save(network.state_dict(), temporary)

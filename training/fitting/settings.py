@@ -15,6 +15,7 @@ from training.networks.network_settings import NetworkSettings
 FORMAT = "mrbokeh-training-settings"
 VERSION = 1
 FILE_NAME = "settings.json"
+TUNING_RATE = 0.25
 _TRUTH = {"true": True, "false": False}
 _BUDGETS = {"minutes": "epochs", "epochs": "minutes"}
 
@@ -49,11 +50,13 @@ class TrainSettings:
     precision: of the network's arithmetic while training; the half types are for GPUs.
     patience: stop after so many looks at the held-out slices without a better one; 0 never stops early.
     sheets: write a sheet of predictions on held-out slices at every look, so that one can watch it learn.
+    start_from: folder of a finished run whose weights this one begins with, and whose ranges of radiance and blur it keeps; None: afresh.
     test_fraction: of the stacks (viewpoints) of scene folders, held out when no names are given; the paper's split is 80 : 20.
         Of a single stack every fourth slice is held out, none where this is 0. A data set has its own split.
     """
 
     network: NetworkSettings = field(default_factory=NetworkSettings)
+    start_from: str | None = None
     seed: int = 0
     minutes: float | None = None
     epochs: int | None = 50
@@ -212,6 +215,13 @@ def demo_settings(minutes: float = 2.5) -> TrainSettings:
         sensor_white=1.0,
         ema_decay=0.97,
     )
+
+
+def tuned_settings(run_folder: Path) -> TrainSettings:
+    """Return the settings to tune a finished run to other data: its own, for 5 minutes at a lower learning rate."""
+    own = read_settings(run_folder)
+    rate = TUNING_RATE * own.learning_rate
+    return replace(own, start_from=str(run_folder.resolve()), minutes=5.0, epochs=None, learning_rate=rate)
 
 
 def better_settings() -> TrainSettings:

@@ -6,6 +6,7 @@ A run is continued only with the settings and data it was begun with.
 import shutil
 from collections.abc import Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 from mrbokeh.stacks.guessed_metres import is_lens_guessed
@@ -24,6 +25,9 @@ from training.fitting.run_folder import RunFacts, read_facts, source_commit, wri
 from training.fitting.settings import FILE_NAME as SETTINGS_NAME
 from training.fitting.settings import TrainSettings, read_settings, write_settings
 
+_SAME_BLUR = 0.01
+TUNING_STEPS = 20
+"""The least of a run that starts from another: it has a lens already."""
 _MAY_DIFFER = ("threads", "device", "cache_mib", "checkpoint_every_s", "sheets")
 
 
@@ -79,7 +83,7 @@ def _fit(
     with closing(pairs):
         facts = ranks.from_first(checked)
         run = Run(Task(folder=run_folder, settings=settings, facts=facts, pairs=pairs, held_out=validation), ranks, afresh=overwrite)
-        run.require_steps(least_steps)
+        run.require_steps(least_steps if settings.start_from is None else min(least_steps, TUNING_STEPS))
         ranks.from_first(lambda: begun(facts))
         return run.train()
 
@@ -94,7 +98,7 @@ def _require_looks(settings: TrainSettings, validation: HeldOutSlices) -> None:
 
 def _facts_of(data: TrainingData, pairs: PairSet, split: Split, settings: TrainSettings) -> RunFacts:
     found = data.facts(pairs, several_lenses=settings.network.lens_inputs)
-    return RunFacts(
+    facts = RunFacts(
         lens=found.lens,
         width_px=found.width_px,
         height_px=found.height_px,
@@ -108,6 +112,19 @@ def _facts_of(data: TrainingData, pairs: PairSet, split: Split, settings: TrainS
         f_numbers=found.f_numbers,
         focal_lengths_mm=found.focal_lengths_mm,
     )
+    return facts if settings.start_from is None else _within(facts, Path(settings.start_from))
+
+
+def _within(facts: RunFacts, run_folder: Path) -> RunFacts:
+    """Return the facts with the ranges of the run that training starts from, on which its weights depend."""
+    before = read_facts(run_folder)
+    if facts.largest_coc_px > before.largest_coc_px * (1.0 + _SAME_BLUR):
+        raise InputError(
+            f"{run_folder} has learned blur of up to {before.largest_coc_px:.1f} px, but these pictures have "
+            f"{facts.largest_coc_px:.1f} px: give smaller pictures, or train afresh"
+        )
+    ranges = {name: getattr(before, name) for name in ("largest_coc_px", "radiance_scale", "f_numbers", "focal_lengths_mm")}
+    return replace(facts, **ranges)
 
 
 def require_same_settings(run_folder: Path, settings: TrainSettings) -> None:
