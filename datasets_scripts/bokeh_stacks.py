@@ -108,6 +108,7 @@ class StackView:
             metadata={"traced": True, "scene": self._scene, "shape": self._plan.shape, "opening": self._plan.opening.document()},
         )
         write_focal_stack(stack)
+        self.__dict__.pop("_tracers", None)  # tens of megabytes, of a view that is done
 
 
 def make_bokeh_stacks(out: Path, plan: StacksPlan, only: tuple[str, ...] = (), *, overwrite: bool = False) -> FocalStackDataset | None:
