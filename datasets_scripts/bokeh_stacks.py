@@ -190,6 +190,7 @@ def main(
     size: Annotated[str, typer.Option(help=f"{', '.join(SIZES)}; docs/datasets.md says how long they take.")] = "small",
     scenes: Annotated[str, typer.Option(help="Only these, with commas between: a share of the work.")] = "",
     samples: Annotated[int, typer.Option(help="Camera rays per pixel, 0 for those of the size.")] = 0,
+    f_number: Annotated[float, typer.Option(help="Of the lens, 0 for that of the size; sets of several make a family of lenses.")] = 0.0,
     pull: Annotated[int, typer.Option(help="Also OUT.pull: one test view at so many focus distances.")] = 0,
     seed: Annotated[int, typer.Option(help="Viewpoints and sampling; scenes are numbered.")] = 1,
     overwrite: Overwrite = False,
@@ -199,6 +200,7 @@ def main(
         if size not in SIZES:
             raise InputError(f"expected a size out of {', '.join(SIZES)}, got {size!r}")
         chosen = replace(SIZES[size], samples=samples) if samples else SIZES[size]
+        chosen = replace(chosen, f_number=f_number) if f_number else chosen
         plan = StacksPlan(shape, chosen, seed)
         dataset = make_bokeh_stacks(out, plan, tuple(scenes.split(",")) if scenes else (), overwrite=overwrite)
         if pull:
