@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mrbokeh.system.channel import say, tell
+from mrbokeh.system.channel import say, tell, warn
 from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
@@ -87,11 +87,16 @@ def _run(planned: "Sequence[PlannedRun]", out: Path, tables: "tuple[TableName, .
     from mrbokeh.system.console import kept_when_interrupted
     from training.ablation.report import Report
     from training.ablation.runs import result_of
+    from training.fitting.record import DivergedError
 
     report = Report(out, tables, planned, _command_line())
     with kept_when_interrupted(f"finished runs are kept in {out}"):
         for number, each in enumerate(planned, 1):
-            result = result_of(each, lpips)  # type: ignore[arg-type]
+            try:
+                result = result_of(each, lpips)  # type: ignore[arg-type]
+            except DivergedError as error:
+                warn(f"{each.folder.relative_to(out)} has no result: {error}")
+                continue
             say(
                 f"{number}/{len(planned)} {each.folder.relative_to(out)}: {result.measures['psnr_db']:.2f} dB, SSIM "
                 f"{result.measures['ssim']:.4f}, {result.steps} steps in {result.seconds:.0f} s"

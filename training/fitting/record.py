@@ -14,6 +14,7 @@ from jaxtyping import Float32
 
 from mrbokeh.images.image_io import WIDEST_PX, SheetRow, write_contact_sheet
 from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.errors import InputError
 from training.data.batches import Batch, stack_pairs
 from training.data.dataset import Pair, PairSet
 from training.data.pairs import WHERE_TRUTH_IS_KNOWN
@@ -106,6 +107,31 @@ class Task:
     held_out: HeldOutSlices
 
 
+class DivergedError(InputError):
+    """A training whose loss or weights are no longer numbers."""
+
+
+def diverged(task: Task, step: int) -> DivergedError:
+    """Return the error for a loss or weights that are no numbers after so many steps."""
+    settings, kept = task.settings, task.folder / CHECKPOINT_NAME
+    if step == 0:
+        return DivergedError(
+            "the loss of the first step is not a number, before anything was learnt: expected pictures and circles of confusion "
+            "that are finite where they count; look for NaN and inf in the slices, all_in_focus.exr and depth.exr"
+        )
+    half = " and precision=float32" if settings.precision != "float32" else ""
+    left = f"{kept} keeps the last weights that were numbers" if kept.exists() else "nothing was written"
+    return DivergedError(
+        f"training diverged: after {step} steps loss or weights are not numbers; give {lower_rate(settings)}{half}, with --overwrite or "
+        f"another --out; {left}"
+    )
+
+
+def lower_rate(settings: TrainSettings) -> str:
+    """Return the option for a tenth of the learning rate."""
+    return f"--set learning_rate={settings.learning_rate / 10.0:.2g}"
+
+
 class Record:
     """The writer of a run's files, in the first process only; progress, learner and rng are shared with the run."""
 
@@ -142,11 +168,19 @@ class Record:
         return 0 < self._task.settings.patience <= self._progress.looks_since_best
 
     def save(self) -> None:
+        """Write the checkpoint and the curve; not with weights that are no numbers, of which the next step tells."""
+        if not self._learner.is_finite():
+            return
         save_checkpoint(self._checkpoint, self._progress, self._learner, self._rng)
         write_curve(self._task.folder, self._progress.curve)
 
     def finish(self) -> None:
-        """Take the last look and save the network: the last weights, or with patience the best ones."""
+        """Take the last look and save the network: the last weights, or with patience the best ones.
+
+        Raises DivergedError, and saves nothing, if the weights are no numbers.
+        """
+        if not self._learner.is_finite():
+            raise diverged(self._task, self._progress.step)
         if not self._progress.stopped_early:
             self.look()
         self._progress.kept_step = self._progress.step
