@@ -6,7 +6,6 @@ The estimate is the budget in minutes, or else from one timed step of each run.
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch

@@ -129,13 +129,14 @@ def _minutes(minutes: float | None, epochs: int | None) -> float | None:
 
 
 def _print_plan(planned: "Sequence[PlannedRun]") -> None:
-    from training.ablation.report import changed_settings
     from training.ablation.runs import estimated_minutes, is_finished
+    from training.fitting.settings import TrainSettings, changed_settings
 
     estimated = estimated_minutes(planned)
     for each, minutes in zip(planned, estimated, strict=True):
         when = "finished" if is_finished(each) else f"{minutes:.1f} min"
-        tell(f"{each.row.name:15s} {each.data_set.name} seed {each.seed}  {when:>10s}  {' '.join(changed_settings(each.settings))}")
+        changed = " ".join(changed_settings(each.settings, TrainSettings()))
+        tell(f"{each.row.name:15s} {each.data_set.name} seed {each.seed}  {when:>10s}  {changed}")
     tell(f"{len(planned)} runs, about {sum(estimated):.0f} min of training; measuring comes on top")
 
 

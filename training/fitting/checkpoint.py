@@ -6,6 +6,7 @@ a table and a picture.
 
 import copy
 import csv
+import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -58,11 +59,11 @@ def write_curve(folder: Path, curve: Sequence[CurvePoint]) -> None:
         rows.writerows(["" if isinstance(value, float) and math.isnan(value) else value for value in point] for point in curve)
 
 
-def draw_curve(folder: Path, curve: Sequence[CurvePoint]) -> None:
-    """Draw curve.png: loss and learning rate (both logarithmic) and the PSNR on held-out slices, over steps."""
+def draw_curve(folder: Path, curve: Sequence[CurvePoint]) -> str:
+    """Draw curve.png: loss and learning rate (both logarithmic) and the PSNR on held-out slices, over steps; return it as SVG."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(7.0, 6.5), layout="constrained")
+    figure = Figure(figsize=(5.0, 6.0), layout="constrained")
     loss, psnr, rate = figure.subplots(3, 1, sharex=True, height_ratios=(3, 3, 1))
     steps = [point.step for point in curve]
     loss.semilogy(steps, [point.loss for point in curve], color="tab:blue")
@@ -74,7 +75,10 @@ def draw_curve(folder: Path, curve: Sequence[CurvePoint]) -> None:
         axes.grid(alpha=0.3)
     rate.set_xlabel("step")
     with atomic_path(folder / PICTURE_NAME) as temporary:
-        figure.savefig(temporary, dpi=100)
+        figure.savefig(temporary, dpi=140)
+    drawn = io.StringIO()
+    figure.savefig(drawn, format="svg", metadata={"Date": None})
+    return drawn.getvalue()[drawn.getvalue().index("<svg") :]
 
 
 class Learner:

@@ -22,9 +22,9 @@ from training.data.stacks import ChosenSlices
 from training.fitting.checkpoint import FILE_NAME as CHECKPOINT_NAME
 from training.fitting.checkpoint import CurvePoint, Learner, Progress, draw_curve, save_checkpoint, write_curve
 from training.fitting.run_folder import RunFacts, save_network
+from training.fitting.run_page import SHEETS, step_of, write_run_page
 from training.fitting.settings import TrainSettings
 
-FOLDER_NAME = "sheets"
 MOST_KEPT = 16
 SLICES = 4
 SIDE_PX = 384
@@ -193,7 +193,8 @@ class Record:
         self._draw()
 
     def _draw(self) -> None:
-        draw_curve(self._task.folder, self._progress.curve)
+        drawn, task = draw_curve(self._task.folder, self._progress.curve), self._task
+        write_run_page(task.folder, drawn, self._progress, (task.settings, task.facts), slices=(len(task.pairs), len(task.held_out)))
         self._drawn_s = self._progress.elapsed_s
 
 
@@ -210,13 +211,9 @@ def write_sheet(run_folder: Path, step: int, rows: Sequence[SheetRow]) -> None:
     """Write sheets/step_0000123.png. At most MOST_KEPT are kept: the first, the last, and others that are far apart."""
     if not rows:
         return
-    folder = run_folder / FOLDER_NAME
+    folder = run_folder / SHEETS
     write_contact_sheet(folder / f"step_{step:07d}.png", rows)
-    kept = sorted(folder.glob("step_*.png"), key=_step)
+    kept = sorted(folder.glob("step_*.png"), key=step_of)
     while len(kept) > MOST_KEPT:
-        closest = min(range(1, len(kept) - 1), key=lambda i: _step(kept[i + 1]) - _step(kept[i - 1]))
+        closest = min(range(1, len(kept) - 1), key=lambda i: step_of(kept[i + 1]) - step_of(kept[i - 1]))
         kept.pop(closest).unlink()
-
-
-def _step(path: Path) -> int:
-    return int(path.stem.removeprefix("step_"))

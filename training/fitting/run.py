@@ -22,8 +22,8 @@ from mrbokeh.system.channel import say, warn
 from mrbokeh.system.console import progress_bars
 from mrbokeh.system.errors import InputError
 from training.data.batches import Batch, Drawing, draw_share
-from training.fitting.checkpoint import FILE_NAME as CHECKPOINT_NAME
 from training.fitting.checkpoint import FAR_ABOVE, FAR_ABOVE_STEPS, Learner, Progress, read_checkpoint, restore_checkpoint
+from training.fitting.checkpoint import FILE_NAME as CHECKPOINT_NAME
 from training.fitting.distributed import Ranks
 from training.fitting.objective import learning_rate_factor, loss
 from training.fitting.record import Record, Task, diverged, lower_rate
@@ -198,7 +198,7 @@ class Run:
         if self.ranks.first and self.progress.steps_above == FAR_ABOVE_STEPS:
             warn(
                 f"the loss has been more than {FAR_ABOVE} times its best for {FAR_ABOVE_STEPS} steps ({self.progress.smoothed_loss:.2e}, "
-                f"best {self.progress.best_loss:.2e}), so that this training will hardly become good: stop it (Ctrl-C) and start again with "
+                f"best {self.progress.best_loss:.2e}), which it hardly recovers from: stop it (Ctrl-C) and start again with "
                 f"{lower_rate(self.settings)} --overwrite"
             )
 
@@ -286,8 +286,8 @@ def plan_words(steps: int, step_s: float, settings: TrainSettings, pairs: int, p
     crops, seen = ("crops", f"in {times} crops") if settings.crop_px else ("pictures", f"{times} times")
     looks = "" if settings.minutes is not None or not settings.validate_every_s else ", and the looks at held-out slices on top"
     return (
-        f"about {steps} steps of {float(format(step_s, '.2g')):g} s: {length}{looks}; {pictures} {crops}, so that each of the {pairs} slices "
-        f"to learn from is seen about {seen}"
+        f"about {steps} steps of {float(format(step_s, '.2g')):g} s: {length}{looks}; {pictures} {crops}, so that each of the {pairs} slices to "
+        f"learn from is seen about {seen}"
     )
 
 

@@ -16,6 +16,7 @@ FORMAT = "mrbokeh-training-settings"
 VERSION = 1
 FILE_NAME = "settings.json"
 _TRUTH = {"true": True, "false": False}
+_WHERE = ("device", "threads", "seed", "minutes", "epochs")
 _BUDGETS = {"minutes": "epochs", "epochs": "minutes"}
 
 
@@ -222,6 +223,20 @@ def better_settings() -> TrainSettings:
     demo = demo_settings()
     network = replace(demo.network, field_position=True, field_bases=4, kernels_per_colour=True)
     return replace(demo, network=network, minutes=None, epochs=50, learning_rate=0.01, crop_px=256, ema_decay=0.99)
+
+
+def changed_settings(settings: TrainSettings, base: TrainSettings) -> list[str]:
+    """Return name=value for each setting that differs from the base, but where and how fast it computes."""
+    now, plain = asdict(settings), asdict(base)
+    network = {f"network.{name}": value for name, value in now["network"].items() if value != plain["network"][name]}
+    own = {name: value for name, value in now.items() if name not in ("network", *_WHERE) and value != plain[name]}
+    return [f"{name}={value}" for name, value in (network | own).items()]
+
+
+def nearest_preset(settings: TrainSettings) -> tuple[str, list[str]]:
+    """Return the preset with the fewest settings that differ, and these."""
+    changed = {name: changed_settings(settings, preset()) for name, preset in PRESETS.items()}
+    return min(changed.items(), key=lambda each: len(each[1]))
 
 
 PRESETS: dict[str, Callable[[], TrainSettings]] = {"paper": TrainSettings, "demo": demo_settings, "better": better_settings}
