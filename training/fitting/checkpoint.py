@@ -225,10 +225,22 @@ def restore_checkpoint(path: Path, state: dict[str, Any], learner: Learner, rng:
         learner.restore(state["learner"])
         rng.bit_generator.state = state["batch_rng"]
         torch.set_rng_state(state["torch_rng"])
-        values = state["progress"]
-        return Progress(**values | {"curve": [CurvePoint(*point) for point in values["curve"]]})
+        return _progress(state["progress"])
     except (RuntimeError, KeyError, TypeError, ValueError) as error:
         raise _not_of_this_run(path, error) from None
+
+
+def read_progress(folder: Path) -> Progress:
+    """Read how far the run in the folder is; Progress() before its first checkpoint. Raises InputError for another file."""
+    state = read_checkpoint(folder / FILE_NAME)
+    try:
+        return Progress() if state is None else _progress(state["progress"])
+    except (KeyError, TypeError) as error:
+        raise _not_of_this_run(folder / FILE_NAME, error) from None
+
+
+def _progress(values: dict[str, Any]) -> Progress:
+    return Progress(**values | {"curve": [CurvePoint(*point) for point in values["curve"]]})
 
 
 def _not_of_this_run(path: Path, error: Exception) -> InputError:

@@ -286,8 +286,8 @@ def plan_words(steps: int, step_s: float, settings: TrainSettings, pairs: int, p
     crops, seen = ("crops", f"in {times} crops") if settings.crop_px else ("pictures", f"{times} times")
     looks = "" if settings.minutes is not None or not settings.validate_every_s else ", and the looks at held-out slices on top"
     return (
-        f"about {steps} steps of {float(format(step_s, '.2g')):g} s: {length}{looks}; {pictures} {crops}, so that each of the {pairs} slices to "
-        f"learn from is seen about {seen}"
+        f"about {steps} steps of {float(format(step_s, '.2g')):g} s: {length}{looks}; {pictures} {crops}, so that each of the {pairs} "
+        f"slices to learn from is seen about {seen}"
     )
 
 

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from mrbokeh.system.html_page import cell, inline_figure, section, table, write_page
+from training.data.stacks import stacks_words
 from training.fitting.checkpoint import Progress
 from training.fitting.run_folder import RunFacts
 from training.fitting.settings import TrainSettings, nearest_preset
@@ -21,7 +22,7 @@ _QUALITY = 88
 _RELOAD = '<meta http-equiv="refresh" content="60">'
 _STYLE = """
 .strip { overflow-x: auto; white-space: nowrap; } .strip figure { margin: 0 .3rem .3rem 0; max-width: none; }
-.strip figcaption { display: none; }
+.strip figcaption { font-size: 12px; } td { overflow-wrap: anywhere; }
 .curve { max-width: 34rem; } .curve svg { width: 100%; height: auto; }
 @media (max-width: 40rem) { body { margin: .5rem auto; } .strip img { width: 62vw; } td, th { padding-right: .5rem; } }
 """
@@ -34,7 +35,7 @@ def write_run_page(
     settings, facts = made_of
     rows = facts_of_run(progress, settings, facts, slices[0])
     strips = list(_strips(folder / SHEETS, slices[1]))
-    words = "The sharp picture, what the network made of it at these steps, and the photograph. Scroll sideways."
+    words = "The sharp picture, what the network made of it step by step, and the photograph. Scroll sideways."
     none = "Nothing is held out, so nothing can tell how good the network is." if not slices[1] else "No sheets are written (sheets=false)."
     blocks = [
         "" if progress.finished else _RELOAD,
@@ -52,13 +53,13 @@ def facts_of_run(progress: Progress, settings: TrainSettings, facts: RunFacts, p
     pictures = f"{progress.pictures} {'crops' if settings.crop_px else 'pictures'}, {progress.pictures / pairs:.1f} for each slice"
     lens = f"{facts.lens.focal_length_mm:g} mm f/{facts.lens.f_number:.3g}"
     size = f"{facts.width_px}x{facts.height_px} px, blur up to {facts.largest_coc_px:.1f} px, radiance up to {facts.radiance_scale:.3g}"
-    apart = ", ".join(facts.held_out) or (f"slices {', '.join(map(str, facts.held_out_slices))}" if facts.held_out_slices else "nothing")
+    apart = stacks_words(facts.held_out) or (f"slices {', '.join(map(str, facts.held_out_slices))}" if facts.held_out_slices else "nothing")
     return {
         "State": _state(progress, settings, pairs),
         "Seen": pictures,
         "Settings": f"preset {preset}{' with ' if changed else ''}{', '.join(changed)}, seed {settings.seed}",
         "Lens": lens,
-        "Learnt from": f"{pairs} slices of {len(facts.trained_on)} stacks ({', '.join(facts.trained_on)}), {size}",
+        "Learnt from": f"{pairs} slices of {len(facts.trained_on)} stacks ({stacks_words(facts.trained_on)}), {size}",
         "Held out": apart,
         "Licence of the data": facts.licence or "unknown",
         "Machine": facts.machine or "unknown",
@@ -87,10 +88,9 @@ def _strips(folder: Path, rows: int) -> Iterator[str]:
     chosen = [paths[index] for index in np.unique(np.linspace(0, len(paths) - 1, min(_MOMENTS, len(paths))).round().astype(int))]
     cells = [_cells(path, rows) for path in chosen]
     for row in range(rows):
-        network = [inline_figure(each[row][1], "jpeg", f"network, step {step_of(path)}") for path, each in zip(chosen, cells, strict=True)]
+        network = [inline_figure(each[row][1], "jpeg", f"step {step_of(path)}") for path, each in zip(chosen, cells, strict=True)]
         sharp, photograph = (inline_figure(cells[-1][row][column], "jpeg", name) for column, name in ((0, "sharp"), (2, "photograph")))
-        steps = ", ".join(str(step_of(path)) for path in chosen)
-        yield f'<p class="muted">Steps {steps}</p><div class="strip">{sharp}{"".join(network)}{photograph}</div>'
+        yield f'<div class="strip">{sharp}{"".join(network)}{photograph}</div>'
 
 
 def _cells(sheet: Path, rows: int) -> list[list[bytes]]:

@@ -16,7 +16,7 @@ FORMAT = "mrbokeh-training-settings"
 VERSION = 1
 FILE_NAME = "settings.json"
 _TRUTH = {"true": True, "false": False}
-_WHERE = ("device", "threads", "seed", "minutes", "epochs")
+_WHERE = ("device", "threads", "seed", "minutes", "epochs", "sheets", "checkpoint_every_s", "validate_every_s", "cache_mib")
 _BUDGETS = {"minutes": "epochs", "epochs": "minutes"}
 
 
