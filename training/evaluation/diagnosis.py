@@ -19,7 +19,7 @@ from training.evaluation.scores import Evaluation
 from training.fitting.checkpoint import FAR_ABOVE, CurvePoint, Progress, read_progress
 from training.fitting.record import lower_rate
 from training.fitting.run_folder import NETWORK_NAME, RunFacts, read_facts
-from training.fitting.settings import PRESETS, TrainSettings, nearest_preset, read_settings
+from training.fitting.settings import TrainSettings, read_settings, tried_rates
 
 _SLICES = 6
 _LEAST_STEPS, _LEAST_SEEN = 300, 4.0
@@ -62,10 +62,10 @@ class Case:
         """Return how often each slice was seen, or nan where nobody knows how many there are."""
         return self.progress.pictures / len(self.pictures.data.train) if self.pictures else math.nan
 
-    @property
-    def more(self) -> str:
-        """Return the option for three times the budget."""
-        return f"--epochs {3 * self.settings.epochs}" if self.settings.epochs else f"--minutes {3 * (self.settings.minutes or 1.0):.2g}"
+    def more(self, times: float = 3.0) -> str:
+        """Return the option for so many times the budget."""
+        epochs = self.settings.epochs
+        return f"--epochs {math.ceil(times * epochs)}" if epochs else f"--minutes {times * (self.settings.minutes or 1.0):.2g}"
 
     def at(self, share: float) -> CurvePoint | None:
         """Return the last point of the curve before this share of all steps."""
@@ -123,13 +123,14 @@ def _steps(case: Case) -> str:
     if step >= _LEAST_STEPS and not case.seen < _LEAST_SEEN:
         return ""
     seen = "" if math.isnan(case.seen) else f", in which each slice was seen {case.seen:.1f} times"
-    return f"Too few steps: {step}{seen}; at least {_LEAST_STEPS}, and {_LEAST_SEEN:g} times, are wanted. Give {case.more}."
+    times = max(3.0, _LEAST_STEPS / max(step, 1), 0.0 if math.isnan(case.seen) else _LEAST_SEEN / max(case.seen, 1e-3))
+    return f"Too few steps: {step}{seen}; at least {_LEAST_STEPS}, and {_LEAST_SEEN:g} times, are wanted. Give {case.more(times)}."
 
 
 def _falling(case: Case) -> str:
     before = case.at(0.75)
     if not case.progress.curve or before is None:
-        return f"Too short to say whether it still learns: the curve has no point before its last quarter. Give {case.more}."
+        return f"Too short to say whether it still learns: the curve has no point before its last quarter. Give {case.more()}."
     end, earlier = case.progress.curve[-1], [look for look in case.looks if look.step <= 0.75 * case.progress.step]
     gain_db = case.looks[-1].held_out_psnr_db - earlier[-1].held_out_psnr_db if earlier else math.nan
     fall = end.loss / before.loss
@@ -138,7 +139,7 @@ def _falling(case: Case) -> str:
     evidence = (
         f"the loss went from {before.loss:.2e} to {end.loss:.2e}" if math.isnan(gain_db) else f"held-out slices gained {gain_db:.1f} dB"
     )
-    return f"It was still learning at the end: in the last quarter {evidence}. Give {case.more}."
+    return f"It was still learning at the end: in the last quarter {evidence}. Give {case.more()}."
 
 
 def _diverged(case: Case) -> str:
@@ -172,9 +173,8 @@ def _overfitted(case: Case) -> str | None:
 
 def _rate(case: Case) -> str:
     """Compare with the presets of its form, with which they were tried."""
-    rate, form = case.settings.learning_rate, case.settings.network.form
-    tried = {name: preset().learning_rate for name, preset in PRESETS.items() if preset().network.form == form}
-    name = min(tried, key=lambda each: abs(math.log(tried[each] / rate)), default=nearest_preset(case.settings)[0])
+    rate, tried = case.settings.learning_rate, tried_rates(case.settings.network.form)
+    name = min(tried, key=lambda each: abs(math.log(tried[each] / rate)), default="")
     times = rate / tried.get(name, rate)
     if 1.0 / _FAR_FROM_PRESET < times < _FAR_FROM_PRESET:
         return ""
@@ -273,10 +273,11 @@ def _better(case: Case) -> str | None:
     over_none, over_disc = result.gain_db(NETWORK, NO_BLUR), result.gain_db(NETWORK, DISC)
     if over_none < _WORTH_DB:
         return f"It is no better than no blur, on {result.slices} {which} slices: {levels}. It has learnt nothing that can be used."
+    if over_disc > 0.0:
+        return ""
     return (
-        f"It is no better than a disc of the right size, on {result.slices} {which} slices: {levels}. Give {case.more}, or use a disc."
-        if (not over_disc > 0.0)
-        else ""
+        f"It is no better than a disc of the right size, on {result.slices} {which} slices: {levels}. Use a disc, or train longer if it "
+        f"still learnt at the end."
     )
 
 

@@ -187,7 +187,8 @@ class Progress:
     def took_step(self, loss: float, pictures: int) -> None:
         self.step += 1
         self.pictures += pictures
-        self.smoothed_loss = loss if math.isnan(self.smoothed_loss) else 0.98 * self.smoothed_loss + 0.02 * loss
+        newest = max(0.02, 1.0 / self.step)  # the mean of all at first
+        self.smoothed_loss = loss if self.step == 1 else (1.0 - newest) * self.smoothed_loss + newest * loss
         self.best_loss = min(self.best_loss, self.smoothed_loss * (1.0 if self.step >= _SETTLED_STEPS else _DARK_START))
         above = self.smoothed_loss > FAR_ABOVE * self.best_loss or self.steps_above >= FAR_ABOVE_STEPS  # told once
         self.steps_above = self.steps_above + 1 if above else 0

@@ -23,7 +23,7 @@ from training.fitting.checkpoint import FILE_NAME as CHECKPOINT_NAME
 from training.fitting.checkpoint import CurvePoint, Learner, Progress, draw_curve, save_checkpoint, write_curve
 from training.fitting.run_folder import RunFacts, save_network
 from training.fitting.run_page import SHEETS, step_of, write_run_page
-from training.fitting.settings import TrainSettings
+from training.fitting.settings import TrainSettings, tried_rates
 
 MOST_KEPT = 16
 SLICES = 4
@@ -128,8 +128,10 @@ def diverged(task: Task, step: int) -> DivergedError:
 
 
 def lower_rate(settings: TrainSettings) -> str:
-    """Return the option for a tenth of the learning rate."""
-    return f"--set learning_rate={settings.learning_rate / 10.0:.2g}"
+    """Return the option for a lower learning rate: a tenth, or that of a preset of this form if it is lower still."""
+    rate = settings.learning_rate
+    tried = max((each for each in tried_rates(settings.network.form).values() if each < rate), default=rate)
+    return f"--set learning_rate={min(rate / 10.0, tried):.2g}"
 
 
 class Record:

@@ -225,6 +225,12 @@ def better_settings() -> TrainSettings:
     return replace(demo, network=network, minutes=None, epochs=50, learning_rate=0.01, crop_px=256, ema_decay=0.99)
 
 
+def tried_rates(form: str) -> dict[str, float]:
+    """Return the learning rates with which a form was tried, by preset."""
+    presets = {name: preset() for name, preset in PRESETS.items()}
+    return {name: each.learning_rate for name, each in presets.items() if each.network.form == form}
+
+
 def changed_settings(settings: TrainSettings, base: TrainSettings) -> list[str]:
     """Return name=value for each setting that differs from the base, but where and how fast it computes."""
     now, plain = asdict(settings), asdict(base)
