@@ -24,7 +24,7 @@ from training.fitting.settings import TrainSettings, read_settings, tried_rates
 _SLICES = 6
 _LEAST_STEPS, _LEAST_SEEN = 300, 4.0
 _LEAST_HELD_OUT = 4
-_GAIN_DB, _GAP_DB, _WORTH_DB = 0.3, 1.5, 1.0
+_GAIN_DB, _GAP_DB, _WORTH_DB = 0.3, 1.0, 1.0
 _FALL = 0.85  # of the loss over the last quarter, which the falling rate makes a little smaller in sound runs too
 _FAR_FROM_PRESET = 10.0
 _LIGHT, _PILE = 2.0, 5e-4
@@ -144,9 +144,10 @@ def _falling(case: Case) -> str:
 
 def _diverged(case: Case) -> str:
     losses = [point.loss for point in case.progress.curve]
-    if not losses or not (not all(map(math.isfinite, losses)) or losses[-1] > FAR_ABOVE * case.progress.best_loss):
+    best = min((case.progress.best_loss, *losses))
+    if all(map(math.isfinite, losses)) and not (losses and losses[-1] > FAR_ABOVE * best):
         return ""
-    return f"It diverged: the loss ended at {losses[-1]:.2e}, its best was {case.progress.best_loss:.2e}. Give {lower_rate(case.settings)}."
+    return f"It diverged: the loss ended at {losses[-1]:.2e}, its best was {best:.2e}. Give {lower_rate(case.settings)}."
 
 
 def _overfitted(case: Case) -> str | None:
