@@ -85,7 +85,13 @@ def diagnose(folder: Path, given: Sequence[FocalStack] = ()) -> Diagnosis:
     """Diagnose a run, finished or not. given: its stacks, if they are no longer where they were. Raises InputError for another folder."""
     settings, facts = read_settings(folder), read_facts(folder)
     data = data_of_run(facts, given)
-    case = Case(folder, settings, facts, read_progress(folder), None if data is None else _pictures(folder, settings, data))
+    case = Case(
+        folder=folder,
+        settings=settings,
+        facts=facts,
+        progress=read_progress(folder),
+        pictures=None if data is None else _pictures(folder, settings, data),
+    )
     answers = {name: check(case) for name, check in _CHECKS.items()}
     return Diagnosis(
         found=tuple(answer for answer in answers.values() if answer),

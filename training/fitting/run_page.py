@@ -83,20 +83,20 @@ def _duration(seconds: float) -> str:
 def _strips(folder: Path, rows: int) -> Iterator[str]:
     """Yield a strip for each held-out slice, cut from the sheets that are kept."""
     paths = sorted(folder.glob("step_*.png"), key=step_of)
-    if not paths or not rows:
+    if not paths:
         return
     chosen = [paths[index] for index in np.unique(np.linspace(0, len(paths) - 1, min(_MOMENTS, len(paths))).round().astype(int))]
-    cells = [_cells(path, rows) for path in chosen]
-    for row in range(rows):
-        network = [inline_figure(each[row][1], "jpeg", f"step {step_of(path)}") for path, each in zip(chosen, cells, strict=True)]
-        sharp, photograph = (inline_figure(cells[-1][row][column], "jpeg", name) for column, name in ((0, "sharp"), (2, "photograph")))
+    read = [(step_of(path), picture) for path in chosen if (picture := cv2.imread(str(path))) is not None]
+    cells = [(step, _cells(picture, rows)) for step, picture in read]
+    for row in range(rows if cells else 0):
+        network = [inline_figure(each[row][1], "jpeg", f"step {step}") for step, each in cells]
+        sharp, photograph = (inline_figure(cells[-1][1][row][column], "jpeg", name) for column, name in ((0, "sharp"), (2, "photograph")))
         yield f'<div class="strip">{sharp}{"".join(network)}{photograph}</div>'
 
 
-def _cells(sheet: Path, rows: int) -> list[list[bytes]]:
+def _cells(sheet: np.ndarray, rows: int) -> list[list[bytes]]:
     """Return the pictures of a sheet as JPEG, row by row; they are of one size."""
-    picture = cv2.imread(str(sheet))
-    parts = [np.array_split(row, _COLUMNS, axis=1) for row in np.array_split(picture, rows, axis=0)]
+    parts = [np.array_split(row, _COLUMNS, axis=1) for row in np.array_split(sheet, rows, axis=0)]
     return [[cv2.imencode(".jpg", each, (cv2.IMWRITE_JPEG_QUALITY, _QUALITY))[1].tobytes() for each in row] for row in parts]
 
 
