@@ -83,7 +83,7 @@ def _duration(seconds: float) -> str:
 def _strips(folder: Path, rows: int) -> Iterator[str]:
     """Yield a strip for each held-out slice, cut from the sheets that are kept."""
     paths = sorted(folder.glob("step_*.png"), key=step_of)
-    if not paths:
+    if not paths or not rows:
         return
     chosen = [paths[index] for index in np.unique(np.linspace(0, len(paths) - 1, min(_MOMENTS, len(paths))).round().astype(int))]
     read = [(step_of(path), picture) for path in chosen if (picture := cv2.imread(str(path))) is not None]
