@@ -153,7 +153,7 @@ def test_the_doctor_looks_at_everything_it_can(run: Path, scene: Path, tmp_path:
     whole = diagnose(run)
     assert not whole.unseen and len(whole.looked) == 12
     found = {" ".join(sentence.split()[:3]) for sentence in whole.found}
-    assert {"Too few steps:", "Only 3 slices"} <= found and not {
+    assert {"Too few steps:", "Few held-out slices"} <= found and not {
         "The pictures are",
         "No lights to",
         "The learning rate",

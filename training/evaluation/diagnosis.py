@@ -234,7 +234,9 @@ def _held_out(case: Case) -> str | None:
     if case.pictures is None:
         return None
     count = len(case.pictures.data.held_out)
-    few = f"Only {count} slices are held out, too few to judge by (at least {_LEAST_HELD_OUT}). Hold another stack out with --held-out."
+    few = (
+        f"Few held-out slices to judge by: {count}, at least {_LEAST_HELD_OUT} are wanted. Give another stack, and name it with --held-out."
+    )
     return few if count < _LEAST_HELD_OUT else ""
 
 
