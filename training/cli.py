@@ -1,8 +1,9 @@
-"""The commands of `mrbokeh train`: fit, export, evaluate, ablate."""
+"""The commands of `mrbokeh train`: fit, export, evaluate, ablate, doctor."""
 
 import typer
 
 from training.commands.ablate import ablate_command
+from training.commands.doctor import doctor_command
 from training.commands.evaluate import evaluate_command
 from training.commands.export import export_command
 from training.commands.fit import fit_command
@@ -12,3 +13,4 @@ app.command("fit")(fit_command)
 app.command("export")(export_command)
 app.command("evaluate")(evaluate_command)
 app.command("ablate")(ablate_command)
+app.command("doctor")(doctor_command)

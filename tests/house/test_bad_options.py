@@ -59,6 +59,7 @@ BASES = {
     "train evaluate": "none.onnx stack --out evaluation",
     "train export": "kept_run --out lens.onnx",
     "train ablate": "stack --out table",
+    "train doctor": "kept_run",
     "viewfinder board": "--out board.pdf",
     "studio": "missing.jpg",
     "host": "blender --out addons",

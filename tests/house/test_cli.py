@@ -23,7 +23,7 @@ COMMANDS = [
     ["capture"], ["capture", "ingest"], ["capture", "merge"], ["capture", "plan"], ["capture", "cameras"],
     ["capture", "shoot"], ["capture", "poses"], ["capture", "scale"], ["capture", "depth"], ["capture", "report"],
     ["capture", "dataset"], ["capture", "process"], ["train"], ["train", "fit"], ["train", "evaluate"], ["train", "export"],
-    ["train", "ablate"],
+    ["train", "ablate"], ["train", "doctor"],
     ["lens"], ["lens", "new"], ["lens", "coc"], ["lens", "show"], ["lens", "psf"], ["lens", "export"],
     ["lens", "fit"], ["lens", "match"], ["render"], ["composite"], ["video"], ["refocus"], ["transfer"], ["tilt-shift"],
     ["dataset"], ["dataset", "synthesize"],

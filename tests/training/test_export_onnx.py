@@ -117,6 +117,7 @@ def test_a_command_writes_what_computes_the_same_and_nothing_else(tmp_path: Path
     refused("no finished network", printed_by, app, "export", run, "--out", out)
     save_network(run, build_network(settings, FACTS))
     assert "any size" in printed_by(app, "export", run, "--out", out)
+    assert "any size" in out.with_suffix(".md").read_text(encoding="utf-8")
     refused("--overwrite", printed_by, app, "export", run, "--out", out)
     monkeypatch.setattr(onnx_export, "largest_difference", lambda *_: 2 * LARGEST_DIFFERENCE)
     refused("nothing was written", printed_by, app, "export", run, "--out", tmp_path / "other.onnx")

@@ -187,23 +187,35 @@ def test_a_killed_run_goes_on_as_if_never_stopped(
     assert all(torch.equal(whole[name], resumed[name]) for name in whole)
 
 
-def test_interrupting_keeps_the_checkpoint_and_the_command_goes_on(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_run_goes_on_to_the_last_bit(
+    number: signal.Signals, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Weights, their average, the optimizer and both random states, of a run that was stopped and one that was not; depth is made
+    worse at random, so that an order that changed would show."""
     step = Run._step
 
     def interrupted(run: Run, rate_factor: float) -> None:
-        """Ctrl-C in the third step, which is still done."""
+        """Ctrl-C, or a batch system's SIGTERM, in the third step, which is still done."""
         if run.progress.step == 2:
-            signal.raise_signal(signal.SIGINT)
+            signal.raise_signal(number)
         step(run, rate_factor)
 
-    arguments = ["fit", scene, *DEMO_WORDS, "--epochs", 4, "--out", tmp_path / "run"]
+    arguments = ["fit", scene, *DEMO_WORDS, "--epochs", 4, "--set", "depth_noise=1", "--out"]
+    printed_by(app, *arguments, tmp_path / "whole")
     monkeypatch.setattr(Run, "_step", interrupted)
-    done = mrbokeh("train", *arguments)
-    assert done.returncode == 130 and "go on" in done.stderr
+    done = mrbokeh("train", *arguments, tmp_path / "run")
+    assert done.returncode == 128 + number and "go on" in done.stderr
     assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["progress"]["step"] == 3
     monkeypatch.setattr(Run, "_step", step)
-    printed_by(app, *arguments)
-    assert (tmp_path / "run" / "network.pt").exists()
+    printed_by(app, *arguments, tmp_path / "run")
+    whole, resumed = (torch.load(tmp_path / name / "checkpoint.pt", weights_only=True) for name in ("whole", "run"))
+    assert resumed["batch_rng"] == whole["batch_rng"] and torch.equal(resumed["torch_rng"], whole["torch_rng"])
+    for part in ("network", "average"):
+        assert all(torch.equal(resumed["learner"][part][name], value) for name, value in whole["learner"][part].items())
+    moments = zip(*(each["learner"]["optimizer"]["state"].values() for each in (resumed, whole)), strict=True)
+    assert all(torch.equal(mine[name], value) for mine, plain in moments for name, value in plain.items())
+    assert (tmp_path / "run" / "network.pt").read_bytes() == (tmp_path / "whole" / "network.pt").read_bytes()
 
 
 def test_a_time_budget_is_kept(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

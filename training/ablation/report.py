@@ -5,7 +5,6 @@ A picture shows crops of a few held-out slices, truth first, then every row, as 
 
 import html
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
 from shlex import quote
 
@@ -26,11 +25,9 @@ from training.evaluation.report import enlarged, informative_crops
 from training.evaluation.unseen_slice import UnseenSlice, unseen_slice
 from training.fitting.run_folder import NETWORK_NAME
 from training.fitting.settings import FILE_NAME as SETTINGS_NAME
-from training.fitting.settings import TrainSettings
 
 Lines = Mapping[TableName, Sequence[Line]]
 SLICES_OF_A_SET = 2
-_WHERE = ("device", "threads", "seed", "minutes", "epochs")
 
 
 def write_results(out: Path, tables: Lines, commands: Sequence[str]) -> None:
@@ -150,11 +147,3 @@ def fit_command_line(planned: PlannedRun) -> str:
     apart = "".join(f" --held-out {quote(name)}" for name in planned.data_set.held_out)
     settings = quote(str(planned.folder / SETTINGS_NAME))
     return f"mrbokeh train fit {quote(str(planned.data_set.folder))} --settings {settings}{apart} --out {quote(str(planned.folder))}"
-
-
-def changed_settings(settings: TrainSettings) -> list[str]:
-    """Return name=value for each setting that differs from the defaults, which are the published network's."""
-    plain, now = TrainSettings(), asdict(settings)
-    own = {name: value for name, value in now.items() if name not in ("network", *_WHERE) and value != getattr(plain, name)}
-    network = {f"network.{name}": value for name, value in now["network"].items() if value != getattr(plain.network, name)}
-    return [f"{name}={value}" for name, value in (network | own).items()]

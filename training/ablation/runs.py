@@ -3,12 +3,9 @@
 The estimate is the budget in minutes, or else from one timed step of each run.
 """
 
-import os
-import platform
 import time
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -25,18 +22,10 @@ from training.evaluation.report import write_numbers
 from training.evaluation.scores import MEASURES, Perceptual
 from training.fitting import train
 from training.fitting.objective import loss
-from training.fitting.run_folder import RunFacts, build_network, load_run
+from training.fitting.run_folder import RunFacts, build_network, load_run, machine_line
 from training.fitting.train import require_same_settings
 
 FLICKER = "flicker"
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return platform.processor() or platform.machine()
-    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 def result_of(planned: PlannedRun, lpips: Perceptual | None = None) -> RunResult:
@@ -124,12 +113,3 @@ def _pairs(planned: PlannedRun) -> PairSet:
 
 def _steps(planned: PlannedRun) -> float:
     return (planned.settings.epochs or 0) * len(_pairs(planned)) / planned.settings.batch
-
-
-def machine_line() -> str:
-    """Describe the machine in one line: processor, cores, the GPU if torch sees one, and versions."""
-    import torch
-
-    gpu = [torch.cuda.get_device_name(0)] if torch.cuda.is_available() else []
-    parts = [_processor(), f"{os.cpu_count()} cores", *gpu, f"Python {platform.python_version()}", f"torch {torch.__version__}"]
-    return ", ".join(parts)

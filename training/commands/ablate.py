@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mrbokeh.system.channel import say, tell
+from mrbokeh.system.channel import say, tell, warn
 from mrbokeh.system.errors import InputError
 
 if TYPE_CHECKING:
@@ -87,11 +87,16 @@ def _run(planned: "Sequence[PlannedRun]", out: Path, tables: "tuple[TableName, .
     from mrbokeh.system.console import kept_when_interrupted
     from training.ablation.report import Report
     from training.ablation.runs import result_of
+    from training.fitting.record import DivergedError
 
     report = Report(out, tables, planned, _command_line())
     with kept_when_interrupted(f"finished runs are kept in {out}"):
         for number, each in enumerate(planned, 1):
-            result = result_of(each, lpips)  # type: ignore[arg-type]
+            try:
+                result = result_of(each, lpips)  # type: ignore[arg-type]
+            except DivergedError as error:
+                warn(f"{each.folder.relative_to(out)} has no result: {error}")
+                continue
             say(
                 f"{number}/{len(planned)} {each.folder.relative_to(out)}: {result.measures['psnr_db']:.2f} dB, SSIM "
                 f"{result.measures['ssim']:.4f}, {result.steps} steps in {result.seconds:.0f} s"
@@ -124,13 +129,14 @@ def _minutes(minutes: float | None, epochs: int | None) -> float | None:
 
 
 def _print_plan(planned: "Sequence[PlannedRun]") -> None:
-    from training.ablation.report import changed_settings
     from training.ablation.runs import estimated_minutes, is_finished
+    from training.fitting.settings import TrainSettings, changed_settings
 
     estimated = estimated_minutes(planned)
     for each, minutes in zip(planned, estimated, strict=True):
         when = "finished" if is_finished(each) else f"{minutes:.1f} min"
-        tell(f"{each.row.name:15s} {each.data_set.name} seed {each.seed}  {when:>10s}  {' '.join(changed_settings(each.settings))}")
+        changed = " ".join(changed_settings(each.settings, TrainSettings()))
+        tell(f"{each.row.name:15s} {each.data_set.name} seed {each.seed}  {when:>10s}  {changed}")
     tell(f"{len(planned)} runs, about {sum(estimated):.0f} min of training; measuring comes on top")
 
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 def export_command(
     run: Annotated[Path, typer.Argument(help="Folder of a finished run.")],
-    out: Annotated[Path, typer.Option(help="The .onnx file to write.")],
+    out: Annotated[Path, typer.Option(help="The .onnx file to write; its card NAME.md comes beside it.")],
     fast: Annotated[bool, typer.Option("--fast", help="Make it fast on a CPU, at the price of a few tenths of a decibel.")] = False,
     max_psnr_loss: Annotated[float, typer.Option(min=0.0, help="With --fast: decibel that may be lost.")] = 0.2,
     data: Annotated[
@@ -22,7 +22,9 @@ def export_command(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
-    """Write the network as ONNX, with its lens inside, after checking that ONNX Runtime agrees with PyTorch.
+    """Write the network as ONNX, with its lens inside, after checking that ONNX Runtime agrees with PyTorch, and a card beside it.
+
+    The card, NAME.md, says what it learnt from and under which licence, how good it is on held-out slices, its limits, and who made it.
 
     With --fast large kernels run at a fraction of the resolution, or as sums of separable ones, as boldly as the budget allows; nothing
     is written where it is not met.
@@ -34,17 +36,19 @@ def export_command(
     from mrbokeh.images.image_io import require_suffix
     from mrbokeh.system.atomic_files import require_safe_outputs
     from mrbokeh.system.errors import InputError
+    from training.export.model_card import card_path, write_card
 
     if data and not fast:
         raise InputError("--data measures what --fast loses: add --fast, or leave --data out")
     require_suffix(out, (".onnx",), "--out")
-    require_safe_outputs((out,), (run, *(data or ())), overwrite)
+    require_safe_outputs((out, card_path(out)), (run, *(data or ())), overwrite)
     if fast:
         _export_fast(run, out, max_psnr_loss, data or [])
         return
     from training.export.onnx_export import export_run
 
     exported = export_run(run, out)
+    write_card(run, out, exported.facts)
     tell(
         f"{out}: ONNX Runtime differs from PyTorch by {exported.difference:.1e}; takes {_sizes(exported.facts)}",
         difference=exported.difference,
@@ -53,8 +57,10 @@ def export_command(
 
 def _export_fast(run: Path, out: Path, max_psnr_loss_db: float, data: list[Path]) -> None:
     from training.export.fast_onnx import export_fast_run
+    from training.export.model_card import write_card
 
     done = export_fast_run(run, out, max_psnr_loss_db, data)
+    write_card(run, out, done.facts)
     against = "the truth" if data else "the trained network, on a made-up picture"
     tell(
         f"{out}: {done.naive_ms:.0f} ms plain, {done.fast_ms:.0f} ms fast, {done.naive_ms / done.fast_ms:.1f} times faster",

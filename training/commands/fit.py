@@ -70,6 +70,7 @@ def fit_command(
     A data set brings its split by viewpoint, its radiance scale and its largest circle of confusion, which decides the network's N.
     Of a single stack every fourth slice or so, inside its focus range, is held out; `mrbokeh train evaluate` judges on these.
     A budget in minutes that has no time for 200 steps is refused after the first ones, before anything is written.
+    OUT/index.html shows curves and held-out slices as they come along.
     Pixels that moved, have no data, show a calibration board, are saturated or have no trustworthy depth do not count.
 
     On several GPUs or machines torchrun starts it: every process takes its own pictures, `batch` of them a step. After an interruption it

@@ -1,5 +1,6 @@
 """Focal stacks to train or test on: their names, whether they are usable, and which of them, or of their slices, are held out."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -10,6 +11,9 @@ from mrbokeh.system.errors import InputError
 
 ChosenSlices = Mapping[str, Sequence[int]]
 """Indices of slices by the name of their stack; of stacks that are not named, all slices are meant."""
+
+
+_MOST_NAMED = 8
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,14 @@ def stack_name(stack: FocalStack) -> str:
     """Return scene/stack, the name under which a run remembers its training data."""
     folder = stack.folder.resolve()
     return f"{folder.parent.name}/{folder.name}"
+
+
+def stacks_words(names: Sequence[str]) -> str:
+    """Return the names of some stacks, or of many their scenes with the number of viewpoints."""
+    if len(names) <= _MOST_NAMED:
+        return ", ".join(names)
+    scenes = Counter(name.rpartition("/")[0] for name in names)
+    return ", ".join(f"{scene} ({views} views)" if views > 1 else scene for scene, views in scenes.items())
 
 
 def require_usable(stack: FocalStack) -> None:

@@ -29,7 +29,7 @@ SIGMA_STEP_PX = 0.25
 Image = Float32[np.ndarray, "height width 3"]
 Blur = Callable[[Pair], Image]
 NETWORK, NO_BLUR, SCATTERED, GATHERED, REFERENCE = "network", "no blur", "Gaussian, scattered", "Gaussian, gathered", "scatter reference"
-NEAREST = "nearest slice"
+NEAREST, DISC = "nearest slice", "disc of the right size"
 RENDERERS = ("polygon", "low-rank", "laplacian", "scatter")
 """Renderers that a table has unless it is told otherwise; `lrdm` takes minutes a picture."""
 
@@ -116,6 +116,11 @@ def renderer_methods(names: Sequence[str]) -> list[Method]:
 
 def renderer_method(name: str) -> Method:
     return _renderer_method(REFERENCE if name == "scatter" else name, make_renderer(name))
+
+
+def disc_method() -> Method:
+    """Return the fast renderer with a plain disc of the right size, whatever the opening of the lens."""
+    return _renderer_method(DISC, make_renderer("polygon"), Aperture.disc())
 
 
 def lens_methods(names: Sequence[str], lens: Path | None) -> list[Method]:

@@ -14,6 +14,7 @@ from jaxtyping import Float32
 
 from mrbokeh.images.image_io import WIDEST_PX, SheetRow, write_contact_sheet
 from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.system.errors import InputError
 from training.data.batches import Batch, stack_pairs
 from training.data.dataset import Pair, PairSet
 from training.data.pairs import WHERE_TRUTH_IS_KNOWN
@@ -21,9 +22,9 @@ from training.data.stacks import ChosenSlices
 from training.fitting.checkpoint import FILE_NAME as CHECKPOINT_NAME
 from training.fitting.checkpoint import CurvePoint, Learner, Progress, draw_curve, save_checkpoint, write_curve
 from training.fitting.run_folder import RunFacts, save_network
-from training.fitting.settings import TrainSettings
+from training.fitting.run_page import SHEETS, step_of, write_run_page
+from training.fitting.settings import TrainSettings, tried_rates
 
-FOLDER_NAME = "sheets"
 MOST_KEPT = 16
 SLICES = 4
 SIDE_PX = 384
@@ -106,6 +107,33 @@ class Task:
     held_out: HeldOutSlices
 
 
+class DivergedError(InputError):
+    """A training whose loss or weights are no longer numbers."""
+
+
+def diverged(task: Task, step: int) -> DivergedError:
+    """Return the error for a loss or weights that are no numbers after so many steps."""
+    settings, kept = task.settings, task.folder / CHECKPOINT_NAME
+    if step == 0:
+        return DivergedError(
+            "the loss of the first step is not a number, before anything was learnt: expected pictures and circles of confusion "
+            "that are finite where they count; look for NaN and inf in the slices, all_in_focus.exr and depth.exr"
+        )
+    half = " and precision=float32" if settings.precision != "float32" else ""
+    left = f"{kept} keeps the last weights that were numbers" if kept.exists() else "nothing was written"
+    return DivergedError(
+        f"training diverged: after {step} steps loss or weights are not numbers; give {lower_rate(settings)}{half}, with --overwrite or "
+        f"another --out; {left}"
+    )
+
+
+def lower_rate(settings: TrainSettings) -> str:
+    """Return the option for a lower learning rate: a tenth, or that of a preset of this form if it is lower still."""
+    rate = settings.learning_rate
+    tried = max((each for each in tried_rates(settings.network.form).values() if each < rate), default=rate)
+    return f"--set learning_rate={min(rate / 10.0, tried):.2g}"
+
+
 class Record:
     """The writer of a run's files, in the first process only; progress, learner and rng are shared with the run."""
 
@@ -142,11 +170,19 @@ class Record:
         return 0 < self._task.settings.patience <= self._progress.looks_since_best
 
     def save(self) -> None:
+        """Write the checkpoint and the curve; not with weights that are no numbers, of which the next step tells."""
+        if not self._learner.is_finite():
+            return
         save_checkpoint(self._checkpoint, self._progress, self._learner, self._rng)
         write_curve(self._task.folder, self._progress.curve)
 
     def finish(self) -> None:
-        """Take the last look and save the network: the last weights, or with patience the best ones."""
+        """Take the last look and save the network: the last weights, or with patience the best ones.
+
+        Raises DivergedError, and saves nothing, if the weights are no numbers.
+        """
+        if not self._learner.is_finite():
+            raise diverged(self._task, self._progress.step)
         if not self._progress.stopped_early:
             self.look()
         self._progress.kept_step = self._progress.step
@@ -159,7 +195,8 @@ class Record:
         self._draw()
 
     def _draw(self) -> None:
-        draw_curve(self._task.folder, self._progress.curve)
+        drawn, task = draw_curve(self._task.folder, self._progress.curve), self._task
+        write_run_page(task.folder, drawn, self._progress, (task.settings, task.facts), slices=(len(task.pairs), len(task.held_out)))
         self._drawn_s = self._progress.elapsed_s
 
 
@@ -176,13 +213,9 @@ def write_sheet(run_folder: Path, step: int, rows: Sequence[SheetRow]) -> None:
     """Write sheets/step_0000123.png. At most MOST_KEPT are kept: the first, the last, and others that are far apart."""
     if not rows:
         return
-    folder = run_folder / FOLDER_NAME
+    folder = run_folder / SHEETS
     write_contact_sheet(folder / f"step_{step:07d}.png", rows)
-    kept = sorted(folder.glob("step_*.png"), key=_step)
+    kept = sorted(folder.glob("step_*.png"), key=step_of)
     while len(kept) > MOST_KEPT:
-        closest = min(range(1, len(kept) - 1), key=lambda i: _step(kept[i + 1]) - _step(kept[i - 1]))
+        closest = min(range(1, len(kept) - 1), key=lambda i: step_of(kept[i + 1]) - step_of(kept[i - 1]))
         kept.pop(closest).unlink()
-
-
-def _step(path: Path) -> int:
-    return int(path.stem.removeprefix("step_"))

@@ -18,14 +18,15 @@ import numpy as np
 import torch
 from rich.progress import Progress as Bars
 
+from mrbokeh.system.channel import say, warn
 from mrbokeh.system.console import progress_bars
 from mrbokeh.system.errors import InputError
 from training.data.batches import Batch, Drawing, draw_share, joined_by_size
+from training.fitting.checkpoint import FAR_ABOVE, FAR_ABOVE_STEPS, Learner, Progress, read_checkpoint, restore_checkpoint
 from training.fitting.checkpoint import FILE_NAME as CHECKPOINT_NAME
-from training.fitting.checkpoint import Learner, Progress, read_checkpoint, restore_checkpoint
 from training.fitting.distributed import Ranks
 from training.fitting.objective import learning_rate_factor, loss
-from training.fitting.record import Record, Task
+from training.fitting.record import Record, Task, diverged, lower_rate
 from training.fitting.run_folder import first_network
 from training.fitting.settings import TrainSettings
 
@@ -102,6 +103,9 @@ class Run:
         self._stopped_by: int | None = None
         self._started_s = time.monotonic() - self.progress.elapsed_s
         self._saved_s = self._looked_s = self.progress.elapsed_s
+        # Of a run that goes on, as measured so far; of a fresh one, 0 until its first steps have told.
+        self._step_s = self.progress.elapsed_s / max(self.progress.step, 1)
+        self._planned = 0
 
     def require_steps(self, least: int) -> None:
         """Take the first steps of a budget in minutes; nothing is written.
@@ -121,12 +125,14 @@ class Run:
             raise StoppedError(self._stopped_by, f"training had not begun, and nothing was changed in {self.task.folder}")
         if steps_within(ends_s, budget_s) < least:
             raise InputError(too_few_words(ends_s, self.settings, self._halo_px, least))
+        self._step_s = seconds_of_a_step(ends_s)
 
     def train(self) -> Progress:
         """Use the rest of the budget; raises StoppedError, with a checkpoint, if any process is asked to stop."""
         if self.progress.finished:
             return self.progress
         with self._interruption:
+            self._say_plan()
             self._loop()
             if self._stopped_by is not None:
                 self._save()
@@ -148,21 +154,40 @@ class Run:
 
     def _loop(self) -> None:
         with self._bars() as bars:
-            bar = bars.add_task(**self._bar())
+            bar, ends_s = bars.add_task(**self._bar()), list[float]()
             while (done := self._done()) < 1.0 and self._stopped_by is None and not self.progress.stopped_early:
                 self._step(learning_rate_factor(done, self.settings.warm_up))
                 bars.update(bar, **self._bar())
                 self._keep()
+                if self._step_s == 0.0:
+                    ends_s.append(self.progress.elapsed_s)
+                    if len(ends_s) == _TELLING_STEPS:
+                        self._step_s = seconds_of_a_step(ends_s)
+                        self._say_plan()
+
+    def _say_plan(self) -> None:
+        """Say how long it will take, and how often pictures are seen, once the time of a step is known."""
+        if self.ranks.first and self._step_s > 0.0:
+            say(plan_words(self._steps(), self._step_s, self.settings, len(self.task.pairs), self.ranks.count), err=True)
+
+    def _steps(self) -> int:
+        """Return how many steps the whole budget makes; of one in minutes, at the rate so far."""
+        step, done = self.progress.step, self._done()
+        if self.settings.epochs is not None:
+            return math.ceil(self.settings.epochs * len(self.task.pairs) / (self.settings.batch * self.ranks.count))
+        if done >= 1.0 or not step:
+            return step
+        left_s = (1.0 - done) * 60.0 * (self.settings.minutes or 0.0)
+        return step + max(1, round(left_s / (self._step_s or self.progress.elapsed_s / step)))
 
     def _bar(self) -> dict[str, Any]:
-        """Return the progress: steps of those planned, or seconds of a budget in minutes with the steps made."""
-        progress, loss_words = self.progress, "" if math.isnan(self.progress.smoothed_loss) else f", loss {self.progress.smoothed_loss:.2e}"
-        if self.settings.epochs is not None:
-            planned = math.ceil(self.settings.epochs * len(self.task.pairs) / (self.settings.batch * self.ranks.count))
-            return {"description": f"train{loss_words}, steps", "completed": progress.step, "total": planned}
-        budget_s = 60.0 * (self.settings.minutes or 0.0)
-        description = f"train, {progress.step} steps{loss_words}, seconds"
-        return {"description": description, "completed": min(progress.elapsed_s, budget_s), "total": budget_s}
+        """Return the progress in steps. The planned ones change little by little: each change makes rich forget how fast it goes."""
+        progress, planned = self.progress, self._steps()
+        if abs(planned - self._planned) > 0.02 * self._planned or self._done() >= 1.0 or self._planned <= progress.step:
+            self._planned = planned
+        loss_words = "" if math.isnan(progress.smoothed_loss) else f", loss {progress.smoothed_loss:.2e}"
+        guessed = "" if self.settings.epochs is not None else " (total estimated)"
+        return {"description": f"train{loss_words}, steps{guessed}", "completed": progress.step, "total": self._planned or None}
 
     def _step(self, rate_factor: float) -> None:
         """Make one update from `batch` pictures of each process: one after the other, or on a GPU those of one size together.
@@ -172,8 +197,16 @@ class Run:
         self.learner.begin(rate_factor)
         batches = joined_by_size(self._draw()) if self._on_gpu else self._draw()
         mean_loss = self._agree(sum(self._learn_from(batch) for batch in batches))
+        if not math.isfinite(mean_loss):
+            raise diverged(self.task, self.progress.step)
         self.learner.apply(self.progress.step)
         self.progress.took_step(mean_loss, self.settings.batch * self.ranks.count)
+        if self.ranks.first and self.progress.steps_above == FAR_ABOVE_STEPS:
+            warn(
+                f"the loss has been more than {FAR_ABOVE} times its best for {FAR_ABOVE_STEPS} steps ({self.progress.smoothed_loss:.2e}, "
+                f"best {self.progress.best_loss:.2e}), which it hardly recovers from: stop it (Ctrl-C) and start again with "
+                f"{lower_rate(self.settings)} --overwrite"
+            )
 
     def _draw(self) -> Iterator[Batch]:
         """Yield the pictures of this process, one by one.
@@ -253,6 +286,20 @@ def is_rate_known(ends_s: Sequence[float], budget_s: float) -> bool:
 
 def seconds_of_a_step(ends_s: Sequence[float]) -> float:
     return ends_s[0] if len(ends_s) == 1 else (ends_s[-1] - ends_s[0]) / (len(ends_s) - 1)
+
+
+def plan_words(steps: int, step_s: float, settings: TrainSettings, pairs: int, processes: int) -> str:
+    """Return how long a run will take and how often it sees what; pairs: slices to learn from."""
+    pictures = steps * settings.batch * processes
+    length_s = 60.0 * settings.minutes if settings.minutes is not None else steps * step_s
+    length = f"{length_s:.0f} s" if length_s < 100 else f"{length_s / 60:.0f} min" if length_s < 6000 else f"{length_s / 3600:.1f} h"
+    times = f"{pictures / pairs:.0f}" if pictures >= 10 * pairs else f"{pictures / pairs:.1f}"
+    crops, seen = ("crops", f"in {times} crops") if settings.crop_px else ("pictures", f"{times} times")
+    looks = "" if settings.minutes is not None or not settings.validate_every_s else ", and the looks at held-out slices on top"
+    return (
+        f"about {steps} steps of {float(format(step_s, '.2g')):g} s: {length}{looks}; {pictures} {crops}, so that each of the {pairs} "
+        f"slices to learn from is seen about {seen}"
+    )
 
 
 def steps_within(ends_s: Sequence[float], budget_s: float) -> int:

@@ -1,5 +1,7 @@
 """The folder of a training run: settings, training data, checkpoint, curve and the finished network."""
 
+import os
+import platform
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
@@ -29,6 +31,7 @@ class RunFacts:
     trained_on, held_out: names of stacks. held_out_slices: of the only stack, if there is one.
     commit: of the source, or None without git. lens_guessed: see NetworkFacts.
     f_numbers, focal_lengths_mm: (lowest, highest) of the data; None: those of `lens` alone.
+    roots: folders in which the stacks lay by their names. licence: of the data set, "" if nobody knows. machine: that it was begun on.
     """
 
     lens: Lens
@@ -43,6 +46,9 @@ class RunFacts:
     focal_lengths_mm: tuple[float, float] | None = None
     held_out_slices: tuple[int, ...] = ()
     lens_guessed: bool = False
+    roots: tuple[str, ...] = ()
+    licence: str = ""
+    machine: str = ""
 
     @property
     def lens_ranges(self) -> LensRanges:
@@ -119,6 +125,21 @@ def load_run(folder: Path) -> tuple[BlurNetwork, TrainSettings, RunFacts]:
     except (OSError, RuntimeError, ValueError, EOFError, UnpicklingError):
         raise InputError(f"{folder / NETWORK_NAME} is cut off or not of this run: copy it again, or train again") from None
     return network.eval(), settings, facts
+
+
+def machine_line() -> str:
+    """Describe the machine in one line: processor, cores, the GPU if torch sees one, and versions."""
+    gpu = [torch.cuda.get_device_name(0)] if torch.cuda.is_available() else []
+    parts = [_processor(), f"{os.cpu_count()} cores", *gpu, f"Python {platform.python_version()}", f"torch {torch.__version__}"]
+    return ", ".join(parts)
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
 
 
 def source_commit() -> str | None:

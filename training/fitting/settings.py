@@ -17,6 +17,7 @@ VERSION = 1
 FILE_NAME = "settings.json"
 TUNING_RATE = 0.25
 _TRUTH = {"true": True, "false": False}
+_WHERE = ("device", "threads", "seed", "minutes", "epochs", "sheets", "checkpoint_every_s", "validate_every_s", "cache_mib")
 _BUDGETS = {"minutes": "epochs", "epochs": "minutes"}
 
 
@@ -232,6 +233,26 @@ def better_settings() -> TrainSettings:
     demo = demo_settings()
     network = replace(demo.network, field_position=True, field_bases=4, kernels_per_colour=True)
     return replace(demo, network=network, minutes=None, epochs=50, learning_rate=0.01, crop_px=256, ema_decay=0.99)
+
+
+def tried_rates(form: str) -> dict[str, float]:
+    """Return the learning rates with which a form was tried, by preset."""
+    presets = {name: preset() for name, preset in PRESETS.items()}
+    return {name: each.learning_rate for name, each in presets.items() if each.network.form == form}
+
+
+def changed_settings(settings: TrainSettings, base: TrainSettings) -> list[str]:
+    """Return name=value for each setting that differs from the base, but where and how fast it computes."""
+    now, plain = asdict(settings), asdict(base)
+    network = {f"network.{name}": value for name, value in now["network"].items() if value != plain["network"][name]}
+    own = {name: value for name, value in now.items() if name not in ("network", *_WHERE) and value != plain[name]}
+    return [f"{name}={value}" for name, value in (network | own).items()]
+
+
+def nearest_preset(settings: TrainSettings) -> tuple[str, list[str]]:
+    """Return the preset with the fewest settings that differ, and these."""
+    changed = {name: changed_settings(settings, preset()) for name, preset in PRESETS.items()}
+    return min(changed.items(), key=lambda each: len(each[1]))
 
 
 PRESETS: dict[str, Callable[[], TrainSettings]] = {"paper": TrainSettings, "demo": demo_settings, "better": better_settings}

@@ -21,7 +21,7 @@ from training.fitting.distributed import Ranks, joined
 from training.fitting.record import HeldOutSlices, Task
 from training.fitting.run import LEAST_STEPS, Run
 from training.fitting.run_folder import FILE_NAME as FACTS_NAME
-from training.fitting.run_folder import RunFacts, read_facts, source_commit, write_facts
+from training.fitting.run_folder import RunFacts, machine_line, read_facts, source_commit, write_facts
 from training.fitting.settings import FILE_NAME as SETTINGS_NAME
 from training.fitting.settings import TrainSettings, read_settings, write_settings
 
@@ -74,6 +74,8 @@ def _fit(
         return facts
 
     def begun(facts: RunFacts) -> None:
+        if run.progress.finished:
+            return  # with the commit and the machine that made it
         if overwrite and run_folder.exists():
             shutil.rmtree(run_folder)
         remove_unfinished(run_folder)
@@ -111,6 +113,9 @@ def _facts_of(data: TrainingData, pairs: PairSet, split: Split, settings: TrainS
         commit=source_commit(),
         f_numbers=found.f_numbers,
         focal_lengths_mm=found.focal_lengths_mm,
+        roots=tuple(sorted({str(stack.folder.resolve().parent.parent) for stack in data.stacks})),
+        licence="" if data.dataset is None else data.dataset.licence,
+        machine=machine_line(),
     )
     return facts if settings.start_from is None else _within(facts, Path(settings.start_from))
 
@@ -136,7 +141,7 @@ def require_same_settings(run_folder: Path, settings: TrainSettings) -> None:
 def require_same_data(run_folder: Path, facts: RunFacts) -> None:
     """Raise InputError for data that differ from the run's: what it has seen cannot be held out later."""
     if _begun(run_folder, FACTS_NAME):
-        _require_same(run_folder, "data", read_facts(run_folder), facts, ("lens", "commit"))
+        _require_same(run_folder, "data", read_facts(run_folder), facts, ("lens", "commit", "roots", "licence", "machine"))
 
 
 def _begun(run_folder: Path, name: str) -> bool:
