@@ -49,7 +49,7 @@ def fit_command(
     ] = None,
     start_from: Annotated[
         Path | None,
-        typer.Option("--from", help="A finished run to tune to these pictures, by default for 5 minutes: its settings and weights."),
+        typer.Option("--tune", help="A finished run to tune to these pictures, by default for 5 minutes: its settings and weights."),
     ] = None,
     settings_file: Annotated[Path | None, typer.Option("--settings", help="A settings.json to start from instead of a preset.")] = None,
     choices: Annotated[
@@ -80,7 +80,7 @@ def fit_command(
 
     Example: mrbokeh train fit scenes/attic --preset demo --minutes 2.5 --held-out view_3 --out runs/attic
 
-    Example: mrbokeh train fit another_50mm/view_1 --from runs/50mm --out runs/another
+    Example: mrbokeh train fit another_50mm/view_1 --tune runs/50mm --out runs/another
 
     Example: mrbokeh train fit lens_50mm --set network.tile_px=96 --set network.overlap_px=24 --set loss_scope=tile --out runs/tiles
 
@@ -147,7 +147,7 @@ def _begun_with(preset: Preset, settings_file: Path | None, start_from: Path | N
     from training.fitting.settings import PRESETS, load_settings, tuned_settings
 
     if start_from is not None and settings_file is not None:
-        raise InputError("--from takes the settings of its run, so --settings cannot be given with it: leave one of them out")
+        raise InputError("--tune takes the settings of its run, so --settings cannot be given with it: leave one of them out")
     if start_from is not None:
         return tuned_settings(start_from)
     return PRESETS[preset]() if settings_file is None else load_settings(settings_file)
