@@ -63,7 +63,7 @@ def test_two_processes_learn_what_one_with_twice_the_batch_learns(scene: Path, t
 # The command, but the second process is asked to stop as its 6th step begins.
 STOPPED_SECOND = """
 import os, signal, sys
-from training.cli import app
+from mrbokeh.cli import main
 from training.fitting.run import Run
 
 step = Run._step
@@ -72,7 +72,8 @@ def stopped(run, rate_factor):
         signal.raise_signal(signal.SIGTERM)
     step(run, rate_factor)
 Run._step = stopped
-app(sys.argv[1:])
+sys.argv.insert(1, "train")
+main()
 """
 
 

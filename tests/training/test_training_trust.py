@@ -5,6 +5,7 @@ import json
 import math
 import re
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +21,25 @@ from tests.training.test_train import DEMO_LIKE, DEMO_WORDS, make_wall
 from training.cli import app
 from training.data.pairs import read_pair
 from training.data.training_data import training_data
-from training.evaluation.diagnosis import Case, _diverged, _falling, _overfitted, _rate, _steps, _tiles, diagnose
-from training.evaluation.methods import blur_of
+from training.evaluation.diagnosis import (
+    Case,
+    Look,
+    Pictures,
+    _better,
+    _blur,
+    _counted,
+    _diverged,
+    _falling,
+    _lights,
+    _overfitted,
+    _rate,
+    _steps,
+    _tiles,
+    diagnose,
+)
+from training.evaluation.methods import DISC, NETWORK, NO_BLUR, blur_of
+from training.evaluation.run_data import RunData
+from training.evaluation.scores import Evaluation, Score
 from training.export import model_card
 from training.export.model_card import write_card
 from training.export.onnx_export import network_facts_of
@@ -194,3 +212,40 @@ def test_the_doctor_reads_curves(run: Path) -> None:
         assert words in _rate(dataclasses.replace(sound, settings=dataclasses.replace(demo, learning_rate=rate)))
     tiled = dataclasses.replace(TrainSettings(), network=dataclasses.replace(TrainSettings().network, tile_px=16, overlap_px=4))
     assert "too small for the blur" in _tiles(dataclasses.replace(sound, settings=tiled))
+
+
+def scores(network_db: float) -> Evaluation:
+    """A network beside no blur at 22 dB and a disc at 27 dB, as on the traced stacks."""
+    levels = {NETWORK: network_db, NO_BLUR: 22.0, DISC: 27.0}
+    return Evaluation(
+        scores=tuple(Score(stack="wall/a", slice_index=0, method=name, psnr_db=decibel, ssim=0.9) for name, decibel in levels.items()),
+        networks=(NETWORK,),
+        rivals=(),
+        flicker={},
+        peak_memory_mib={},
+    )
+
+
+def test_the_doctor_looks_at_pictures(run: Path) -> None:
+    """Each fault of data and result alone; the network reaches 5 px with N = 2."""
+    sound = case(demo_settings(), run, [4e-5, 2e-5, 1.6e-5, 1.55e-5, 1.5e-5], [28.0, 29.0, 29.2, 29.25, 29.25])
+    data = RunData((), ())
+    seen = Pictures(
+        data=data, held_out=scores(29.0), train=scores(29.4), looks=(Look(3.0, 0.0, 15.0, 0.0),), left_out=0.1, by_depth=0.1, clipped=0.0
+    )
+
+    def told(check: Callable[[Case], str | None], settings: TrainSettings = sound.settings, **changed: object) -> str:
+        pictures = dataclasses.replace(seen, **changed)  # type: ignore[arg-type]
+        return check(dataclasses.replace(sound, settings=settings, pictures=pictures)) or ""
+
+    assert not any(told(check) for check in (_overfitted, _blur, _lights, _counted, _better))
+    small = dataclasses.replace(demo_settings(), network=dataclasses.replace(demo_settings().network, blocks=2))
+    assert "up to 9.0 px, it reaches 5.0 px, and 20%" in told(_blur, small, looks=(Look(9.0, 0.2, 15.0, 0.0),))
+    assert "clipped there: 0.4%" in told(_lights, looks=(Look(3.0, 0.0, 1.0, 0.004),))
+    assert "and none is cut" in told(_lights, looks=(Look(3.0, 0.0, 0.8, 0.0),))
+    left_out = dataclasses.replace(demo_settings(), sensor_white=None)
+    assert "5.0% of the slices' pixels are saturated" in told(_lights, left_out, clipped=0.05) and not told(_lights, clipped=0.05)
+    assert "70% of the pixels do not count, 60% because" in told(_counted, left_out=0.7, by_depth=0.6)
+    assert "+4.0 dB over a disc of the right size on slices it learnt from, +2.0 dB on held-out" in told(_overfitted, train=scores(31.0))
+    assert "no better than no blur" in told(_better, held_out=scores(22.5))
+    assert "no better than a disc" in told(_better, held_out=scores(26.9))

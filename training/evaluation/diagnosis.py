@@ -8,13 +8,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from mrbokeh.stacks.focal_stack import FocalStack
 from training.data.pairs import WHERE_TRUTH_IS_KNOWN, Pair, counting_of, read_pair
 from training.evaluation.methods import DISC, NETWORK, NO_BLUR, blur_of, disc_method, network_method, plain_methods
-from training.evaluation.run_data import RunData, data_of_run, scored_on, some
+from training.evaluation.run_data import RunData, affordable, data_of_run, scored_on, some
 from training.evaluation.scores import Evaluation
 from training.fitting.checkpoint import FAR_ABOVE, CurvePoint, Progress, read_progress
 from training.fitting.record import lower_rate
@@ -31,15 +32,29 @@ _LIGHT, _PILE = 2.0, 5e-4
 _LEAST_IN_BLURS = 4.0  # side of a tile
 
 
+class Look(NamedTuple):
+    """A look at one slice. largest_px: diameter; beyond: share of the pixels blurred more than the network reaches. piled: share within
+    2 % of the brightest."""
+
+    largest_px: float
+    beyond: float
+    brightest: float
+    piled: float
+
+
 @dataclass(frozen=True)
 class Pictures:
-    """A look at a few slices. scores: of both; None without a network. pairs: as trained on, with all that counts and what is known."""
+    """A look at a few slices. held_out, train: scores, None without a network. left_out: share of the pixels that do not count.
+
+    by_depth: of these, because depth is not trusted. clipped: share of the slices' pixels that are saturated.
+    """
 
     data: RunData
     held_out: Evaluation | None
     train: Evaluation | None
-    counted: tuple[Pair, ...]
-    known: tuple[Pair, ...]
+    looks: tuple[Look, ...]
+    left_out: float
+    by_depth: float
     clipped: float
 
 
@@ -90,7 +105,7 @@ def diagnose(folder: Path, given: Sequence[FocalStack] = ()) -> Diagnosis:
         settings=settings,
         facts=facts,
         progress=read_progress(folder),
-        pictures=None if data is None else _pictures(folder, settings, data),
+        pictures=None if data is None else _pictures(folder, settings, facts, data),
     )
     answers = {name: check(case) for name, check in _CHECKS.items()}
     return Diagnosis(
@@ -100,19 +115,42 @@ def diagnose(folder: Path, given: Sequence[FocalStack] = ()) -> Diagnosis:
     )
 
 
-def _pictures(folder: Path, settings: TrainSettings, data: RunData) -> Pictures:
+def _pictures(folder: Path, settings: TrainSettings, facts: RunFacts, data: RunData) -> Pictures:
     train, held_out = some(data.train, _SLICES), some(data.held_out, _SLICES)
-    known = [read_pair(stack, index, WHERE_TRUTH_IS_KNOWN) for stack, index in (*train, *held_out)]
-    of_network = (folder / NETWORK_NAME).is_file()
-    methods = [network_method(NETWORK, blur_of(folder)[0]), *plain_methods()[:1], disc_method()] if of_network else []
+    scores: list[Evaluation | None] = [None, None]
+    if (folder / NETWORK_NAME).is_file():
+        blur = blur_of(folder)[0]
+        methods = [network_method(NETWORK, blur), *plain_methods()[:1], disc_method()]
+        chosen = [affordable(blur, each, _SLICES) if each else [] for each in (data.held_out, data.train)]
+        scores = [scored_on(methods, each) if each else None for each in chosen]
+    counting = counting_of(settings)
+    left_out, whatever_depth = (
+        1.0 - float(np.mean([read_pair(stack, index, each).weight.mean() for stack, index in train]))
+        for each in (counting, replace(counting, least_confidence=0.0))
+    )
     return Pictures(
         data=data,
-        held_out=scored_on(methods, held_out) if of_network and held_out else None,
-        train=scored_on(methods, train) if of_network else None,
-        counted=tuple(read_pair(stack, index, counting_of(settings)) for stack, index in train),
-        known=tuple(known),
+        held_out=scores[0],
+        train=scores[1],
+        looks=tuple(
+            _look(read_pair(stack, index, WHERE_TRUTH_IS_KNOWN), _covered_px(settings, facts)) for stack, index in train + held_out
+        ),
+        left_out=left_out,
+        by_depth=left_out - whatever_depth,
         clipped=float(np.mean([stack.slice_masks(index).saturated.mean() for stack, index in train])),
     )
+
+
+def _look(pair: Pair, covered_px: float) -> Look:
+    diameters, light = np.abs(pair.coc_px[pair.weight > 0]), pair.all_in_focus.max(axis=2)
+    beyond = float(np.mean(diameters > covered_px)) if diameters.size else 0.0
+    return Look(float(diameters.max(initial=0.0)), beyond, float(light.max()), float(np.mean(light > 0.98 * light.max())))
+
+
+def _covered_px(settings: TrainSettings, facts: RunFacts) -> float:
+    """Return the largest diameter that the network was built for: that of the data, or its largest kernel where N was given."""
+    blocks = settings.network.blocks
+    return min(facts.largest_coc_px, math.inf if blocks is None else 2.0 * blocks + 1.0)
 
 
 def _finished(case: Case) -> str:
@@ -195,25 +233,25 @@ def _rate(case: Case) -> str:
 def _blur(case: Case) -> str | None:
     if case.pictures is None:
         return None
-    blocks = case.settings.network.blocks
-    covered_px = min(case.facts.largest_coc_px, math.inf if blocks is None else 2.0 * blocks + 1.0)
-    diameters = np.concatenate([np.abs(pair.coc_px[pair.weight > 0]) for pair in case.pictures.known])
-    if diameters.max(initial=0.0) <= 1.02 * covered_px:
+    largest_px, covered_px = max(each.largest_px for each in case.pictures.looks), _covered_px(case.settings, case.facts)
+    if largest_px <= 1.02 * covered_px:
         return ""
+    beyond = float(np.mean([each.beyond for each in case.pictures.looks]))
+    blocks = case.settings.network.blocks
     how = (
         "leave network.blocks at none" if blocks else "write the data set again (`mrbokeh capture dataset`), or train on the scene folders"
     )
     return (
-        f"The pictures are blurred more than the network reaches: up to {diameters.max():.1f} px, it reaches {covered_px:.1f} px, and "
-        f"{np.mean(diameters > covered_px):.0%} of the pixels lie beyond. To learn them, {how}."
+        f"The pictures are blurred more than the network reaches: up to {largest_px:.1f} px, it reaches {covered_px:.1f} px, and "
+        f"{beyond:.0%} of the pixels lie beyond. To learn them, {how}."
     )
 
 
 def _lights(case: Case) -> str | None:
     if case.pictures is None:
         return None
-    light = np.concatenate([pair.all_in_focus.max(axis=2).ravel() for pair in case.pictures.known])
-    top, pile = float(light.max()), float(np.mean(light > 0.98 * light.max()))
+    brightest = max(case.pictures.looks, key=lambda each: each.brightest)
+    top, pile = brightest.brightest, brightest.piled
     if top < _LIGHT:
         cut = f"clipped there: {pile:.1%} of the pixels are within 2 % of it" if pile > _PILE else "and none is cut"
         return (
@@ -243,16 +281,12 @@ def _held_out(case: Case) -> str | None:
 def _counted(case: Case) -> str | None:
     if case.pictures is None:
         return None
-    left_out = 1.0 - float(np.mean([pair.weight.mean() for pair in case.pictures.counted]))
-    if left_out < 0.5:
+    if case.pictures.left_out < 0.5:
         return ""
-    trusting = replace(counting_of(case.settings), least_confidence=0.0)
-    slices = some(case.pictures.data.train, _SLICES)
-    by_depth = left_out - (1.0 - float(np.mean([read_pair(stack, index, trusting).weight.mean() for stack, index in slices])))
-    why = f"{by_depth:.0%} because depth is not trusted (least_confidence={case.settings.least_confidence:g})"
+    why = f"{case.pictures.by_depth:.0%} because depth is not trusted (least_confidence={case.settings.least_confidence:g})"
     return (
-        f"{left_out:.0%} of the pixels do not count, {why}. Give better depth (more views, more texture, `mrbokeh capture report` shows "
-        f"where), or --set least_confidence=0."
+        f"{case.pictures.left_out:.0%} of the pixels do not count, {why}. Give better depth (more views, more texture, `mrbokeh capture "
+        f"report` shows where), or --set least_confidence=0."
     )
 
 

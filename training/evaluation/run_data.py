@@ -2,16 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, read_focal_stack
+from training.data.pairs import read_pair
 from training.data.stacks import stack_name
-from training.evaluation.comparison import Extras, Unseen, scored
-from training.evaluation.methods import Method
+from training.evaluation.comparison import Extras, Unseen, scored, timed
+from training.evaluation.methods import Blur, Method
 from training.evaluation.scores import Evaluation
 from training.fitting.run_folder import RunFacts
+
+LONGEST_S = 60.0
+"""Of a network over slices that nobody asked it to be measured on."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,12 @@ def data_of_run(facts: RunFacts, given: Sequence[FocalStack] = ()) -> RunData | 
 def some(slices: Sequence[tuple[FocalStack, int]], most: int) -> list[tuple[FocalStack, int]]:
     """Return at most so many slices, spread over all."""
     return [slices[index] for index in np.unique(np.linspace(0, len(slices) - 1, min(most, len(slices))).round().astype(int))]
+
+
+def affordable(blur: Blur, slices: Sequence[tuple[FocalStack, int]], most: int) -> list[tuple[FocalStack, int]]:
+    """Return at most so many slices, spread over all, and no more than the network is done with in LONGEST_S."""
+    _, seconds = timed(partial(blur, read_pair(*slices[0])))
+    return some(slices, max(1, min(most, int(LONGEST_S / seconds))))
 
 
 def scored_on(methods: Sequence[Method], slices: Sequence[tuple[FocalStack, int]]) -> Evaluation:

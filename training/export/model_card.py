@@ -8,7 +8,7 @@ from mrbokeh.renderers.onnx_network import NetworkFacts
 from mrbokeh.system.atomic_files import atomic_path
 from training.data.stacks import stacks_words
 from training.evaluation.methods import DISC, NO_BLUR, blur_of, disc_method, network_method, plain_methods
-from training.evaluation.run_data import RunData, data_of_run, scored_on, some
+from training.evaluation.run_data import RunData, affordable, data_of_run, scored_on
 from training.fitting.checkpoint import Progress, read_progress
 from training.fitting.run_folder import RunFacts, read_facts
 from training.fitting.settings import TrainSettings, nearest_preset, read_settings
@@ -75,8 +75,9 @@ def _data(card: Card) -> dict[str, str]:
 def _figures(card: Card, network: Path) -> dict[str, str]:
     held_out = () if card.data is None else card.data.held_out
     if held_out:
-        chosen = some(held_out, _MOST_SLICES)
-        methods = [network_method(_NAME, blur_of(network)[0]), *plain_methods()[:1], disc_method()]
+        blur = blur_of(network)[0]
+        chosen = affordable(blur, held_out, _MOST_SLICES)
+        methods = [network_method(_NAME, blur), *plain_methods()[:1], disc_method()]
         result = scored_on(methods, chosen)
         of = f"{len(chosen)} of {len(held_out)} held-out slices" + (" of a stack it learnt from" if card.facts.held_out_slices else "")
         return {
