@@ -108,7 +108,7 @@ class Learner:
         with torch.no_grad():
             x = network.encode(batch.rgb, batch.coc_px, batch.place, batch.lens)
             x = x if network.grid is None else split(x, network.grid)
-        network.tiles = torch.cuda.make_graphed_callables(network.tiles, (x,))
+        network.tiles = torch.cuda.make_graphed_callables(network.tiles, (x,))  # type: ignore[assignment]
 
     def begin(self, rate_factor: float) -> None:
         """Start a step at this fraction of the peak learning rate, without gradients."""
