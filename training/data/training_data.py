@@ -95,6 +95,14 @@ def training_data(folders: Sequence[Path]) -> TrainingData:
     return TrainingData(tuple(stacks))
 
 
+def focal_stacks(stacks: Sequence[Source]) -> tuple[FocalStack, ...]:
+    """Return the stacks. Raises InputError if there are blur pairs among them, which have no metres to move the focus by."""
+    for stack in stacks:
+        if isinstance(stack, BlurPair):
+            raise InputError(f"expected focal stacks, got the blur pair {stack.folder}: of these `mrbokeh train fit` alone makes use")
+    return tuple(stack for stack in stacks if isinstance(stack, FocalStack))
+
+
 def _pairs_alone(pairs: Sequence[BlurPair], folders: Sequence[Path]) -> tuple[BlurPair, ...]:
     """Return the pairs. Raises InputError if there are stacks beside them, whose lens is stated while theirs is not."""
     if any(True for folder in folders for _ in folder.rglob(STACK_NAME)):
