@@ -51,7 +51,7 @@ NETWORK = (
     *(each for name in ("signed_coc=false", "field_position=true", "field_bases=4") for each in ("--set", f"network.{name}")),
     *(each for name in ("sensor_white=none", "ema_decay=0.99", "learning_rate=0.01", "test_fraction=0") for each in ("--set", name)),
 )
-FIT = ("--regions", f"{COLUMNS}x{ROWS}", "--diameters", "14,20,26,32", "--smoothness", "0.1", "--pixels", "40000")
+FIT = ("--regions", f"{COLUMNS // 2}x{ROWS // 2}", "--diameters", f"{KERNEL_PX:g}", "--smoothness", "0.3")
 _GAUGE = Lens(focal_length_mm=50.0, f_number=1.8, focus_distance_m=0.5)  # any lens: depths are those at which it has the map's diameters
 
 
