@@ -8,7 +8,11 @@ finds in the other scenes, and compared with the photograph: PSNR of linear ligh
 Gain and black are fitted for each picture. The truths of some scenes were taken in other light (shiny boxes mirror something else): the
 second figure of each pair lets the gain change slowly over the frame (a quadratic, five numbers more), and "in even light" the light of a
 prediction is made that of the photograph over windows three times as wide as the largest kernel. "rims" judges what lies between surfaces
-as well, by published kernels. "noise" is the photograph's own, by its second differences where it is blurred by 15 px or more.
+as well, by published kernels. "exact" is the disc through the renderer that sums every pixel's (`scatter`). "noise" is the photograph's
+own, by its second differences where it is blurred by 15 px or more.
+
+With --networks RUNS a network is among them: our gated form with kernels that change over the frame, trained by `mrbokeh train fit` on the
+other scenes at several scales (each shows kernels of further diameters), in RUNS/SCENE; one that is there is taken as it is.
 """
 
 import argparse
@@ -16,26 +20,37 @@ import tempfile
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from statistics import fmean
 
+import cv2
 import numpy as np
 
 from mrbokeh.images.layer import opaque
 from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair, write_blur_pair
 from mrbokeh.lens_measuring.fitting.pair_matching import match
+from mrbokeh.optics.aperture import Aperture
+from mrbokeh.optics.camera import field_positions
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.psf_bank import PsfBank
 from mrbokeh.optics.psf_bank_file import read_bank
+from mrbokeh.renderers.scatter_reference import scatter
 from mrbokeh.renderers.spreadlets.laplacian_spreadlets import LaplacianSpreadlets
 from tests.bench.machine import machine_line, memory_line
-from tests.bench.pixel4_measures import decibels, in_even_light_db, noise_db
+from tests.bench.pixel4_measures import decibels, in_even_light, in_even_light_db, looks, noise_db
 from tests.bench.pixel4_page import write_pixel4_page
 from tests.bench.pixel4_set import COLUMNS, KERNEL_PX, ROWS, SIZE, Scene, bank_of_kernels, centred, published_kernels, read_scene, scenes
 from tests.bench.process_cost import mrbokeh
 
 BAR_DB, FITTED_BAR_DB, CORRELATION_BAR = 35.0, 0.5, 0.97
-METHODS = ("no blur", "Gaussian", "disc", "published", "ours")
+METHODS = ("no blur", "Gaussian", "disc", "exact", "published", "ours", "network")
+SCALES = (1.0, 0.8, 0.64, 0.5)
+NETWORK = (
+    *("--preset", "demo", "--threads", "1"),
+    *(each for name in ("signed_coc=false", "field_position=true", "field_bases=4") for each in ("--set", f"network.{name}")),
+    *(each for name in ("sensor_white=none", "ema_decay=0.99", "learning_rate=0.01", "test_fraction=0") for each in ("--set", name)),
+)
 FIT = ("--regions", f"{COLUMNS // 2}x{ROWS // 2}", "--diameters", f"{KERNEL_PX:g}", "--smoothness", "0.3")
 _GAUGE = Lens(focal_length_mm=50.0, f_number=1.8, focus_distance_m=0.5)  # any lens: depths are those at which it has the map's diameters
 
@@ -48,6 +63,7 @@ class Measured:
     pictures: dict[str, np.ndarray]
     decibels: dict[str, tuple[float, float]]
     even_light_db: dict[str, float]
+    looks: dict[str, tuple[float, float]]
     rims_db: float
     noise_db: float
     correlation: float
@@ -89,6 +105,28 @@ def fitted(pairs: Sequence[Path], out: Path) -> tuple[PsfBank, float]:
     return read_bank(out), cpu_s
 
 
+def shrunken(pair: BlurPair, scale: float, folder: Path) -> BlurPair:
+    """The pair at another scale: an average over the pixels that become one, diameters as much smaller."""
+    size = tuple(round(each * scale) for each in pair.size)
+    sharp, blurred = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (pair.sharp, pair.blurred))
+    coc_px = cv2.resize(pair.coc_px, size, interpolation=cv2.INTER_NEAREST) * np.float32(scale)
+    return BlurPair(folder, sharp, blurred, coc_px)
+
+
+def network_picture(scene: Scene, others: Sequence[Path], run: Path, minutes: float) -> np.ndarray:
+    """What the network of a run makes of a scene; it is trained on the others first if there is none."""
+    import torch
+
+    from training.fitting.run_folder import NETWORK_NAME, load_run
+
+    if not (run / NETWORK_NAME).is_file():
+        mrbokeh("train", "fit", *others, "--out", run, "--minutes", minutes, *NETWORK)
+    rgb, coc_px = np.repeat(scene.sharp[None], 3, axis=0), scene.coc_px[None]
+    place = np.moveaxis(field_positions(SIZE, SIZE), 2, 0)
+    with torch.inference_mode():
+        return load_run(run)[0](*(torch.from_numpy(np.ascontiguousarray(each))[None] for each in (rgb, coc_px, place)))[0, 1].numpy()
+
+
 def correlation(bank: PsfBank, published: np.ndarray) -> float:
     """The mean over the frame of the correlation of a bank's kernels with the published ones, each centred."""
     half = np.array(SIZE[::-1]) / np.hypot(*SIZE)
@@ -102,18 +140,26 @@ def correlation(bank: PsfBank, published: np.ndarray) -> float:
     return fmean(map(float, found))
 
 
-def measure(data: Path, name: str, banks: dict[str, PsfBank], fit_s: float, published: np.ndarray) -> Measured:
-    scene = registered(read_scene(data, name))
+def exact(scene: Scene) -> np.ndarray:
+    """The scene through a disc, every pixel's summed."""
+    light = scatter(np.stack([scene.sharp, np.ones_like(scene.sharp)], axis=-1).astype(np.float64), scene.coc_px, Aperture.disc())
+    return light[..., 0] / np.maximum(light[..., 1], 1e-6)
+
+
+def measure(scene: Scene, banks: dict[str, PsfBank], fit_s: float, published: np.ndarray, network: np.ndarray | None) -> Measured:
     started_s = time.process_time()
     pictures = {"no blur": scene.sharp} | {method: rendered(scene.sharp, scene.coc_px, bank) for method, bank in banks.items()}
     render_s = (time.process_time() - started_s) / max(1, len(banks))
+    pictures |= {"exact": exact(scene)} | ({} if network is None else {"network": network})
+    lit = {method: in_even_light(picture, scene) for method, picture in pictures.items()}
     figures = {method: decibels(picture, scene) for method, picture in pictures.items()}
     like = correlation(banks["ours"], published) if "ours" in banks else float("nan")
     return Measured(
         scene=scene,
         pictures=pictures,
         decibels=figures,
-        even_light_db={method: in_even_light_db(picture, scene) for method, picture in pictures.items()},
+        even_light_db={method: in_even_light_db(picture, scene) for method, picture in lit.items()},
+        looks={method: looks(picture, scene) for method, picture in lit.items()},
         rims_db=decibels(pictures["published"], scene, scene.rims)[0],
         noise_db=noise_db(scene),
         correlation=like,
@@ -123,13 +169,16 @@ def measure(data: Path, name: str, banks: dict[str, PsfBank], fit_s: float, publ
 
 
 def lines(results: Sequence[Measured]) -> list[str]:
-    columns = " ".join(f"{method:>13}" for method in METHODS)
+    methods = [method for method in METHODS if method in results[0].pictures]
+    columns = " ".join(f"{method:>13}" for method in methods)
     out = [f"{'scene':>6} {'judged':>6} {columns}  {'rims':>6}  {'noise':>6}  correlation  render_s  fit_s (CPU)"]
     out += [_line(each) for each in results]
-    means = {method: np.mean([each.decibels[method] for each in results], axis=0) for method in METHODS}
+    means = {method: np.mean([each.decibels[method] for each in results], axis=0) for method in methods}
     rims_db = fmean(each.rims_db for each in results)
-    out.append(f"{'mean':>6} {'':>6} " + " ".join("{:6.2f} {:6.2f}".format(*means[method]) for method in METHODS) + f"  {rims_db:6.2f}")
-    out.append("in even light: " + ", ".join(f"{method} {fmean(each.even_light_db[method] for each in results):.2f}" for method in METHODS))
+    out.append(f"{'mean':>6} {'':>6} " + " ".join("{:6.2f} {:6.2f}".format(*means[method]) for method in methods) + f"  {rims_db:6.2f}")
+    out.append("in even light: " + ", ".join(f"{method} {fmean(each.even_light_db[method] for each in results):.2f}" for method in methods))
+    for place, name in enumerate(("SSIM", "FLIP")):
+        out.append(f"{name}: " + ", ".join(f"{method} {fmean(each.looks[method][place] for each in results):.4f}" for method in methods))
     worse = max(each.decibels["published"][0] - each.decibels["ours"][0] for each in results)
     like = fmean(each.correlation for each in results)
     held = {"published": means["published"][0] >= BAR_DB, "ours": worse <= FITTED_BAR_DB, "correlation": like >= CORRELATION_BAR}
@@ -139,9 +188,10 @@ def lines(results: Sequence[Measured]) -> list[str]:
 
 
 def _line(each: Measured) -> str:
-    row = " ".join("{:6.2f} {:6.2f}".format(*each.decibels[method]) for method in METHODS)
+    methods = [method for method in METHODS if method in each.pictures]
+    row = " ".join("{:6.2f} {:6.2f}".format(*each.decibels[method]) for method in methods)
     told = f"{each.rims_db:6.2f}  {each.noise_db:6.1f}  {each.correlation:11.4f}  {each.render_s:8.1f}  {each.fit_s:6.1f}"
-    lit = ", ".join(f"{method} {each.even_light_db[method]:.2f}" for method in METHODS)
+    lit = ", ".join(f"{method} {each.even_light_db[method]:.2f}" for method in methods)
     return f"{each.scene.name:>6} {each.scene.judged.mean():6.0%} {row}  {told}   in even light: {lit}"
 
 
@@ -150,16 +200,24 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--out", type=Path, help="an HTML page with crops")
     parser.add_argument("--scenes", nargs="*", help="names, such as 003 (all)")
+    parser.add_argument("--networks", type=Path, help="runs of networks, one a scene, trained here if they are not there")
+    parser.add_argument("--minutes", type=float, default=5.0, help="budget of each network (5)")
     given = parser.parse_args()
     names, published = scenes(given.data), published_kernels(given.data)
     plain = {method: bank_of_kernels(kernels) for method, kernels in shape_kernels().items()} | {"published": bank_of_kernels(published)}
     results = []
     with tempfile.TemporaryDirectory() as folder:
-        for name in names:
-            write_blur_pair(pair_of(read_scene(given.data, name), Path(folder) / name))
+        for name, scale in product(names, SCALES if given.networks else SCALES[:1]):
+            pair = pair_of(read_scene(given.data, name), Path(folder) / f"{SCALES[0]:g}" / name)
+            write_blur_pair(pair if scale == SCALES[0] else shrunken(pair, scale, Path(folder) / f"{scale:g}" / name))
         for name in given.scenes or names:
-            bank, fit_s = fitted([Path(folder) / each for each in names if each != name], Path(folder) / f"bank_{name}")
-            results.append(measure(given.data, name, plain | {"ours": bank}, fit_s, published))
+            others = [each for each in names if each != name]
+            bank, fit_s = fitted([Path(folder) / f"{SCALES[0]:g}" / each for each in others], Path(folder) / f"bank_{name}")
+            scene, network = registered(read_scene(given.data, name)), None
+            if given.networks:
+                pairs = [Path(folder) / f"{scale:g}" / each for scale, each in product(SCALES, others)]
+                network = network_picture(scene, pairs, given.networks / name, given.minutes)
+            results.append(measure(scene, plain | {"ours": bank}, fit_s, published, network))
             print(lines(results)[len(results)], flush=True)
     told = [*lines(results), memory_line(), machine_line()]
     print("\n".join(told))

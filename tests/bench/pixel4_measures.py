@@ -1,9 +1,17 @@
-"""How near a predicted photograph comes to the one that was taken, for `bench_pixel4`: decibels of linear light, and what bounds them."""
+"""How near a predicted photograph comes to the one that was taken, for `bench_pixel4`: decibels of linear light, how alike they look, and
+what bounds them.
+
+Perception is measured without weights: SSIM (Wang et al. 2004) and FLIP (`flip`), both of pictures encoded for display and in even light.
+LPIPS and its like need a network's weights, which cannot be shipped and were trained on other people's photographs.
+"""
 
 import cv2
 import numpy as np
+from skimage.metrics import structural_similarity
 
+from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.lens_measuring.fitting.pair_matching import even_light
+from tests.bench.flip import flip
 from tests.bench.pixel4_set import Scene
 
 
@@ -22,10 +30,24 @@ def decibels(picture: np.ndarray, scene: Scene, judged: np.ndarray | None = None
     return first, second
 
 
-def in_even_light_db(picture: np.ndarray, scene: Scene) -> float:
+def in_even_light(picture: np.ndarray, scene: Scene) -> np.ndarray:
+    """The picture with the photograph's gain, black and light, as far as these change over three of the largest kernels."""
     found = explained(picture, scene.photograph, scene.judged, 0).astype(np.float32)
     light = even_light(scene.photograph[..., None], found[..., None], scene.judged, 3.0 * float(scene.coc_px.max()))
-    return -10.0 * float(np.log10((((found * light - scene.photograph)[scene.judged]).astype(np.float64) ** 2).mean()))
+    return np.asarray(found * light, np.float32)
+
+
+def in_even_light_db(lit: np.ndarray, scene: Scene) -> float:
+    return -10.0 * float(np.log10((((lit - scene.photograph)[scene.judged]).astype(np.float64) ** 2).mean()))
+
+
+def looks(lit: np.ndarray, scene: Scene) -> tuple[float, float]:
+    """SSIM and FLIP of a picture in even light; what is not judged is the photograph's own, so that it tells nothing."""
+    shown = np.where(scene.judged, lit, scene.photograph)
+    pair = [linear_to_srgb(np.clip(each, 0.0, 1.0)) for each in (scene.photograph, shown)]
+    similarity = structural_similarity(*pair, data_range=1.0, gaussian_weights=True, sigma=1.5, use_sample_covariance=False, full=True)[1]
+    differs = flip(*(np.repeat(np.clip(each, 0.0, 1.0)[..., None], 3, axis=2) for each in (scene.photograph, shown)))
+    return float(similarity[scene.judged].mean()), float(differs[scene.judged].mean())
 
 
 def noise_db(scene: Scene) -> float:

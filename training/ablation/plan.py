@@ -12,7 +12,7 @@ from typing import Any, Literal
 from mrbokeh.system.errors import InputError
 from training.data.pairs import slice_size_px
 from training.data.stacks import stack_name
-from training.data.training_data import TrainingData, training_data
+from training.data.training_data import TrainingData, focal_stacks, training_data
 from training.fitting.settings import PRESETS, TrainSettings
 
 TableName = Literal["1", "3", "improvements"]
@@ -232,6 +232,7 @@ def scaled_tiles(base: TrainSettings, width_px: int, ablation: Ablation) -> dict
 def _data_set(folder: Path) -> DataSet:
     """Read a data set; the split is the manifest's, or for scene folders drawn once for all rows and seeds."""
     data = training_data([folder])
+    focal_stacks(data.stacks)
     split = data.split((), TEST_FRACTION, SPLIT_SEED)
     if not split.test or split.held_out_slices:
         raise InputError(f"{folder} has {len(data.stacks)} stack and none to test on: give data with at least two viewpoints")

@@ -16,6 +16,7 @@ from training.data.batches import draw_batch
 from training.data.dataset import PairSet
 from training.data.pairs import counting_of
 from training.data.stacks import stack_name
+from training.data.training_data import focal_stacks
 from training.evaluation.comparison import Extras, Unseen, focus_pull, scored
 from training.evaluation.methods import blur_of, network_method
 from training.evaluation.report import write_numbers
@@ -59,7 +60,7 @@ def result_of(planned: PlannedRun, lpips: Perceptual | None = None) -> RunResult
 def _measured(planned: PlannedRun, lpips: Perceptual | None) -> tuple[dict[str, float], int]:
     """Return (means over the held-out slices, their number); each slice is in scores.csv of the run."""
     method = network_method(planned.row.name, blur_of(planned.folder, device_of(planned.settings.device))[0])
-    stacks = tuple(stack for stack in planned.data_set.data.stacks if stack_name(stack) in planned.data_set.held_out)
+    stacks = focal_stacks([stack for stack in planned.data_set.data.stacks if stack_name(stack) in planned.data_set.held_out])
     result = scored([method], Unseen(stacks), Extras(lpips, memory=False))
     write_numbers(planned.folder / SCORES_NAME, result.scores)
     means = {name: result.mean(method.name, name) for name in MEASURES}

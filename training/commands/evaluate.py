@@ -52,7 +52,7 @@ def evaluate_command(
     Example: mrbokeh train evaluate runs/50mm --data lens_50mm --lens lens_50mm.bank --renderer polygon --out measured
     """
     from mrbokeh.stacks.guessed_metres import metres_notes
-    from training.data.training_data import training_data
+    from training.data.training_data import focal_stacks, training_data
     from training.evaluation.comparison import Extras, compare, unseen_of
     from training.evaluation.methods import lens_methods, nearest_method, network_methods, plain_methods, renderer_methods
     from training.evaluation.report import gain_lines, table_rows
@@ -64,7 +64,7 @@ def evaluate_command(
         raise InputError(f"--out: expected a folder, but {folder} is a file")
     refuse_existing(folder / "evaluation.md", overwrite)
     of_networks, seen = network_methods(networks, device)
-    stacks = training_data(scenes).stacks
+    stacks = focal_stacks(training_data(scenes).stacks)
     if note := metres_notes(stacks):
         guess(note)
     unseen = unseen_of(stacks, seen)

@@ -15,7 +15,7 @@ from training.fitting.settings import with_overrides
 
 Scenes = Annotated[
     list[Path],
-    typer.Argument(help="A data set (of `mrbokeh capture dataset`), or folders of merged focal stacks, or folders of such folders."),
+    typer.Argument(help="A data set (of `mrbokeh capture dataset`), folders of merged focal stacks or of blur pairs, or folders of such."),
 ]
 
 
@@ -104,6 +104,7 @@ def fit_command(
 
 
 def _fit(scenes: list[Path], out: Path, settings: "TrainSettings", held_out: list[str], overwrite: bool) -> None:
+    from mrbokeh.stacks.focal_stack import FocalStack
     from mrbokeh.stacks.guessed_metres import metres_notes
     from training.data.training_data import training_data
     from training.fitting.run import StoppedError
@@ -114,7 +115,7 @@ def _fit(scenes: list[Path], out: Path, settings: "TrainSettings", held_out: lis
         data = training_data(scenes)
         if _number("RANK") == 0:
             say(data.split(held_out, settings.test_fraction, settings.seed).words(), err=True)
-            if note := metres_notes(data.stacks):
+            if note := metres_notes(stack for stack in data.stacks if isinstance(stack, FocalStack)):
                 guess(note)
         said = f"{out}: {_summary(fit(data, out, settings, held_out, overwrite))}"
     except StoppedError as stop:

@@ -11,10 +11,10 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair
 from mrbokeh.system.resources import cores
 from training.data.pairs import Counting, Pair, StackRows, read_pair, read_stack_rows, slice_size_px
-from training.data.stacks import ChosenSlices, stack_name
+from training.data.stacks import ChosenSlices, Source, stack_name
 
 __all__ = ["Pair", "PairSet", "read_pair"]
 _PLANES = 8  # of float32: two pictures, circles of confusion, weight
@@ -115,7 +115,7 @@ class PairSet:
     """
 
     def __init__(
-        self, stacks: Sequence[FocalStack], counting: Counting | None = None, cache_mib: int = 2048, slices: ChosenSlices | None = None
+        self, stacks: Sequence[Source], counting: Counting | None = None, cache_mib: int = 2048, slices: ChosenSlices | None = None
     ) -> None:
         self.stacks, self._slices = tuple(stacks), dict(slices or {})
         self.keys = [(stack, index) for stack in self.stacks for index in self._slices.get(stack_name(stack), range(len(stack)))]
@@ -125,7 +125,7 @@ class PairSet:
         self._sharing = threading.Lock()
         self._cache = ReadAhead(self._read, cache_mib * 2**20, readers=max(1, min(4, cores() // 2)))
 
-    def __reduce__(self) -> tuple[type["PairSet"], tuple[tuple[FocalStack, ...], Counting, int, ChosenSlices]]:
+    def __reduce__(self) -> tuple[type["PairSet"], tuple[tuple[Source, ...], Counting, int, ChosenSlices]]:
         return PairSet, (self.stacks, self._counting, self._cache_mib, self._slices)
 
     def __len__(self) -> int:
@@ -139,7 +139,7 @@ class PairSet:
         stack, slice_index = self.keys[index]
         return f"{stack_name(stack)} slice {slice_index}"
 
-    def left_out(self, stack: FocalStack) -> list[int]:
+    def left_out(self, stack: Source) -> list[int]:
         """Return the slices of one of its stacks that do not belong to it."""
         chosen = self._slices.get(stack_name(stack))
         return [] if chosen is None else [index for index in range(len(stack)) if index not in chosen]
@@ -197,8 +197,10 @@ class PairSet:
         rows = slice(window.top, window.bottom)
         return read_pair(stack, index, self._counting, rows, self._stack_rows(stack, rows) if self.all_fit else None)
 
-    def _stack_rows(self, stack: FocalStack, rows: slice) -> StackRows:
-        """Return what belongs to the whole picture, read by whoever comes first."""
+    def _stack_rows(self, stack: Source, rows: slice) -> StackRows | None:
+        """Return what belongs to the whole picture, read by whoever comes first; None of a pair, which is in memory."""
+        if isinstance(stack, BlurPair):
+            return None
         with self._sharing:
             if stack.folder not in self._shared:
                 self._shared[stack.folder] = read_stack_rows(stack, rows)

@@ -1,7 +1,7 @@
-"""Training pairs from FocalStack folders: (all-in-focus picture, circles of confusion) -> photographed slice.
+"""Training pairs from FocalStack folders and blur pairs: (all-in-focus picture, circles of confusion) -> photographed slice.
 
 Some rows of a slice and its stack can be read without decoding the rest. Pixels count if their depth and radiance are known and
-nothing moved there.
+nothing moved there. Blur pairs come whole, registered and in even light.
 """
 
 from dataclasses import dataclass, replace
@@ -10,10 +10,14 @@ import numpy as np
 from jaxtyping import Bool, Float32
 
 from mrbokeh.images.camera_rgb import MASK_PREFIX, SATURATED, VALID
+from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair
+from mrbokeh.lens_measuring.fitting.pupil_picture import EXTENT
+from mrbokeh.lens_measuring.fitting.stack_equations import from_frame_px
 from mrbokeh.optics.camera import field_positions
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.system.errors import InputError
 from training.data.exr_rows import exr_size_px, read_rows
+from training.data.stacks import UNSTATED_LENS, Source, lens_of_slice
 from training.fitting.settings import TrainSettings
 
 Mask = Bool[np.ndarray, "height width"]
@@ -52,8 +56,10 @@ class SliceRows:
     valid: Mask
 
 
-def slice_size_px(stack: FocalStack, index: int) -> tuple[int, int]:
+def slice_size_px(stack: Source, index: int) -> tuple[int, int]:
     """Return (height, width), from the header of its file."""
+    if isinstance(stack, BlurPair):
+        return stack.size[1], stack.size[0]
     return exr_size_px(stack.folder / stack.slices[index].path)
 
 
@@ -196,12 +202,14 @@ class Pair:
 
 
 def read_pair(
-    stack: FocalStack, index: int, counting: Counting | None = None, rows: slice | None = None, shared: StackRows | None = None
+    stack: Source, index: int, counting: Counting | None = None, rows: slice | None = None, shared: StackRows | None = None
 ) -> Pair:
     """Read a pair. rows: only these of the picture; None: all of them. shared: the stack's data of these rows, if already read."""
     counting, frame_px = counting or Counting(), slice_size_px(stack, index)
+    if isinstance(stack, BlurPair):
+        return _of_blur_pair(stack, frame_px).cut(rows or slice(0, frame_px[0]), slice(0, frame_px[1]))
     read = read_slice_rows(stack, index, rows or slice(0, frame_px[0]), shared)
-    lens = stack.lens_of(index)
+    lens = lens_of_slice(stack, index)
     return Pair(
         all_in_focus=read.shared.all_in_focus,
         coc_px=_coc_px(stack, index, read.shared, frame_px),
@@ -214,6 +222,23 @@ def read_pair(
         frame_px=frame_px,
         origin_px=(read.shared.rows.start, 0),
         saturated=read.saturated if counting.one_sided else None,
+    )
+
+
+def _of_blur_pair(pair: BlurPair, frame_px: tuple[int, int]) -> Pair:
+    """Return the whole pair. Pixels count whose light all comes from known diameters within the frame."""
+    view = pair.view
+    counted = view.known & (from_frame_px(frame_px) > 0.5 * EXTENT * np.abs(view.coc_px) + 1.0)
+    return Pair(
+        all_in_focus=view.sharp,
+        coc_px=view.coc_px,
+        target=view.blurred,
+        weight=counted.astype(np.float32),
+        f_number=UNSTATED_LENS.f_number,
+        focal_length_mm=UNSTATED_LENS.focal_length_mm,
+        coc_px_per_dioptre=UNSTATED_LENS.coc_px_per_dioptre(frame_px[1]),
+        focus_dioptres=1.0 / UNSTATED_LENS.focus_distance_m,
+        frame_px=frame_px,
     )
 
 

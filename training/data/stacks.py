@@ -6,9 +6,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair
+from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.system.errors import InputError
 
+Source = FocalStack | BlurPair
+"""A sharp picture and photographs of it: a stack's slices, or the one of a blur pair."""
+UNSTATED_LENS = Lens(focal_length_mm=50.0, f_number=1.8, focus_distance_m=0.5)
+"""The lens of blur pairs, of which nothing is stated: any will do, since diameters are given in pixels."""
 ChosenSlices = Mapping[str, Sequence[int]]
 """Indices of slices by the name of their stack; of stacks that are not named, all slices are meant."""
 
@@ -20,8 +26,8 @@ _MOST_NAMED = 8
 class Split:
     """A split into training and test. train, test: whole stacks. held_out_slices: of the only stack, which then is in both."""
 
-    train: tuple[FocalStack, ...]
-    test: tuple[FocalStack, ...]
+    train: tuple[Source, ...]
+    test: tuple[Source, ...]
     held_out_slices: tuple[int, ...] = ()
 
     @property
@@ -57,13 +63,13 @@ class Seen:
     stacks: tuple[str, ...]
     held_out_slices: tuple[int, ...] = ()
 
-    def unseen_slices(self, stack: FocalStack) -> set[int]:
+    def unseen_slices(self, stack: Source) -> set[int]:
         if stack_name(stack) not in self.stacks:
             return set(range(len(stack)))
         return {index for index in self.held_out_slices if index < len(stack)}
 
 
-def stack_name(stack: FocalStack) -> str:
+def stack_name(stack: Source) -> str:
     """Return scene/stack, the name under which a run remembers its training data."""
     folder = stack.folder.resolve()
     return f"{folder.parent.name}/{folder.name}"
@@ -75,6 +81,11 @@ def stacks_words(names: Sequence[str]) -> str:
         return ", ".join(names)
     scenes = Counter(name.rpartition("/")[0] for name in names)
     return ", ".join(f"{scene} ({views} views)" if views > 1 else scene for scene, views in scenes.items())
+
+
+def lens_of_slice(stack: Source, index: int) -> Lens:
+    """Return the lens of a slice. Raises InputError for a stack whose lens nobody knows."""
+    return UNSTATED_LENS if isinstance(stack, BlurPair) else stack.lens_of(index)
 
 
 def require_usable(stack: FocalStack) -> None:
@@ -89,7 +100,7 @@ def require_usable(stack: FocalStack) -> None:
     stack.lens_of(0)
 
 
-def named(stacks: Sequence[FocalStack], held_out: Sequence[str]) -> list[str]:
+def named(stacks: Sequence[Source], held_out: Sequence[str]) -> list[str]:
     """Return the full names of stacks held out by name (their folder, or scene/folder). Raises InputError for an unknown name."""
     known = [stack_name(stack) for stack in stacks]
     unknown = [name for name in held_out if not any(_is_called(each, name) for each in known)]
@@ -98,13 +109,13 @@ def named(stacks: Sequence[FocalStack], held_out: Sequence[str]) -> list[str]:
     return [each for each in known if any(_is_called(each, name) for name in held_out)]
 
 
-def drawn(stacks: Sequence[FocalStack], test_fraction: float, seed: int) -> list[str]:
+def drawn(stacks: Sequence[Source], test_fraction: float, seed: int) -> list[str]:
     """Draw the full names of the stacks to hold out: at least one of two or more, unless the fraction is 0."""
     count = max(1, round(test_fraction * len(stacks))) if test_fraction > 0 and len(stacks) > 1 else 0
     return list(np.random.default_rng(seed).permutation(sorted(stack_name(stack) for stack in stacks))[:count])
 
 
-def split_stacks(stacks: Sequence[FocalStack], apart: Sequence[str]) -> tuple[list[FocalStack], list[FocalStack]]:
+def split_stacks(stacks: Sequence[Source], apart: Sequence[str]) -> tuple[list[Source], list[Source]]:
     """Return (to train on, held out), whole stacks. apart: full names. Raises InputError if none is left to train on."""
     by_name = {stack_name(stack): stack for stack in stacks}
     train = [stack for name, stack in by_name.items() if name not in apart]

@@ -9,13 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
+from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair, find_blur_pairs
 from mrbokeh.optics.lens import Lens
+from mrbokeh.stacks.focal_stack import FILE_NAME as STACK_NAME
 from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks, read_focal_stack
 from mrbokeh.stacks.focal_stack_dataset import FILE_NAME, FocalStackDataset, file_troubles, read_focal_stack_dataset, slices_to_hold_out
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 from training.data.dataset import PairSet
-from training.data.stacks import Split, drawn, named, require_usable, split_stacks, stack_name
+from training.data.stacks import UNSTATED_LENS, Source, Split, drawn, lens_of_slice, named, require_usable, split_stacks, stack_name
 
 _SAME = 1e-3
 
@@ -40,9 +42,9 @@ class DataFacts:
 
 @dataclass(frozen=True)
 class TrainingData:
-    """All stacks, training and test; dataset: the manifest that they came with, in its order, or None."""
+    """All stacks or blur pairs, training and test; dataset: the manifest that they came with, in its order, or None."""
 
-    stacks: tuple[FocalStack, ...]
+    stacks: tuple[Source, ...]
     dataset: FocalStackDataset | None = None
 
     def split(self, held_out: Sequence[str], test_fraction: float, seed: int) -> Split:
@@ -63,17 +65,18 @@ class TrainingData:
     def _slices_apart(self, test_fraction: float) -> tuple[int, ...]:
         if self.dataset is not None:
             return self.dataset.stacks[0].held_out_slices
-        return slices_to_hold_out(self.stacks[0]) if test_fraction > 0.0 else ()
+        only = self.stacks[0]
+        return slices_to_hold_out(only) if test_fraction > 0.0 and isinstance(only, FocalStack) else ()
 
-    def facts(self, pairs: PairSet, several_lenses: bool = False) -> DataFacts:
-        """Read facts from the manifest, or from every pair to train on. several_lenses: f-number and focal length may differ."""
+    def facts(self, pairs: PairSet, several_lenses: bool = False, several_sizes: bool = False) -> DataFacts:
+        """Read facts from the manifest, or from every pair to train on. several_lenses, several_sizes: see `gather_facts`."""
         if self.dataset is None:
-            return gather_facts(pairs, several_lenses)
+            return gather_facts(pairs, several_lenses, several_sizes)
         return manifest_facts(self.dataset, pairs.stacks, several_lenses)
 
 
 def training_data(folders: Sequence[Path]) -> TrainingData:
-    """Return the stacks of a data set, or of scene folders. Raises InputError if they cannot be used or are a mixture of both."""
+    """Return the stacks of a data set or of scene folders, or blur pairs. Raises InputError for what cannot be used, or a mixture."""
     datasets = [folder for folder in folders if (folder / FILE_NAME).is_file()]
     if datasets and len(folders) > 1:
         raise InputError(
@@ -82,11 +85,29 @@ def training_data(folders: Sequence[Path]) -> TrainingData:
         )
     if datasets:
         return _of_dataset(read_focal_stack_dataset(datasets[0]))
+    pairs = [pair for folder in folders for pair in find_blur_pairs(folder)]
+    if pairs:
+        return TrainingData(_pairs_alone(pairs, folders))
     stacks = [stack for folder in folders for stack in find_focal_stacks(folder)]
     for stack in stacks:
         _require_no_manifest(stack)
         require_usable(stack)
     return TrainingData(tuple(stacks))
+
+
+def focal_stacks(stacks: Sequence[Source]) -> tuple[FocalStack, ...]:
+    """Return the stacks. Raises InputError if there are blur pairs among them, which have no metres to move the focus by."""
+    for stack in stacks:
+        if isinstance(stack, BlurPair):
+            raise InputError(f"expected focal stacks, got the blur pair {stack.folder}: of these `mrbokeh train fit` alone makes use")
+    return tuple(stack for stack in stacks if isinstance(stack, FocalStack))
+
+
+def _pairs_alone(pairs: Sequence[BlurPair], folders: Sequence[Path]) -> tuple[BlurPair, ...]:
+    """Return the pairs. Raises InputError if there are stacks beside them, whose lens is stated while theirs is not."""
+    if any(True for folder in folders for _ in folder.rglob(STACK_NAME)):
+        raise InputError(f"expected blur pairs or focal stacks, got both, {pairs[0].folder} and stacks beside it: train on one kind")
+    return tuple(pairs)
 
 
 def _of_dataset(dataset: FocalStackDataset) -> TrainingData:
@@ -109,13 +130,16 @@ def _require_no_manifest(stack: FocalStack) -> None:
         raise InputError(f"{stack.folder} belongs to the data set {dataset}: give {dataset} itself, so that its split holds")
 
 
-def gather_facts(pairs: PairSet, several_lenses: bool = False) -> DataFacts:
+def gather_facts(pairs: PairSet, several_lenses: bool = False, several_sizes: bool = False) -> DataFacts:
     """Gather the facts in one pass over all pairs, whose largest radiance is the scale. Raises InputError for several lenses or sizes.
 
-    several_lenses: f-number and focal length may differ, for a network that takes them as inputs.
+    several_lenses: f-number and focal length may differ, for a network that takes them as inputs. several_sizes: blur pairs may be of
+    different size, for a network without tiles: a lens is the same at every scale, so that shrunken pairs show further diameters.
     """
     lens, size = lens_of_stacks(pairs.stacks, several_lenses), pairs.size_px(0)
     for index, (stack, _) in enumerate(pairs.keys):
+        if several_sizes and isinstance(stack, BlurPair):
+            continue
         _require_same_size(stack_name(stack), size, pairs.size_px(index))
     largest_coc_px, largest_radiance = 0.0, 0.0
     for piece in (piece for index in track(range(len(pairs)), "look at the pictures") for piece in pairs.pieces(index)):
@@ -125,7 +149,7 @@ def gather_facts(pairs: PairSet, several_lenses: bool = False) -> DataFacts:
     return _facts(lens, size, (largest_coc_px, largest_radiance), pairs.stacks)
 
 
-def manifest_facts(dataset: FocalStackDataset, stacks: Sequence[FocalStack], several_lenses: bool = False) -> DataFacts:
+def manifest_facts(dataset: FocalStackDataset, stacks: Sequence[Source], several_lenses: bool = False) -> DataFacts:
     """Return the facts without opening a picture; raises as `gather_facts` does. stacks: those to train on."""
     size = (dataset.stacks[0].height_px, dataset.stacks[0].width_px)
     for record in dataset.stacks:
@@ -134,7 +158,7 @@ def manifest_facts(dataset: FocalStackDataset, stacks: Sequence[FocalStack], sev
     return _facts(lens, size, (dataset.largest_coc_px, dataset.radiance_scale), stacks)
 
 
-def _facts(lens: Lens, size: tuple[int, int], largest: tuple[float, float], stacks: Sequence[FocalStack]) -> DataFacts:
+def _facts(lens: Lens, size: tuple[int, int], largest: tuple[float, float], stacks: Sequence[Source]) -> DataFacts:
     """Return the facts. size: (rows, columns). largest: circle of confusion in pixels, radiance."""
     f_numbers, focal_lengths_mm = lens_ranges(stacks)
     return DataFacts(
@@ -148,14 +172,14 @@ def _facts(lens: Lens, size: tuple[int, int], largest: tuple[float, float], stac
     )
 
 
-def lens_ranges(stacks: Sequence[FocalStack]) -> tuple[tuple[float, float], tuple[float, float]]:
+def lens_ranges(stacks: Sequence[Source]) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return (lowest, highest) f-number and focal length in mm of all slices; f-numbers as measured if blur was calibrated."""
-    lenses = [stack.lens_of(index) for stack in stacks for index in range(len(stack))]
+    lenses = [lens_of_slice(stack, index) for stack in stacks for index in range(len(stack))]
     f_numbers, focal_lengths_mm = [each.f_number for each in lenses], [each.focal_length_mm for each in lenses]
     return (min(f_numbers), max(f_numbers)), (min(focal_lengths_mm), max(focal_lengths_mm))
 
 
-def lens_of_stacks(stacks: Sequence[FocalStack], several_lenses: bool = False) -> Lens:
+def lens_of_stacks(stacks: Sequence[Source], several_lenses: bool = False) -> Lens:
     """Return `common_lens`, or for several lenses the middle one of all slices, ordered by focal length and f-number.
 
     Raises InputError if sensors differ, since f-number and focal length do not tell how many pixels a millimetre has.
@@ -169,11 +193,11 @@ def lens_of_stacks(stacks: Sequence[FocalStack], several_lenses: bool = False) -
                 f"one network learns lenses on one sensor: expected a sensor {width_mm} mm wide as in the first stack, "
                 f"but {stack.folder} has {_stated(stack)[2]} mm; train on it apart"
             )
-    lenses = [stack.lens_of(index) for stack in stacks for index in range(len(stack))]
+    lenses = [lens_of_slice(stack, index) for stack in stacks for index in range(len(stack))]
     return sorted(lenses, key=lambda lens: (lens.focal_length_mm, lens.f_number))[len(lenses) // 2]
 
 
-def common_lens(stacks: Sequence[FocalStack]) -> Lens:
+def common_lens(stacks: Sequence[Source]) -> Lens:
     """Return the lens of all slices, with the median f-number, since calibrated slices each have a measured one.
 
     Raises InputError if stacks state different lenses.
@@ -185,14 +209,14 @@ def common_lens(stacks: Sequence[FocalStack]) -> Lens:
                 f"one network learns one lens: expected (focal length, f-number, sensor width) {expected} as in the first stack, "
                 f"but {stack.folder} has {_stated(stack)}; train on it apart"
             )
-    f_numbers = [stack.lens_of(index).f_number for stack in stacks for index in range(len(stack))]
-    return replace(stacks[0].lens_of(0), f_number=float(np.median(f_numbers)))
+    f_numbers = [lens_of_slice(stack, index).f_number for stack in stacks for index in range(len(stack))]
+    return replace(lens_of_slice(stacks[0], 0), f_number=float(np.median(f_numbers)))
 
 
-def _stated(stack: FocalStack) -> tuple[float, float, float]:
-    stack.lens_of(0)  # says what to do where nobody knows the lens
-    assert stack.lens is not None
-    return stack.lens.focal_length_mm, stack.lens.f_number, stack.lens.sensor_width_mm
+def _stated(stack: Source) -> tuple[float, float, float]:
+    lens_of_slice(stack, 0)  # says what to do where nobody knows the lens
+    lens = stack.lens or UNSTATED_LENS
+    return lens.focal_length_mm, lens.f_number, lens.sensor_width_mm
 
 
 def _require_same_size(name: str, size: tuple[int, ...], other_size: tuple[int, ...]) -> None:

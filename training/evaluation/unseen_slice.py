@@ -63,6 +63,7 @@ class UnseenSlice:
 def unseen_slice(pairs: PairSet, index: int) -> UnseenSlice:
     """Read the pair at that index of the set with its lens and depth."""
     stack, slice_index = pairs.keys[index]
+    assert isinstance(stack, FocalStack), "blur pairs are not evaluated"
     saturated = stack.slice_masks(slice_index).saturated
     nearest = _nearest(stack, slice_index, pairs.left_out(stack))
     return UnseenSlice(

@@ -13,12 +13,11 @@ import torch
 from jaxtyping import Float32
 
 from mrbokeh.images.image_io import WIDEST_PX, SheetRow, write_contact_sheet
-from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.system.errors import InputError
 from training.data.batches import Batch, stack_pairs
 from training.data.dataset import Pair, PairSet
 from training.data.pairs import WHERE_TRUTH_IS_KNOWN
-from training.data.stacks import ChosenSlices
+from training.data.stacks import ChosenSlices, Source
 from training.fitting.checkpoint import FILE_NAME as CHECKPOINT_NAME
 from training.fitting.checkpoint import CurvePoint, Learner, Progress, draw_curve, save_checkpoint, write_curve
 from training.fitting.run_folder import RunFacts, save_network
@@ -50,7 +49,7 @@ class Look:
 class HeldOutSlices:
     """Some slices, spread over stacks and focus range: the middle of each, or all of it if tiles have their own places."""
 
-    def __init__(self, stacks: Sequence[FocalStack], slices: ChosenSlices | None = None) -> None:
+    def __init__(self, stacks: Sequence[Source], slices: ChosenSlices | None = None) -> None:
         self._pairs = PairSet(stacks, WHERE_TRUTH_IS_KNOWN, cache_mib=0, slices=slices)
         spread = np.linspace(0, len(self._pairs) - 1, SLICES if len(self._pairs) else 0)
         self._chosen = [int(index) for index in np.unique(spread.round())]

@@ -9,11 +9,12 @@ from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
+from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.stacks.guessed_metres import is_lens_guessed
 from mrbokeh.system.errors import InputError
 from training.data.dataset import PairSet
 from training.data.pairs import counting_of
-from training.data.stacks import Split, stack_name
+from training.data.stacks import Source, Split, stack_name
 from training.data.training_data import TrainingData
 from training.fitting.checkpoint import FILE_NAME as CHECKPOINT_NAME
 from training.fitting.checkpoint import Progress
@@ -99,7 +100,7 @@ def _require_looks(settings: TrainSettings, validation: HeldOutSlices) -> None:
 
 
 def _facts_of(data: TrainingData, pairs: PairSet, split: Split, settings: TrainSettings) -> RunFacts:
-    found = data.facts(pairs, several_lenses=settings.network.lens_inputs)
+    found = data.facts(pairs, several_lenses=settings.network.lens_inputs, several_sizes=not settings.network.tile_px)
     facts = RunFacts(
         lens=found.lens,
         width_px=found.width_px,
@@ -109,7 +110,7 @@ def _facts_of(data: TrainingData, pairs: PairSet, split: Split, settings: TrainS
         trained_on=tuple(stack_name(stack) for stack in pairs.stacks),
         held_out=() if split.held_out_slices else tuple(stack_name(stack) for stack in split.test),
         held_out_slices=split.held_out_slices,
-        lens_guessed=any(is_lens_guessed(stack) and not stack.metres_known for stack in pairs.stacks),
+        lens_guessed=any(_is_guessed(stack) for stack in pairs.stacks),
         commit=source_commit(),
         f_numbers=found.f_numbers,
         focal_lengths_mm=found.focal_lengths_mm,
@@ -130,6 +131,10 @@ def _within(facts: RunFacts, run_folder: Path) -> RunFacts:
         )
     ranges = {name: getattr(before, name) for name in ("largest_coc_px", "radiance_scale", "f_numbers", "focal_lengths_mm")}
     return replace(facts, **ranges)
+
+
+def _is_guessed(stack: Source) -> bool:
+    return not isinstance(stack, FocalStack) or (is_lens_guessed(stack) and not stack.metres_known)
 
 
 def require_same_settings(run_folder: Path, settings: TrainSettings) -> None:

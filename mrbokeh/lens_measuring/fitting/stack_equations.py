@@ -72,10 +72,13 @@ def usable_pixels(view: SliceView) -> Mask:
         away, (rows, columns) = distance_transform_edt(~edges, return_indices=True)
         widest = cv2.dilate(size, np.ones((5, 5), np.uint8))
         inside = away > np.maximum(reach, 0.5 * widest[rows, columns]) + 1.0
-    height, width = size.shape
-    row, column = np.arange(height)[:, None] + 0.5, np.arange(width)[None, :] + 0.5
-    from_frame = np.minimum(np.minimum(row, height - row), np.minimum(column, width - column))
-    return np.asarray(view.known & (size >= LEAST_DIAMETER_PX) & inside & (from_frame > EXTENT * reach + 1.0))
+    return np.asarray(view.known & (size >= LEAST_DIAMETER_PX) & inside & (from_frame_px(size.shape) > EXTENT * reach + 1.0))
+
+
+def from_frame_px(size: tuple[int, ...]) -> Float64[np.ndarray, "height width"]:
+    """Return how far the middle of each pixel of a picture (height, width) is from the frame."""
+    row, column = (np.minimum(each, each[::-1]) for each in (np.arange(length) + 0.5 for length in size))
+    return np.minimum(row[:, None], column)
 
 
 def drawn_pixels(view: SliceView, knots: Knots, count: int, rng: np.random.Generator) -> Int64[np.ndarray, "points 2"]:
