@@ -2,9 +2,10 @@
 
     python -m tests.bench.bench_network_sizes [--longest-s 5]
 
-Plain and fast export by every provider of ONNX Runtime that is found, each in a process of its own, and on a GPU of torch with its kernels
-as they are and by Fourier transforms. One tile, fresh weights: the time of the plain form does not depend on them, and what the fast form
-gains by factors of trained kernels is not in it. A picture that would take longer than --longest-s is estimated from the next smaller one.
+On a GPU of torch with its kernels as they are and by Fourier transforms; without one the plain and the fast export by every provider of
+ONNX Runtime that is found, each in a process of its own. One tile, fresh weights: the time of the plain form does not depend on them, and
+what the fast form gains by factors of trained kernels is not in it. A picture that would take longer than --longest-s is estimated from the
+next smaller one.
 The paper's numbers (Mandl et al. 2024, Table 2) are of an RTX 4090.
 """
 

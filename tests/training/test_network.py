@@ -15,7 +15,7 @@ from mrbokeh.stacks.focal_stack_dataset import network_blocks
 from tests.support.refusals import refused
 from training.fitting.settings import PRESETS, TrainSettings, better_settings, demo_settings, settings_from_json, settings_to_json
 from training.networks.gated_network import GatedTiles, bins_px, blocks_for_gates
-from training.networks.kernels import LEAST_SIZE, depthwise, disc_kernel
+from training.networks.kernels import LEAST_SIZE, _TransformedDepthwise, depthwise, disc_kernel, pointwise_product
 from training.networks.network import BlurNetwork, TileGrid, assemble
 from training.networks.network_settings import NetworkSettings
 from training.networks.published_network import PublishedTiles
@@ -282,3 +282,25 @@ def test_wide_kernels_learn_in_a_fraction_of_the_time() -> None:
 
     cpu_s(depthwise)
     assert cpu_s(depthwise) < 0.5 * cpu_s(plain)
+
+
+@pytest.mark.parametrize(("size", "padding", "batch"), [(5, 0, 2), (7, 3, 1), (15, 5, 3), (15, 0, 2)])
+def test_convolutions_of_a_gpu_by_transforms_are_the_plain_ones(size: int, padding: int, batch: int) -> None:
+    """In value and in both gradients, to rounding; on the processor, in double precision."""
+    generator = torch.Generator().manual_seed(size)
+    maps, kernels = (torch.randn(*shape, dtype=torch.float64, generator=generator) for shape in ((batch, 5, 40, 33), (5, 1, size, size)))
+    results = []
+    for convolve in (
+        lambda x, k: torch.nn.functional.conv2d(x, k, padding=padding, groups=5),
+        lambda x, k: _TransformedDepthwise.apply(x, k, padding),
+    ):
+        inputs = maps.clone().requires_grad_(), kernels.clone().requires_grad_()
+        out = convolve(*inputs)
+        results.append((out, *torch.autograd.grad(out.sin().sum(), inputs)))
+    for plain, transformed in zip(*results, strict=True):
+        assert torch.allclose(plain, transformed, atol=1e-10)
+
+
+def test_grouped_pointwise_convolutions_are_products_of_matrices() -> None:
+    convolution, maps = torch.nn.Conv2d(12, 18, 1, groups=3), torch.randn(2, 12, 7, 5)
+    assert torch.allclose(pointwise_product(maps, convolution), convolution(maps), atol=1e-6)

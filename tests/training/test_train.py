@@ -2,6 +2,7 @@
 
 import dataclasses
 import itertools
+import shutil
 import signal
 from pathlib import Path
 
@@ -34,9 +35,10 @@ from training.evaluation.methods import (
     sigma_per_coc,
 )
 from training.fitting import train
+from training.fitting.checkpoint import Learner
 from training.fitting.objective import learning_rate_factor
 from training.fitting.run import Run
-from training.fitting.run_folder import first_network, load_run
+from training.fitting.run_folder import load_run
 from training.fitting.settings import TrainSettings, demo_settings
 from training.networks.network_settings import NetworkSettings
 
@@ -118,27 +120,50 @@ def test_the_network_learns_the_lens_and_a_finished_run_is_left_alone(scene: Pat
     refused("other settings \\(seed\\)", train.fit, training_data([scene]), run, dataclasses.replace(DEMO_LIKE, seed=1), ["view_2"])
 
 
+def test_pictures_of_a_step_teach_together_what_they_teach_one_by_one(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a GPU, on the processor: joined by size, and kept where they are; only the recording of kernels needs a GPU."""
+    few = dataclasses.replace(DEMO_LIKE, epochs=2, sheets=False)
+    train.fit(training_data([scene]), tmp_path / "apart", few, ["view_2"])
+    begin, sizes = Run.__init__, []
+
+    def on_gpu(run: Run, *arguments: object, **named: object) -> None:
+        begin(run, *arguments, **named)  # type: ignore[arg-type]
+        run._on_gpu, run._kept = True, {}
+
+    monkeypatch.setattr(Run, "__init__", on_gpu)
+    monkeypatch.setattr(Learner, "record_steps", lambda _, batch: sizes.append(len(batch.rgb)))
+    train.fit(training_data([scene]), tmp_path / "together", few, ["view_2"])
+    assert sizes == [2]
+    apart, together = (load_run(tmp_path / name)[0].state_dict() for name in ("apart", "together"))
+    assert all(torch.allclose(apart[name], together[name], atol=1e-4) for name in apart)
+
+
 def test_a_run_starts_from_another_one_and_learns_a_lens_of_its_family_sooner(run: Path, tmp_path: Path) -> None:
-    """Of a blade less, seen in one stack: as many steps afresh are worse, and the first look is at the other run's network."""
+    """Of a blade less, seen in one stack: as many steps afresh are worse. It knows what the other one saw, and goes on without it."""
     lens = dataclasses.replace(LENS, aperture=Aperture.blades(5, 0.2))
-    wall = make_stack(tmp_path / "wall", 7, lens=lens)
-    data = training_data([wall.folder])
-    few = dataclasses.replace(DEMO_LIKE, epochs=6, start_from=str(run), learning_rate=0.005)
-    tuned = train.fit(data, tmp_path / "tuned", few)
-    afresh = train.fit(data, tmp_path / "afresh", dataclasses.replace(few, start_from=None, learning_rate=DEMO_LIKE.learning_rate))
+    data = training_data([make_stack(tmp_path / "wall", 7, lens=lens).folder])
+    few, base = dataclasses.replace(DEMO_LIKE, epochs=6, learning_rate=0.005), shutil.copytree(run, tmp_path / "base")
+    tuned = train.fit(data, tmp_path / "tuned", few, start_from=base)
+    afresh = train.fit(data, tmp_path / "afresh", dataclasses.replace(few, learning_rate=DEMO_LIKE.learning_rate))
     assert tuned.curve[-1].held_out_psnr_db > afresh.curve[-1].held_out_psnr_db + 1.0
-    assert load_run(tmp_path / "tuned")[2].radiance_scale == load_run(run)[2].radiance_scale
-    before, task = load_run(run)[0].state_dict(), first_network(few, load_run(run)[2]).state_dict()
-    assert all(torch.equal(before[name], task[name]) for name in before)
+    facts, before = load_run(tmp_path / "tuned")[2], load_run(run)[2]
+    assert (facts.radiance_scale, facts.tuned_from) == (before.radiance_scale, "base")
+    assert set(facts.trained_on) == {*before.trained_on, f"{tmp_path.name}/wall"}
+    shutil.rmtree(base)
+    assert train.fit(data, tmp_path / "tuned", few, start_from=base).step == tuned.step
 
 
-def test_a_run_does_not_start_from_one_that_knows_less_blur_or_has_another_shape(scene: Path, run: Path, tmp_path: Path) -> None:
-    near = make_stack(tmp_path / "near", 7, lens=dataclasses.replace(LENS, f_number=2.0))
-    few = dataclasses.replace(DEMO_LIKE, start_from=str(run))
-    refused("has learned blur of up to .* px: give smaller", train.fit, training_data([near.folder]), tmp_path / "out", few)
-    wider = dataclasses.replace(few, network=dataclasses.replace(few.network, width=3))
-    refused("another shape .* train afresh", train.fit, training_data([scene]), tmp_path / "out", wider)
-    assert not (tmp_path / "out").exists()
+def test_a_run_does_not_start_from_one_that_does_not_fit_it(scene: Path, run: Path, tmp_path: Path) -> None:
+    near = training_data([make_stack(tmp_path / "near", 7, lens=dataclasses.replace(LENS, f_number=2.0)).folder])
+    wall, out = training_data([scene]), tmp_path / "out"
+    wider = dataclasses.replace(DEMO_LIKE, network=dataclasses.replace(DEMO_LIKE.network, width=3))
+    refused("has learned blur of up to .* px: give smaller", train.fit, near, out, DEMO_LIKE, start_from=run)
+    refused("another shape", train.fit, wall, out, wider, ["view_2"], start_from=run)
+    refused("was trained on wall/view_0, which cannot be held out", train.fit, wall, out, DEMO_LIKE, ["view_0"], start_from=run)
+    refused("is the run to start from", train.fit, wall, run, DEMO_LIKE, ["view_2"], True, start_from=run)
+    assert not out.exists()
+    told = mrbokeh("train", "fit", scene, "--tune", run, "--set", "radiance_scale=50", "--out", out)
+    assert told.returncode == 2 and "--tune takes the network and its ranges" in told.stderr
 
 
 @pytest.mark.slow

@@ -115,7 +115,6 @@ def test_a_loss_far_above_its_best_is_told_once(scene: Path, tmp_path: Path, mon
     for _ in range(FAR_ABOVE_STEPS + 60):
         progress.took_step(2.0, 1)
     assert FAR_ABOVE_STEPS < progress.steps_above < FAR_ABOVE_STEPS + 60  # 35 steps until the smoothed loss is above 1.5
-    assert 0.98**34 > 0.5 > 0.98**35
     monkeypatch.setattr(run_module, "FAR_ABOVE_STEPS", 2)
     before = Progress(step=50, best_loss=1e-12, smoothed_loss=1e-3)
     monkeypatch.setattr(run_module, "Progress", lambda: dataclasses.replace(before, curve=[]))
@@ -149,7 +148,7 @@ def test_the_card_measures_what_is_held_out_or_says_that_it_cannot(
     network, settings, facts = load_run(run)
     exported, blur = network_facts_of(network, settings.network, facts), blur_of(run)[0]
     monkeypatch.setattr(model_card, "blur_of", lambda _: (blur, None))
-    write_card(run, tmp_path / "lens.onnx", exported)
+    write_card(run, tmp_path / "lens.onnx", exported, "fast, loses 0.1 dB")
     card = (tmp_path / "lens.md").read_text(encoding="utf-8")
     pairs = [read_pair(read_focal_stack(scene / "view_2"), index) for index in range(3)]
     decibels, similarities = zip(*((psnr(blur(each), each.target), ssim(blur(each), each.target)) for each in pairs), strict=True)
@@ -160,7 +159,8 @@ def test_the_card_measures_what_is_held_out_or_says_that_it_cannot(
     shutil.copytree(run, tmp_path / "run")
     document = json.loads((run / "run.json").read_text())
     (tmp_path / "run" / "run.json").write_text(json.dumps(document | {"roots": [str(tmp_path)], "licence": "CC0"}))
-    write_card(tmp_path / "run", tmp_path / "lens.onnx", exported)
+    assert "Form: fast, loses 0.1 dB" in card
+    write_card(tmp_path / "run", tmp_path / "lens.onnx", exported, "plain")
     card = (tmp_path / "lens.md").read_text(encoding="utf-8")
     assert "dB while training" in card and "Focus: unknown" in card and "data: CC0" in card
 
@@ -175,7 +175,7 @@ def test_the_doctor_looks_at_everything_it_can(run: Path, scene: Path, tmp_path:
         "The pictures are",
         "No lights to",
         "The learning rate",
-        "It diverged:",
+        "It diverged: the",
     } & found
     shutil.copytree(run, tmp_path / "run")
     facts = json.loads((run / "run.json").read_text())

@@ -21,14 +21,17 @@ def doctor_command(
 
     Example: mrbokeh train doctor runs/attic
     """
-    from training.data.training_data import training_data
+    from training.data.training_data import focal_stacks, training_data
     from training.evaluation.diagnosis import diagnose
 
-    diagnosis = diagnose(run, training_data(data).stacks if data else ())
+    diagnosis = diagnose(run, focal_stacks(training_data(data).stacks) if data else ())
     for number, sentence in enumerate(diagnosis.found, 1):
         tell(f"{number}. {sentence}")
+    if diagnosis.found:
+        tell("other options mean another run: give another --out with them, or --overwrite")
     if not diagnosis.found and not diagnosis.unseen:
         tell("nothing found wrong")
     tell(f"looked at: {'; '.join(diagnosis.looked)}", found=diagnosis.found, looked_at=diagnosis.looked, not_looked_at=diagnosis.unseen)
     if diagnosis.unseen:
-        tell(f"not looked at, for lack of the pictures or of a finished network: {'; '.join(diagnosis.unseen)}; give --data")
+        why = "its network is not finished" if diagnosis.has_pictures else "its pictures are not where they were, give --data"
+        tell(f"not looked at, as {why}: {'; '.join(diagnosis.unseen)}")

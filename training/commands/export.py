@@ -18,7 +18,7 @@ def export_command(
     max_psnr_loss: Annotated[float, typer.Option(min=0.0, help="With --fast: decibel that may be lost.")] = 0.2,
     data: Annotated[
         list[Path] | None,
-        typer.Option(help="With --fast: focal stacks to measure the loss against the truth (repeat for more); else a made-up picture."),
+        typer.Option(help="Focal stacks to measure what --fast loses, and for the card where the run's have moved (repeat for more)."),
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an existing file.")] = False,
 ) -> None:
@@ -35,32 +35,29 @@ def export_command(
     """
     from mrbokeh.images.image_io import require_suffix
     from mrbokeh.system.atomic_files import require_safe_outputs
-    from mrbokeh.system.errors import InputError
+    from training.data.training_data import focal_stacks, training_data
     from training.export.model_card import card_path, write_card
 
-    if data and not fast:
-        raise InputError("--data measures what --fast loses: add --fast, or leave --data out")
     require_suffix(out, (".onnx",), "--out")
     require_safe_outputs((out, card_path(out)), (run, *(data or ())), overwrite)
-    if fast:
-        _export_fast(run, out, max_psnr_loss, data or [])
-        return
+    stacks = focal_stacks(training_data(data).stacks) if data else ()
+    facts, form = _exported_fast(run, out, max_psnr_loss, data or []) if fast else _exported(run, out)
+    write_card(run, out, facts, form, stacks)
+
+
+def _exported(run: Path, out: Path) -> "tuple[NetworkFacts, str]":
+    """Export and return the facts and the form in words."""
     from training.export.onnx_export import export_run
 
-    exported = export_run(run, out)
-    write_card(run, out, exported.facts)
-    tell(
-        f"{out}: ONNX Runtime differs from PyTorch by {exported.difference:.1e}; takes {_sizes(exported.facts)}",
-        difference=exported.difference,
-    )
+    done = export_run(run, out)
+    tell(f"{out}: ONNX Runtime differs from PyTorch by {done.difference:.1e}; takes {_sizes(done.facts)}", difference=done.difference)
+    return done.facts, "plain"
 
 
-def _export_fast(run: Path, out: Path, max_psnr_loss_db: float, data: list[Path]) -> None:
+def _exported_fast(run: Path, out: Path, max_psnr_loss_db: float, data: list[Path]) -> "tuple[NetworkFacts, str]":
     from training.export.fast_onnx import export_fast_run
-    from training.export.model_card import write_card
 
     done = export_fast_run(run, out, max_psnr_loss_db, data)
-    write_card(run, out, done.facts)
     against = "the truth" if data else "the trained network, on a made-up picture"
     tell(
         f"{out}: {done.naive_ms:.0f} ms plain, {done.fast_ms:.0f} ms fast, {done.naive_ms / done.fast_ms:.1f} times faster",
@@ -70,6 +67,7 @@ def _export_fast(run: Path, out: Path, max_psnr_loss_db: float, data: list[Path]
     )
     tell(f"loses {done.loss_db:.3f} dB of at most {max_psnr_loss_db:g} dB, measured against {against}; takes {_sizes(done.facts)}")
     tell(done.plan.words())
+    return done.facts, f"fast, loses {done.loss_db:.2g} dB, measured against {against}"
 
 
 def _sizes(facts: "NetworkFacts") -> str:

@@ -2,6 +2,7 @@
 
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import replace
 from enum import StrEnum
 from pathlib import Path
@@ -34,11 +35,11 @@ def fit_command(
     scenes: Scenes,
     out: Annotated[Path, typer.Option(help="Folder of the run: settings, checkpoint, curve, network.")],
     preset: Annotated[
-        Preset,
+        Preset | None,
         typer.Option(
-            help="paper: as published; demo: our gated form, learns in minutes on two cores; better: with kernels by place and colour."
+            help="paper (default): as published; demo: our gated form, learns in minutes on two cores; better: kernels by place and colour."
         ),
-    ] = Preset.paper,
+    ] = None,
     minutes: Annotated[float | None, typer.Option(min=0.01, max=100_000.0, help="Budget in minutes; the learning rate follows it.")] = None,
     epochs: Annotated[int | None, typer.Option(min=1, help="Budget in epochs, instead of minutes.")] = None,
     held_out: Annotated[
@@ -47,7 +48,7 @@ def fit_command(
             help="Stack to keep for testing (repeat for more), instead of the split of the data set; of scenes else a fifth is drawn."
         ),
     ] = None,
-    start_from: Annotated[
+    tune: Annotated[
         Path | None,
         typer.Option("--tune", help="A finished run to tune to these pictures, by default for 5 minutes: its settings and weights."),
     ] = None,
@@ -91,19 +92,19 @@ def fit_command(
     budget: dict[str, Any] = {"minutes": minutes, "epochs": epochs} if minutes is not None or epochs is not None else {}
     given = {"threads": threads, "device": device, "seed": seed}
     try:
-        settings = with_overrides(_begun_with(preset, settings_file, start_from), choices or ())
+        settings = with_overrides(_begun_with(preset, settings_file, tune, choices or (), out, overwrite), choices or ())
         settings = replace(settings, **budget | {name: value for name, value in given.items() if value is not None})
         if _number("RANK") == 0:
             _require_run(out)
             say(f"reading {', '.join(str(scene) for scene in scenes)}", err=True)  # loading PyTorch takes seconds
-        _fit(scenes, out, settings, held_out or [], overwrite)
+        _fit(scenes, out, settings, held_out or [], overwrite, tune)
     except InputError:
         if _number("LOCAL_RANK"):  # one sentence for each machine
             raise typer.Exit(2) from None
         raise
 
 
-def _fit(scenes: list[Path], out: Path, settings: "TrainSettings", held_out: list[str], overwrite: bool) -> None:
+def _fit(scenes: list[Path], out: Path, settings: "TrainSettings", held_out: list[str], overwrite: bool, tune: Path | None) -> None:
     from mrbokeh.stacks.focal_stack import FocalStack
     from mrbokeh.stacks.guessed_metres import metres_notes
     from training.data.training_data import training_data
@@ -117,7 +118,7 @@ def _fit(scenes: list[Path], out: Path, settings: "TrainSettings", held_out: lis
             say(data.split(held_out, settings.test_fraction, settings.seed).words(), err=True)
             if note := metres_notes(stack for stack in data.stacks if isinstance(stack, FocalStack)):
                 guess(note)
-        said = f"{out}: {_summary(fit(data, out, settings, held_out, overwrite))}"
+        said = f"{out}: {_summary(fit(data, out, settings, held_out, overwrite, start_from=tune))}"
     except StoppedError as stop:
         code, channel().kept = stop.exit_code, str(stop)
     except KeyboardInterrupt:
@@ -144,14 +145,22 @@ def _number(name: str) -> int:
     return int(os.environ.get(name, "0"))
 
 
-def _begun_with(preset: Preset, settings_file: Path | None, start_from: Path | None) -> "TrainSettings":
-    from training.fitting.settings import PRESETS, load_settings, tuned_settings
+def _begun_with(
+    preset: Preset | None, settings_file: Path | None, tune: Path | None, choices: Sequence[str], out: Path, overwrite: bool
+) -> "TrainSettings":
+    from training.fitting.checkpoint import FILE_NAME as CHECKPOINT_NAME
+    from training.fitting.run_folder import read_facts
+    from training.fitting.settings import FILE_NAME, PRESETS, load_settings, tuned_settings
 
-    if start_from is not None and settings_file is not None:
-        raise InputError("--tune takes the settings of its run, so --settings cannot be given with it: leave one of them out")
-    if start_from is not None:
-        return tuned_settings(start_from)
-    return PRESETS[preset]() if settings_file is None else load_settings(settings_file)
+    if tune is None:
+        return PRESETS[preset or Preset.paper]() if settings_file is None else load_settings(settings_file)
+    kept = [each for each in choices if each.startswith(("network.", "radiance_scale"))]
+    if preset is not None or settings_file is not None or kept:
+        which = kept[0] if kept else "--preset or --settings"
+        raise InputError(f"--tune takes the network and its ranges from {tune}, got {which} beside it: leave that out")
+    if not overwrite and (out / CHECKPOINT_NAME).exists():
+        return load_settings(out / FILE_NAME)
+    return tuned_settings(tune, is_tuned=bool(read_facts(tune).tuned_from))
 
 
 def _require_run(out: Path) -> None:

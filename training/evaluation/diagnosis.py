@@ -80,7 +80,7 @@ class Case:
     def more(self, times: float = 3.0) -> str:
         """Return the option for so many times the budget."""
         epochs = self.settings.epochs
-        return f"--epochs {math.ceil(times * epochs)}" if epochs else f"--minutes {times * (self.settings.minutes or 1.0):.2g}"
+        return f"--epochs {math.ceil(times * epochs)}" if epochs else f"--minutes {times * (self.settings.minutes or 1.0):g}"
 
     def at(self, share: float) -> CurvePoint | None:
         """Return the last point of the curve before this share of all steps."""
@@ -94,6 +94,7 @@ class Diagnosis:
     found: tuple[str, ...]
     looked: tuple[str, ...]
     unseen: tuple[str, ...]
+    has_pictures: bool
 
 
 def diagnose(folder: Path, given: Sequence[FocalStack] = ()) -> Diagnosis:
@@ -112,6 +113,7 @@ def diagnose(folder: Path, given: Sequence[FocalStack] = ()) -> Diagnosis:
         found=tuple(answer for answer in answers.values() if answer),
         looked=tuple(name for name, answer in answers.items() if answer is not None),
         unseen=tuple(name for name, answer in answers.items() if answer is None),
+        has_pictures=data is not None,
     )
 
 
@@ -164,10 +166,12 @@ def _finished(case: Case) -> str:
 
 def _steps(case: Case) -> str:
     step = case.progress.step
+    if not step:
+        return "No step was made, or none was kept: see what the run said when it ended."
     if step >= _LEAST_STEPS and not case.seen < _LEAST_SEEN:
         return ""
     seen = "" if math.isnan(case.seen) else f", in which each slice was seen {case.seen:.1f} times"
-    times = max(3.0, _LEAST_STEPS / max(step, 1), 0.0 if math.isnan(case.seen) else _LEAST_SEEN / max(case.seen, 1e-3))
+    times = max(3.0, _LEAST_STEPS / max(step, 1), 0.0 if math.isnan(case.seen) else _LEAST_SEEN / case.seen)
     return f"Too few steps: {step}{seen}; at least {_LEAST_STEPS}, and {_LEAST_SEEN:g} times, are wanted. Give {case.more(times)}."
 
 
@@ -189,7 +193,7 @@ def _falling(case: Case) -> str:
 def _diverged(case: Case) -> str:
     losses = [point.loss for point in case.progress.curve]
     best = min((case.progress.best_loss, *losses))
-    if all(map(math.isfinite, losses)) and not (losses and losses[-1] > FAR_ABOVE * best):
+    if not (losses and losses[-1] > FAR_ABOVE * best):
         return ""
     return f"It diverged: the loss ended at {losses[-1]:.2e}, its best was {best:.2e}. Give {lower_rate(case.settings)}."
 
@@ -199,7 +203,8 @@ def _overfitted(case: Case) -> str | None:
     looks, losses = case.looks, case.progress.curve
     best = max(looks, key=lambda look: look.held_out_psnr_db, default=None)
     more = "Give more scenes and viewpoints, crops (crop_px), depth_noise, or --set patience=5, which keeps the best"
-    if best is not None and looks[-1].held_out_psnr_db < best.held_out_psnr_db - _GAIN_DB and losses[-1].loss < best.loss:
+    kept_best = best is not None and case.progress.kept_step == best.step
+    if best is not None and not kept_best and looks[-1].held_out_psnr_db < best.held_out_psnr_db - _GAIN_DB and losses[-1].loss < best.loss:
         fell_db = best.held_out_psnr_db - looks[-1].held_out_psnr_db
         return (
             f"It overfitted: held-out slices were best at step {best.step} ({best.held_out_psnr_db:.2f} dB), then lost {fell_db:.2f} dB, "
@@ -208,7 +213,7 @@ def _overfitted(case: Case) -> str | None:
     if case.pictures is None or case.pictures.held_out is None or case.pictures.train is None:
         return None
     ahead, at_home = (each.gain_db(NETWORK, DISC) for each in (case.pictures.held_out, case.pictures.train))
-    if at_home - ahead <= _GAP_DB:
+    if at_home - ahead <= _GAP_DB or at_home < 0.0:
         return ""
     return (
         f"It learnt its pictures rather than the lens: it is {at_home:+.1f} dB over a disc of the right size on slices it learnt from, "
@@ -283,10 +288,12 @@ def _counted(case: Case) -> str | None:
         return None
     if case.pictures.left_out < 0.5:
         return ""
-    why = f"{case.pictures.by_depth:.0%} because depth is not trusted (least_confidence={case.settings.least_confidence:g})"
+    of_all = f"{case.pictures.left_out:.0%} of the pixels do not count"
+    if case.pictures.by_depth < 0.5 * case.pictures.left_out:
+        return f"{of_all}: they moved, lie beyond the border, show a board or are saturated. Give other pictures of the scene."
     return (
-        f"{case.pictures.left_out:.0%} of the pixels do not count, {why}. Give better depth (more views, more texture, `mrbokeh capture "
-        f"report` shows where), or --set least_confidence=0."
+        f"{of_all}, {case.pictures.by_depth:.0%} because depth is not trusted (least_confidence={case.settings.least_confidence:g}). Give "
+        f"better depth (more views, more texture, `mrbokeh capture report` shows where), or --set least_confidence=0."
     )
 
 

@@ -28,13 +28,16 @@ class RunData:
 
 
 def data_of_run(facts: RunFacts, given: Sequence[FocalStack] = ()) -> RunData | None:
-    """Return the data of a run, or None if any stack is missing. given: stacks to look among, before the places the run knew."""
+    """Return the data of a run, or None if a stack or a file of one is missing. given: stacks to take before those where the run knew."""
     stacks = {stack_name(stack): stack for stack in given}
     for name in (*facts.trained_on, *facts.held_out):
         folders = [Path(root) / name for root in facts.roots if (Path(root) / name / FILE_NAME).is_file()]
         if name not in stacks and not folders:
             return None
-        stacks.setdefault(name, stacks[name] if name in stacks else read_focal_stack(folders[0]))
+        stacks[name] = stack = stacks[name] if name in stacks else read_focal_stack(folders[0])
+        files = [stack.all_in_focus_path, stack.depth_path, *(stack.folder / each.path for each in stack.slices)]
+        if not all(path.is_file() for path in files):
+            return None
     apart = facts.held_out_slices
     whole = [(stacks[name], index) for name in facts.trained_on for index in range(len(stacks[name]))]
     test = [(stacks[name], index) for name in facts.held_out for index in range(len(stacks[name]))]

@@ -1,10 +1,12 @@
 """The card of an exported network, NAME.md beside NAME.onnx: what it is, learnt from which data, how good, how far, and how it was made."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from mrbokeh.renderers.onnx_network import NetworkFacts
+from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.system.atomic_files import atomic_path
 from training.data.stacks import stacks_words
 from training.evaluation.methods import DISC, NO_BLUR, blur_of, disc_method, network_method, plain_methods
@@ -31,10 +33,13 @@ def card_path(network: Path) -> Path:
     return network.with_suffix(".md")
 
 
-def write_card(run_folder: Path, network: Path, exported: NetworkFacts) -> None:
-    """Write the card of an exported run; held-out slices are measured with the file itself where they still lie."""
+def write_card(run_folder: Path, network: Path, exported: NetworkFacts, form: str, given: Sequence[FocalStack] = ()) -> None:
+    """Write the card of an exported run. form: of the file, in words. given: the run's stacks, if they are not where they were.
+
+    Held-out slices are measured with the file itself, where they are found.
+    """
     facts = read_facts(run_folder)
-    card = Card(read_settings(run_folder), facts, read_progress(run_folder), data_of_run(facts))
+    card = Card(read_settings(run_folder), facts, read_progress(run_folder), data_of_run(facts, given))
     lines = [
         f"# {network.stem}: {_lens_words(facts, exported)}",
         "",
@@ -43,7 +48,7 @@ def write_card(run_folder: Path, network: Path, exported: NetworkFacts) -> None:
         *_section("Data", _data(card)),
         *_section("How good", _figures(card, network)),
         *_section("Limits", _limits(card, exported)),
-        *_section("Made by", _made(card)),
+        *_section("Made by", {"Form": form, **_made(card)}),
     ]
     with atomic_path(card_path(network)) as temporary:
         temporary.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -66,7 +71,8 @@ def _data(card: Card) -> dict[str, str]:
         f"slices {', '.join(map(str, facts.held_out_slices))} of the only stack" if facts.held_out_slices else stacks_words(facts.held_out)
     )
     return {
-        "Learnt from": f"{stacks_words(facts.trained_on)}{slices}",
+        "Learnt from": f"{stacks_words(facts.trained_on)}{slices}"
+        + (f", begun from the run {facts.tuned_from}" if facts.tuned_from else ""),
         "Held out": apart or "nothing",
         "Licence of the data": " ".join(facts.licence.split()) or "unknown: ask whoever took the pictures before passing the network on",
     }

@@ -102,6 +102,16 @@ class Learner:
         """Return the learning rate of the last step."""
         return float(self._optimizer.param_groups[0]["lr"])
 
+    def begin_with(self, network: BlurNetwork) -> None:
+        """Begin with the weights of another network. Raises InputError where it has another shape."""
+        try:
+            for each in (self.network, self.average):
+                each.load_state_dict(network.state_dict())
+        except RuntimeError:
+            raise InputError(
+                "the run to start from has a network of another shape: leave settings of the network out, or train afresh"
+            ) from None
+
     def record_steps(self, batch: Batch) -> None:
         """Record the kernels of one pass for pictures of this size, forward and backward, to start them all at once (CUDA graphs)."""
         network = self.network

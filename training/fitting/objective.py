@@ -96,7 +96,9 @@ def learning_rate_factor(done: float, warm_up: float) -> float:
 
 
 def weighted_mean_square(error: Tensor, weight: Tensor) -> Tensor:
-    return (weight * error.square()).sum() / weight.sum().clamp(min=_TINY)
+    """Return the mean over pictures of each one's weighted mean, so that together they teach what they teach one by one."""
+    over = tuple(range(1, error.dim()))
+    return ((weight * error.square()).sum(dim=over) / weight.sum(dim=over).clamp(min=_TINY)).mean()
 
 
 def local_light_error(error: Tensor, counted: Tensor, largest_coc_px: float) -> Tensor:

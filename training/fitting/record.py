@@ -110,12 +110,12 @@ class DivergedError(InputError):
     """A training whose loss or weights are no longer numbers."""
 
 
-def diverged(task: Task, step: int) -> DivergedError:
-    """Return the error for a loss or weights that are no numbers after so many steps."""
+def diverged(task: Task, step: int, spoilt: bool = False) -> DivergedError:
+    """Return the error for a loss or weights that are no numbers after so many steps. spoilt: the pictures of the step have none either."""
     settings, kept = task.settings, task.folder / CHECKPOINT_NAME
-    if step == 0:
+    if step == 0 or spoilt:
         return DivergedError(
-            "the loss of the first step is not a number, before anything was learnt: expected pictures and circles of confusion "
+            f"the loss of step {step + 1} is not a number, and learning is not to blame: expected pictures and circles of confusion "
             "that are finite where they count; look for NaN and inf in the slices, all_in_focus.exr and depth.exr"
         )
     half = " and precision=float32" if settings.precision != "float32" else ""
@@ -164,8 +164,7 @@ class Record:
         if self._task.settings.sheets:
             write_sheet(self._task.folder, self._progress.step, look.rows)
         write_curve(self._task.folder, self._progress.curve)
-        if self._progress.elapsed_s - self._drawn_s >= _DRAWN_EVERY_S:
-            self._draw()
+        self._draw_if_due()
         return 0 < self._task.settings.patience <= self._progress.looks_since_best
 
     def save(self) -> None:
@@ -174,6 +173,11 @@ class Record:
             return
         save_checkpoint(self._checkpoint, self._progress, self._learner, self._rng)
         write_curve(self._task.folder, self._progress.curve)
+        self._draw_if_due()
+
+    def _draw_if_due(self) -> None:
+        if self._progress.elapsed_s - self._drawn_s >= _DRAWN_EVERY_S:
+            self._draw()
 
     def finish(self) -> None:
         """Take the last look and save the network: the last weights, or with patience the best ones.

@@ -27,7 +27,7 @@ from training.fitting.checkpoint import FILE_NAME as CHECKPOINT_NAME
 from training.fitting.distributed import Ranks
 from training.fitting.objective import learning_rate_factor, loss
 from training.fitting.record import Record, Task, diverged, lower_rate
-from training.fitting.run_folder import first_network
+from training.fitting.run_folder import build_network
 from training.fitting.settings import TrainSettings
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -87,8 +87,9 @@ class Run:
     def __init__(self, task: Task, ranks: Ranks, afresh: bool = False) -> None:
         self.task, self.settings, self.ranks = task, task.settings, ranks
         torch.set_num_threads(self.settings.threads or max(1, (os.cpu_count() or 1) // ranks.local_count))
-        self.learner = Learner(first_network(self.settings, task.facts), self.settings, ranks.device)
+        self.learner = Learner(build_network(self.settings, task.facts), self.settings, ranks.device)
         self._rng = np.random.default_rng(self.settings.seed)
+        self.is_restored = False
         self.progress = Progress() if afresh else self._restored()
         self._record = Record(task, self.learner, self.progress, self._rng)
         self._halo_px = math.ceil(task.facts.largest_coc_px / 2.0)
@@ -103,8 +104,7 @@ class Run:
         self._stopped_by: int | None = None
         self._started_s = time.monotonic() - self.progress.elapsed_s
         self._saved_s = self._looked_s = self.progress.elapsed_s
-        # Of a run that goes on, as measured so far; of a fresh one, 0 until its first steps have told.
-        self._step_s = self.progress.elapsed_s / max(self.progress.step, 1)
+        self._step_s = 0.0  # until some steps have told
         self._planned = 0
 
     def require_steps(self, least: int) -> None:
@@ -144,7 +144,10 @@ class Run:
     def _restored(self) -> Progress:
         path = self.task.folder / CHECKPOINT_NAME
         state = self.ranks.from_first(lambda: read_checkpoint(path))
-        return Progress() if state is None else restore_checkpoint(path, state, self.learner, self._rng)
+        if state is None:
+            return Progress()
+        self.is_restored = True
+        return restore_checkpoint(path, state, self.learner, self._rng)
 
     def _done(self) -> float:
         """Return the used fraction of the budget."""
@@ -238,7 +241,10 @@ class Run:
         with self.learner.autocast():
             error = loss(self.learner.network, batch, facts.radiance_scale, facts.largest_coc_px, settings) * share
         self.learner.backward(error)
-        return error.item()
+        value = error.item()
+        if not math.isfinite(value) and not all(bool(each.isfinite().all()) for each in (batch.rgb, batch.coc_px, batch.target)):
+            raise diverged(self.task, self.progress.step, spoilt=True)
+        return value
 
     def _agree(self, own_loss: float) -> float:
         """Average gradients and loss over all processes; all take the clock of the first, and stop when one is asked to."""

@@ -32,6 +32,7 @@ class RunFacts:
     commit: of the source, or None without git. lens_guessed: see NetworkFacts.
     f_numbers, focal_lengths_mm: (lowest, highest) of the data; None: those of `lens` alone.
     roots: folders in which the stacks lay by their names. licence: of the data set, "" if nobody knows. machine: that it was begun on.
+    tuned_from: name of the run that it started from, whose stacks are among trained_on; "" if it began afresh.
     """
 
     lens: Lens
@@ -49,6 +50,7 @@ class RunFacts:
     roots: tuple[str, ...] = ()
     licence: str = ""
     machine: str = ""
+    tuned_from: str = ""
 
     @property
     def lens_ranges(self) -> LensRanges:
@@ -90,21 +92,6 @@ def build_network(settings: TrainSettings, facts: RunFacts) -> BlurNetwork:
             grid=grid,
             lens_ranges=facts.lens_ranges,
         )
-
-
-def first_network(settings: TrainSettings, facts: RunFacts) -> BlurNetwork:
-    """Build the network that training begins with: a fresh one, or that of the run which the settings start from."""
-    network = build_network(settings, facts)
-    if settings.start_from is not None:
-        before = load_run(Path(settings.start_from))[0]
-        try:
-            network.load_state_dict(before.state_dict())
-        except RuntimeError:
-            raise InputError(
-                f"the network of {settings.start_from} has another shape than this run's: expected its settings of the network and, of a "
-                f"tiled one, pictures of its size, {facts.width_px}x{facts.height_px} px: train afresh"
-            ) from None
-    return network
 
 
 def save_network(folder: Path, network: BlurNetwork) -> None:

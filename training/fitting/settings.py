@@ -51,13 +51,11 @@ class TrainSettings:
     precision: of the network's arithmetic while training; the half types are for GPUs.
     patience: stop after so many looks at the held-out slices without a better one; 0 never stops early.
     sheets: write a sheet of predictions on held-out slices at every look, so that one can watch it learn.
-    start_from: folder of a finished run whose weights this one begins with, and whose ranges of radiance and blur it keeps; None: afresh.
     test_fraction: of the stacks (viewpoints) of scene folders, held out when no names are given; the paper's split is 80 : 20.
         Of a single stack every fourth slice is held out, none where this is 0. A data set has its own split.
     """
 
     network: NetworkSettings = field(default_factory=NetworkSettings)
-    start_from: str | None = None
     seed: int = 0
     minutes: float | None = None
     epochs: int | None = 50
@@ -218,11 +216,10 @@ def demo_settings(minutes: float = 2.5) -> TrainSettings:
     )
 
 
-def tuned_settings(run_folder: Path) -> TrainSettings:
-    """Return the settings to tune a finished run to other data: its own, for 5 minutes at a lower learning rate."""
+def tuned_settings(run_folder: Path, is_tuned: bool) -> TrainSettings:
+    """Return the settings to tune a finished run: its own, for 5 minutes, at a lower learning rate if it is not tuned itself."""
     own = read_settings(run_folder)
-    rate = TUNING_RATE * own.learning_rate
-    return replace(own, start_from=str(run_folder.resolve()), minutes=5.0, epochs=None, learning_rate=rate)
+    return replace(own, minutes=5.0, epochs=None, learning_rate=own.learning_rate * (1.0 if is_tuned else TUNING_RATE))
 
 
 def better_settings() -> TrainSettings:

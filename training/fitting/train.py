@@ -22,11 +22,11 @@ from training.fitting.distributed import Ranks, joined
 from training.fitting.record import HeldOutSlices, Task
 from training.fitting.run import LEAST_STEPS, Run
 from training.fitting.run_folder import FILE_NAME as FACTS_NAME
-from training.fitting.run_folder import RunFacts, machine_line, read_facts, source_commit, write_facts
+from training.fitting.run_folder import RunFacts, load_run, machine_line, read_facts, source_commit, write_facts
 from training.fitting.settings import FILE_NAME as SETTINGS_NAME
 from training.fitting.settings import TrainSettings, read_settings, write_settings
 
-_SAME_BLUR = 0.01
+_SAME = 0.01
 TUNING_STEPS = 20
 """The least of a run that starts from another: it has a lens already."""
 _MAY_DIFFER = ("threads", "device", "cache_mib", "checkpoint_every_s", "sheets")
@@ -39,17 +39,18 @@ def fit(
     held_out: Sequence[str] = (),
     overwrite: bool = False,
     least_steps: int = LEAST_STEPS,
+    start_from: Path | None = None,
 ) -> Progress:
     """Train, or continue training, into run_folder; a finished run is left as it is. held_out: see `TrainingData.split`.
 
     overwrite: restart an existing run. least_steps: raises InputError, and writes or removes nothing, if the first steps show that a
-    budget in minutes has no time for so many.
+    budget in minutes has no time for so many. start_from: a finished run whose weights a new one begins with; it is not needed to go on.
     Ctrl-C and SIGTERM end it after the step (StoppedError, a KeyboardInterrupt) with a checkpoint, from which the same call continues;
     while the first steps are timed, with nothing changed.
     Processes that torchrun started train together; all need the data, only the first needs the folder.
     """
     with joined(settings.device) as ranks:
-        return _fit(data, run_folder, settings, held_out, ranks, overwrite, least_steps)
+        return _fit(data, run_folder, settings, held_out, ranks, overwrite, least_steps, start_from)
 
 
 def _fit(
@@ -60,33 +61,43 @@ def _fit(
     ranks: Ranks,
     overwrite: bool,
     least_steps: int,
+    start_from: Path | None,
 ) -> Progress:
+    if start_from is not None and start_from.resolve() == run_folder.resolve():
+        raise InputError(f"{run_folder} is the run to start from, and stays as it is: give another --out")
     split = data.split(held_out, settings.test_fraction, settings.seed)
     pairs = PairSet(split.train, counting_of(settings), settings.cache_mib, split.train_slices)
     validation = HeldOutSlices(split.test, split.test_slices)
     _require_looks(settings, validation)
 
     def checked() -> RunFacts:
-        if overwrite:
-            return _facts_of(data, pairs, split, settings)
-        require_same_settings(run_folder, settings)
+        if not overwrite:
+            require_same_settings(run_folder, settings)
         facts = _facts_of(data, pairs, split, settings)
-        require_same_data(run_folder, facts)
+        before = None if overwrite or not _begun(run_folder, FACTS_NAME) else read_facts(run_folder)
+        if before is not None and before.tuned_from:
+            facts = _started(facts, before, before.tuned_from, settings)
+        elif start_from is not None:
+            facts = _started(facts, read_facts(start_from), start_from.resolve().name, settings)
+        if not overwrite:
+            require_same_data(run_folder, facts)
         return facts
 
     def begun(facts: RunFacts) -> None:
-        if run.progress.finished:
-            return  # with the commit and the machine that made it
         if overwrite and run_folder.exists():
             shutil.rmtree(run_folder)
         remove_unfinished(run_folder)
+        if run.is_restored:
+            return  # with the commit and the machine that it was begun on
         write_settings(run_folder, settings)
         write_facts(run_folder, facts)
 
     with closing(pairs):
         facts = ranks.from_first(checked)
         run = Run(Task(folder=run_folder, settings=settings, facts=facts, pairs=pairs, held_out=validation), ranks, afresh=overwrite)
-        run.require_steps(least_steps if settings.start_from is None else min(least_steps, TUNING_STEPS))
+        if start_from is not None and not run.is_restored:
+            run.learner.begin_with(load_run(start_from)[0])
+        run.require_steps(least_steps if start_from is None else min(least_steps, TUNING_STEPS))
         ranks.from_first(lambda: begun(facts))
         return run.train()
 
@@ -101,7 +112,7 @@ def _require_looks(settings: TrainSettings, validation: HeldOutSlices) -> None:
 
 def _facts_of(data: TrainingData, pairs: PairSet, split: Split, settings: TrainSettings) -> RunFacts:
     found = data.facts(pairs, several_lenses=settings.network.lens_inputs, several_sizes=not settings.network.tile_px)
-    facts = RunFacts(
+    return RunFacts(
         lens=found.lens,
         width_px=found.width_px,
         height_px=found.height_px,
@@ -118,19 +129,43 @@ def _facts_of(data: TrainingData, pairs: PairSet, split: Split, settings: TrainS
         licence="" if data.dataset is None else data.dataset.licence,
         machine=machine_line(),
     )
-    return facts if settings.start_from is None else _within(facts, Path(settings.start_from))
 
 
-def _within(facts: RunFacts, run_folder: Path) -> RunFacts:
-    """Return the facts with the ranges of the run that training starts from, on which its weights depend."""
-    before = read_facts(run_folder)
-    if facts.largest_coc_px > before.largest_coc_px * (1.0 + _SAME_BLUR):
+def _started(facts: RunFacts, before: RunFacts, name: str, settings: TrainSettings) -> RunFacts:
+    """Return the facts of a run that starts from another: with its ranges, on which its weights depend, and with what it has seen."""
+    if facts.largest_coc_px > before.largest_coc_px * (1.0 + _SAME):
         raise InputError(
-            f"{run_folder} has learned blur of up to {before.largest_coc_px:.1f} px, but these pictures have "
-            f"{facts.largest_coc_px:.1f} px: give smaller pictures, or train afresh"
+            f"{name} has learned blur of up to {before.largest_coc_px:.1f} px, but these pictures have {facts.largest_coc_px:.1f} px: "
+            f"give smaller pictures, or train afresh"
         )
-    ranges = {name: getattr(before, name) for name in ("largest_coc_px", "radiance_scale", "f_numbers", "focal_lengths_mm")}
-    return replace(facts, **ranges)
+    if seen := [each for each in facts.held_out if each in before.trained_on]:
+        raise InputError(f"{name} was trained on {seen[0]}, which cannot be held out later: hold out another with --held-out")
+    sizes = [(each.width_px, each.height_px) for each in (facts, before)]
+    if settings.network.tile_px and sizes[0] != sizes[1]:
+        raise InputError(
+            f"{name} has tiles for pictures of {sizes[1][0]}x{sizes[1][1]} px, got {sizes[0][0]}x{sizes[0][1]} px: train afresh"
+        )
+    if settings.network.lens_inputs:
+        _require_known_lens(facts, before, name)
+        facts = replace(facts, f_numbers=before.f_numbers, focal_lengths_mm=before.focal_lengths_mm)
+    return replace(
+        facts,
+        largest_coc_px=before.largest_coc_px,
+        radiance_scale=before.radiance_scale,
+        trained_on=tuple(dict.fromkeys((*before.trained_on, *facts.trained_on))),
+        roots=tuple(dict.fromkeys((*before.roots, *facts.roots))),
+        licence="; ".join(dict.fromkeys(each for each in (before.licence, facts.licence) if each)),
+        tuned_from=name,
+    )
+
+
+def _require_known_lens(facts: RunFacts, before: RunFacts, name: str) -> None:
+    for what, known, now in zip(("f-numbers", "focal lengths"), before.lens_ranges, facts.lens_ranges, strict=True):
+        if now[0] < known[0] * (1.0 - _SAME) or now[1] > known[1] * (1.0 + _SAME):
+            raise InputError(
+                f"{name} takes {what} from {known[0]:.3g} to {known[1]:.3g}, but these pictures have {now[0]:.3g} to {now[1]:.3g}: "
+                f"give pictures within, or train afresh"
+            )
 
 
 def _is_guessed(stack: Source) -> bool:

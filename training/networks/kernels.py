@@ -40,6 +40,10 @@ def pointwise(maps: Tensor, convolution: nn.Conv2d) -> Tensor:
     """Return a 1x1 convolution in groups; on a GPU that learns as one product of matrices, since grouped ones are slow backward there."""
     if maps.device.type == "cpu" or torch.compiler.is_exporting() or not torch.is_grad_enabled():
         return convolution(maps)  # type: ignore[no-any-return]
+    return pointwise_product(maps, convolution)
+
+
+def pointwise_product(maps: Tensor, convolution: nn.Conv2d) -> Tensor:
     batch, _, height, width = maps.shape
     weight = convolution.weight.view(convolution.groups, -1, convolution.in_channels // convolution.groups)
     product = weight @ maps.reshape(batch, convolution.groups, -1, height * width)
