@@ -116,4 +116,3 @@ def test_the_command_writes_a_fast_network(tmp_path: Path) -> None:
     out = tmp_path / "fast.onnx"
     told = printed_by(export_command, run, "--out", out, "--fast", "--max-psnr-loss", 0.1)
     assert "times faster" in told and "of at most 0.1 dB" in told and out.is_file()
-    refused("add --fast", printed_by, export_command, run, "--out", tmp_path / "x.onnx", "--data", run)
