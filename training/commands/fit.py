@@ -50,7 +50,10 @@ def fit_command(
     ] = None,
     tune: Annotated[
         Path | None,
-        typer.Option("--tune", help="A finished run to tune to these pictures, by default for 5 minutes: its settings and weights."),
+        typer.Option(
+            "--tune",
+            help="A finished run to go on from, with other pictures of its lens and its own settings, for 5 minutes.",
+        ),
     ] = None,
     settings_file: Annotated[Path | None, typer.Option("--settings", help="A settings.json to start from instead of a preset.")] = None,
     choices: Annotated[
@@ -81,7 +84,7 @@ def fit_command(
 
     Example: mrbokeh train fit scenes/attic --preset demo --minutes 2.5 --held-out view_3 --out runs/attic
 
-    Example: mrbokeh train fit another_50mm/view_1 --tune runs/50mm --out runs/another
+    Example: mrbokeh train fit more_views --tune runs/50mm --out runs/more
 
     Example: mrbokeh train fit lens_50mm --set network.tile_px=96 --set network.overlap_px=24 --set loss_scope=tile --out runs/tiles
 
