@@ -3,8 +3,7 @@
 import typer
 
 from training.commands.ablate import ablate_command
-from training.commands.doctor import doctor_command
-from training.commands.evaluate import evaluate_command
+from training.commands.evaluate import doctor_command, evaluate_command
 from training.commands.export import export_command
 from training.commands.fit import fit_command
 
