@@ -13,9 +13,23 @@ from mrbokeh.system.errors import InputError, require_file
 if TYPE_CHECKING:
     import onnxruntime
 
-PROVIDERS = {"tensorrt": "TensorrtExecutionProvider", "cuda": "CUDAExecutionProvider", "openvino": "OpenVINOExecutionProvider"}
+PROVIDERS = {
+    "tensorrt": "TensorrtExecutionProvider",
+    "cuda": "CUDAExecutionProvider",
+    "directml": "DmlExecutionProvider",
+    "coreml": "CoreMLExecutionProvider",
+    "openvino": "OpenVINOExecutionProvider",
+}
 CPU = "CPUExecutionProvider"
-_PACKAGES = {"tensorrt": "onnxruntime-gpu and TensorRT", "cuda": "onnxruntime-gpu", "openvino": "onnxruntime-openvino"}
+_PACKAGES = {
+    "tensorrt": "onnxruntime-gpu and TensorRT",
+    "cuda": "onnxruntime-gpu",
+    "directml": "onnxruntime-directml (Windows)",
+    "coreml": "onnxruntime on a Mac",
+    "openvino": "onnxruntime-openvino",
+}
+# Apple's neural engine computes in 16 bits; CPU and GPU keep the network's 32. NeuralNetwork, the older default, lacks most operators.
+_OPTIONS = {"CoreMLExecutionProvider": {"ModelFormat": "MLProgram", "MLComputeUnits": "CPUAndGPU"}}
 # As onnxruntime 1.20 to 1.31 say it: core/graph/model.cc and model_load_utils.h.
 _NEWER_IR = re.compile(r"IR version: (\d+), max supported IR version: (\d+)")
 _NEWER_OPSET = re.compile(r"Opset (\d+) is under development.*till opset (\d+)", re.DOTALL)
@@ -24,8 +38,8 @@ _NEWER_OPSET = re.compile(r"Opset (\d+) is under development.*till opset (\d+)",
 def open_session(path: Path, threads: int = 0, providers: Sequence[str] | None = None) -> "onnxruntime.InferenceSession":
     """Open the network at `path`, ready to run.
 
-    threads: of the CPU, 0 takes all cores. providers: names out of "tensorrt", "cuda", "openvino", "cpu", best first, all of which must
-    be there; None takes those that are there. What none of them can compute is left to the CPU.
+    threads: of the CPU, 0 takes all cores. providers: names out of PROVIDERS and "cpu", best first, all of which must be there; None takes
+    those that are there. What none of them can compute is left to the CPU.
     Raises InputError for a file that is no network and for a provider that is not installed.
     """
     import onnxruntime
@@ -33,13 +47,14 @@ def open_session(path: Path, threads: int = 0, providers: Sequence[str] | None =
     require_file(path, "a network", f": make one with `mrbokeh train export RUN --out {path}`")
     chosen = _chosen(providers, onnxruntime.get_available_providers())
     try:
-        return onnxruntime.InferenceSession(str(path), _options(threads), providers=chosen)
+        options = [_OPTIONS.get(each, {}) for each in chosen]
+        return onnxruntime.InferenceSession(str(path), _options(threads), providers=chosen, provider_options=options)
     except Exception as error:  # onnxruntime has no common base class for "this is not a model"
         raise InputError(_unopened(path, str(error))) from None
 
 
 def provider_of(session: "onnxruntime.InferenceSession") -> str:
-    """Return the short name of the provider that comes first in an open session: "cpu", "cuda", "tensorrt" or "openvino".
+    """Return the short name of the provider that comes first in an open session: "cpu" or one of PROVIDERS.
 
     A provider that is installed but finds no device is dropped by ONNX Runtime while the session opens, and is not named here.
     """
@@ -83,6 +98,7 @@ def _options(threads: int) -> "onnxruntime.SessionOptions":
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
     options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_ALL
-    options.enable_mem_pattern = False  # sizes change from call to call, and a pattern belongs to one size
+    # Sizes change from call to call, and a pattern belongs to one size; DirectML takes none.
+    options.enable_mem_pattern = False
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     return options

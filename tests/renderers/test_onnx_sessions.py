@@ -8,10 +8,10 @@ import onnxruntime
 import pytest
 from onnx import helper
 
-from mrbokeh.renderers.onnx_sessions import CPU, _chosen, open_session, provider_of
+from mrbokeh.renderers.onnx_sessions import CPU, PROVIDERS, _chosen, open_session, provider_of
 from mrbokeh.system.errors import InputError
 
-ALL = ["TensorrtExecutionProvider", "CUDAExecutionProvider", "OpenVINOExecutionProvider", CPU]
+ALL = [*PROVIDERS.values(), CPU]
 
 
 @pytest.fixture
@@ -28,11 +28,7 @@ def test_it_runs_on_the_cpu_and_what_is_not_there_is_said_by_name(doubling: Path
     session = open_session(doubling, threads=1, providers=["cpu"])
     assert provider_of(session) == "cpu"
     np.testing.assert_array_equal(session.run(["y"], {"x": np.array([1.0, 2.0], np.float32)})[0], [2.0, 4.0])
-    missing = next(
-        name
-        for name, full in (("tensorrt", ALL[0]), ("cuda", ALL[1]), ("openvino", ALL[2]))
-        if full not in onnxruntime.get_available_providers()
-    )
+    missing = next(name for name, full in PROVIDERS.items() if full not in onnxruntime.get_available_providers())
     with pytest.raises(InputError, match=f"'{missing}' is not in this ONNX Runtime: install"):
         open_session(doubling, providers=[missing])
     with pytest.raises(InputError, match="got 'tpu'"):
@@ -42,6 +38,7 @@ def test_it_runs_on_the_cpu_and_what_is_not_there_is_said_by_name(doubling: Path
 def test_a_wish_is_kept_else_the_fastest_comes_first_and_the_cpu_last() -> None:
     assert _chosen(None, ALL) == ALL
     assert _chosen(None, [CPU, "AzureExecutionProvider", "CUDAExecutionProvider"]) == ["CUDAExecutionProvider", CPU]
+    assert _chosen(None, [CPU, "CoreMLExecutionProvider"]) == ["CoreMLExecutionProvider", CPU]
     assert _chosen(["openvino"], ALL) == ["OpenVINOExecutionProvider", CPU]
     assert _chosen(["cpu"], ALL) == [CPU]
 

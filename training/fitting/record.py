@@ -167,13 +167,19 @@ class Record:
         self._draw_if_due()
         return 0 < self._task.settings.patience <= self._progress.looks_since_best
 
-    def save(self) -> None:
-        """Write the checkpoint and the curve; not with weights that are no numbers, of which the next step tells."""
+    def save(self, stopped: bool = False) -> None:
+        """Write the checkpoint and the curve; not with weights that are no numbers, of which the next step tells.
+
+        stopped: the run ends here for now, and its page says so.
+        """
         if not self._learner.is_finite():
             return
         save_checkpoint(self._checkpoint, self._progress, self._learner, self._rng)
         write_curve(self._task.folder, self._progress.curve)
-        self._draw_if_due()
+        if stopped:
+            self._draw(stopped)
+        else:
+            self._draw_if_due()
 
     def _draw_if_due(self) -> None:
         if self._progress.elapsed_s - self._drawn_s >= _DRAWN_EVERY_S:
@@ -197,9 +203,10 @@ class Record:
         self.save()
         self._draw()
 
-    def _draw(self) -> None:
+    def _draw(self, stopped: bool = False) -> None:
         drawn, task = draw_curve(self._task.folder, self._progress.curve), self._task
-        write_run_page(task.folder, drawn, self._progress, (task.settings, task.facts), slices=(len(task.pairs), len(task.held_out)))
+        slices = (len(task.pairs), len(task.held_out))
+        write_run_page(task.folder, drawn, self._progress, (task.settings, task.facts), slices, stopped)
         self._drawn_s = self._progress.elapsed_s
 
 

@@ -135,7 +135,8 @@ class Run:
             self._say_plan()
             self._loop()
             if self._stopped_by is not None:
-                self._save()
+                if self.ranks.first:
+                    self._record.save(stopped=True)
                 kept = f"the checkpoint in {self.task.folder} is kept, run the same command again (without --overwrite) to go on"
                 raise StoppedError(self._stopped_by, kept)
             self.ranks.from_first(self._record.finish)
@@ -269,12 +270,9 @@ class Run:
             if self.settings.minutes is not None:
                 self._looked_s += max(0.0, 9.0 * (self._looked_s - now_s) - self.settings.validate_every_s)
         if now_s - self._saved_s >= self.settings.checkpoint_every_s:
-            self._save()
+            if self.ranks.first:
+                self._record.save()
             self._saved_s = now_s
-
-    def _save(self) -> None:
-        if self.ranks.first:
-            self._record.save()
 
     def _bars(self) -> AbstractContextManager[Bars]:
         return progress_bars() if self.ranks.first else nullcontext(Bars(disable=True))

@@ -29,16 +29,18 @@ _STYLE = """
 
 
 def write_run_page(
-    folder: Path, curve_svg: str, progress: Progress, made_of: tuple[TrainSettings, RunFacts], slices: tuple[int, int]
+    folder: Path, curve_svg: str, progress: Progress, made_of: tuple[TrainSettings, RunFacts], slices: tuple[int, int], stopped: bool
 ) -> None:
-    """Write the page. slices: to learn from, and held-out ones that are looked at."""
+    """Write the page. slices: to learn from, and held-out ones that are looked at. stopped: before its end, to be gone on with."""
     settings, facts = made_of
     rows = facts_of_run(progress, settings, facts, slices[0])
+    if stopped:
+        rows["State"] = f"stopped, the same command goes on; {rows['State']}"
     strips = list(_strips(folder / SHEETS, slices[1]))
     words = "The sharp picture, what the network made of it step by step, and the photograph. Scroll sideways."
     none = "Nothing is held out, so nothing can tell how good the network is." if not slices[1] else "No sheets are written (sheets=false)."
     blocks = [
-        "" if progress.finished else _RELOAD,
+        "" if progress.finished or stopped else _RELOAD,
         f"<h1>{html.escape(folder.resolve().name)}</h1>",
         table(("", ""), ([cell(name), cell(value)] for name, value in rows.items())),
         section("Curves", "Training loss (smoothed), PSNR of held-out slices, learning rate.", [f'<div class="curve">{curve_svg}</div>']),
@@ -73,7 +75,7 @@ def _state(progress: Progress, settings: TrainSettings, pairs: int) -> str:
     if progress.finished:
         return f"finished: {steps} ({budget})" + (", stopped early" if progress.stopped_early else "")
     done = progress.elapsed_s / (60.0 * settings.minutes) if settings.minutes else progress.pictures / ((settings.epochs or 1) * pairs)
-    return f"training: {steps} of about {_duration(progress.elapsed_s / max(done, 1e-6))} ({budget})"
+    return f"{steps} of about {_duration(progress.elapsed_s / max(done, 1e-6))} ({budget})"
 
 
 def _duration(seconds: float) -> str:
