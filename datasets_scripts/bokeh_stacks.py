@@ -9,9 +9,12 @@ share of the work each. With --pull OUT.pull/ becomes one test view at many focu
 It needs Mitsuba 3 (`pip install -e '.[datasets]'`) and LLVM's library (Debian: libllvm19).
 """
 
-from collections.abc import Iterator
+import os
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, replace
 from functools import cached_property, partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -42,6 +45,7 @@ from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.scene.mitsuba.mitsuba_tracer import load
 from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset
+from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 
 NOISE_FLOOR = "noiseFloorDb"
@@ -84,6 +88,12 @@ class StackView:
         first, second = (tracer.traced(opening, samples // 2).rgb + tracer.lamp_light(opening, lamp_rays // 2) for tracer in self._tracers)
         return 0.5 * (first + second), float(psnr(first, second) + _MEAN_OVER_DIFFERENCE_DB)
 
+    def make(self) -> None:
+        """Make what is missing of the view."""
+        for job in self.jobs():
+            if not job.done:
+                job.make()
+
     def _make_slice(self, index: int) -> None:
         rgb, noise_floor_db = self.defocused(self._plan.traced_opening(self.focus_distances_m[index]))
         write_camera_rgb(self.folder / slice_name(index), rgb, None, attributes={NOISE_FLOOR: noise_floor_db})
@@ -111,9 +121,12 @@ class StackView:
         self.__dict__.pop("_tracers", None)  # tens of megabytes, of a view that is done
 
 
-def make_bokeh_stacks(out: Path, plan: StacksPlan, only: tuple[str, ...] = (), *, overwrite: bool = False) -> FocalStackDataset | None:
+def make_bokeh_stacks(
+    out: Path, plan: StacksPlan, only: tuple[str, ...] = (), *, workers: int = 1, overwrite: bool = False
+) -> FocalStackDataset | None:
     """Write what is missing of a set, the manifest last. Return the set, or None where only some scenes were asked for.
 
+    workers: processes that share cores and views; their rays are the same from any number of them, only the order of sums is not.
     Raises InputError where `out` holds something else, unless `overwrite` says to replace it.
     """
     _require_scenes(plan, only)
@@ -122,7 +135,7 @@ def make_bokeh_stacks(out: Path, plan: StacksPlan, only: tuple[str, ...] = (), *
     _claim(out, plan, views, overwrite)
     write_lens(out / "lens.json", plan.lens(plan.focus_distances_m[0]))
     chosen = [view for view, name in zip(views, plan.names, strict=True) if not only or _place(name)[0] in only]
-    make_missing((job for view in chosen for job in view.jobs()), "tracing stacks")
+    _trace(chosen, workers)
     if not all(job.done for view in views for job in view.jobs()):
         return None
     return _dataset(out, plan)
@@ -139,6 +152,18 @@ def make_pull(out: Path, plan: StacksPlan, frames: int, *, overwrite: bool = Fal
     _claim(out, plan, [view], overwrite, {"pull_frames": frames})
     make_missing(view.jobs(), "tracing a focus pull")
     return out / name
+
+
+def _trace(views: Sequence[StackView], workers: int) -> None:
+    if workers == 1:
+        make_missing((job for view in views for job in view.jobs()), "tracing stacks")
+        return
+    waiting = [view for view in views if not all(job.done for job in view.jobs())]
+    threads = max(1, (os.cpu_count() or 1) // workers)
+    with ProcessPoolExecutor(workers, get_context("spawn"), initializer=load, initargs=(threads,)) as pool:
+        running = [pool.submit(view.make) for view in waiting]
+        for done in track(as_completed(running), "tracing views", total=len(running)):
+            done.result()
 
 
 def _claim(out: Path, plan: StacksPlan, views: list[StackView], overwrite: bool, more: dict[str, int] | None = None) -> None:
@@ -193,6 +218,7 @@ def main(
     f_number: Annotated[float, typer.Option(help="Of the lens, 0 for that of the size; sets of several make a family of lenses.")] = 0.0,
     pull: Annotated[int, typer.Option(help="Also OUT.pull: one test view at so many focus distances.")] = 0,
     seed: Annotated[int, typer.Option(help="Viewpoints and sampling; scenes are numbered.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that trace, each a view.")] = 1,
     overwrite: Overwrite = False,
 ) -> None:
     """Trace the missing pictures of a set of focal stacks."""
@@ -202,7 +228,7 @@ def main(
         chosen = replace(SIZES[size], samples=samples) if samples else SIZES[size]
         chosen = replace(chosen, f_number=f_number) if f_number else chosen
         plan = StacksPlan(shape, chosen, seed)
-        dataset = make_bokeh_stacks(out, plan, tuple(scenes.split(",")) if scenes else (), overwrite=overwrite)
+        dataset = make_bokeh_stacks(out, plan, tuple(scenes.split(",")) if scenes else (), workers=workers, overwrite=overwrite)
         if pull:
             typer.echo(f"{make_pull(out.with_name(out.name + '.pull'), plan, pull, overwrite=overwrite)}: focus pull complete")
     typer.echo(f"{out}: " + ("other scenes are missing still" if dataset is None else _summary(dataset)))

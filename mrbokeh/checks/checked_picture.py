@@ -44,21 +44,28 @@ class Storage:
     step: float
     mixes: bool = False
 
-    @property
-    def dark_step(self) -> float:
-        """Return how far below 0 storing can bring light: not in EXR; colours of lossy films ring over the dark beside them."""
+    def dark_step(self, rgb: Rgb) -> Plane:
+        """Return how far below 0 storing can bring light, for each pixel.
+
+        Not in EXR of our primaries; of others, rounding of a bright channel can. Colours of lossy films ring over the dark beside them.
+        """
         if self.is_linear:
-            return 0.0
-        return float("inf") if self.step >= _LOSSY_STEP else self.step / _STEEPEST
+            return self._rounded(np.abs(np.nan_to_num(rgb, posinf=0.0, neginf=0.0)))[..., 0] * np.float32(self.mixes)
+        lossy = self.step >= _LOSSY_STEP
+        return np.full(rgb.shape[:2], np.inf if lossy else self.step / _STEEPEST, np.float32)
+
+    def _rounded(self, light: Rgb) -> Rgb:
+        """Return by how much rounding in the file can change ours; a row of the matrix from AP0 has 4.05 in sum."""
+        if self.mixes:
+            light = np.broadcast_to(np.float32(4.1) * light.max(axis=2, keepdims=True), light.shape)
+        return np.float32(self.step) * light
 
     def changed(self, rgb: Rgb, plate_rgb: Rgb) -> Bool[np.ndarray, "height width"]:
         """Return where two pictures differ by more than storing them explains. NaN differs from everything."""
         if self.is_linear:
             known = np.nan_to_num(rgb, posinf=0.0, neginf=0.0)
             light = np.maximum(np.abs(known), np.abs(plate_rgb))
-            # A row of the matrix from AP0 has 4.05 in sum.
-            scale = 4.1 * light.max(axis=2, keepdims=True) if self.mixes else light
-            allowed = self.step * scale + (1e-7 if self.step else 0.0)
+            allowed = self._rounded(light) + (1e-7 if self.step else 0.0)
             return ~((np.abs(known - plate_rgb) <= allowed) & np.isfinite(rgb)).all(axis=2)
         # The curve is nowhere steeper than its foot: what differs less in light than that can hide need not be encoded.
         differs = ~(np.abs(rgb - plate_rgb) <= self.step / _STEEPEST).all(axis=2)

@@ -91,23 +91,25 @@ def check_numbers(report: CheckReport, picture: CheckedPicture, plate_rgb: Rgb |
     below the plate counts or, without one, what no colour of BT.2020 has. What storing explains is allowed; lossy films cannot be judged.
     """
     light = _in_bt2020(picture.rgb) if plate_rgb is None else picture.rgb - np.minimum(plate_rgb, np.float32(0.0))
-    _check(report, picture.name, picture.rgb, picture.alpha, light, DARK_SLACK + picture.storage.dark_step)
+    _check(report, picture.name, picture.rgb, picture.alpha, light, DARK_SLACK + picture.storage.dark_step(picture.rgb))
     for name, layer in picture.layers.items():
-        _check(report, f"{picture.name}, layer {name}", layer.rgb, layer.alpha, layer.rgb, DARK_SLACK)
+        _check(
+            report, f"{picture.name}, layer {name}", layer.rgb, layer.alpha, layer.rgb, np.full(layer.alpha.shape, DARK_SLACK, np.float32)
+        )
 
 
 def _in_bt2020(rgb: Rgb) -> Rgb:
     return np.where(np.isfinite(rgb), convert(np.nan_to_num(rgb, posinf=0.0, neginf=0.0), BT2020_from_rec709), np.float32(np.nan))
 
 
-def _check(report: CheckReport, where: str, rgb: Rgb, alpha: Plane | None, light: Rgb, slack: float) -> None:
-    """Check one picture or layer. light: the picture as far as it must not be negative."""
+def _check(report: CheckReport, where: str, rgb: Rgb, alpha: Plane | None, light: Rgb, slack: Plane) -> None:
+    """Check one picture or layer. light: the picture as far as it must not be negative by more than the slack."""
     lost = ~np.isfinite(rgb).all(axis=2)
     if alpha is not None:
         lost |= ~np.isfinite(alpha)
     _note(report, "nan", where, lost, "NaN or infinity", float(lost.sum()), 0.0)
     dark = np.where(np.isfinite(light), light, np.float32(0.0)).min(axis=2)
-    _note(report, "negative", where, dark < -slack, "negative light", float(dark.min()), -slack)
+    _note(report, "negative", where, dark < -slack, "negative light", float(dark.min()), -float(slack.min()))
     if alpha is not None:
         known = np.where(np.isfinite(alpha), alpha, np.float32(0.0))
         above, below = known > 1.0 + ALPHA_SLACK, known < -ALPHA_SLACK

@@ -61,9 +61,10 @@ def host(
     from mrbokeh.system.atomic_files import atomic_path, refuse_existing
     from mrbokeh.system.errors import InputError
 
-    if out.exists() and not out.is_dir():
-        raise InputError(f"expected a folder for the file, but {out} is a file: name a folder")
-    target = out / _FILES[program].target
+    name = _FILES[program].target
+    if out.suffix.lower() == Path(name).suffix or (out.exists() and not out.is_dir()):
+        raise InputError(f"expected a folder, in which {name} is put, got {out}: name a folder")
+    target = out / name
     refuse_existing(target, overwrite)
     with atomic_path(target) as temporary:
         temporary.write_text(written(program), encoding="utf-8")

@@ -17,8 +17,8 @@ from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.compositing.plate import plate_of
 from mrbokeh.demo.plan import DATA
 from mrbokeh.images.color import linear_to_srgb
-from mrbokeh.images.exr_io import ExrPart, write_exr
-from mrbokeh.images.image_io import write_image, write_layer
+from mrbokeh.images.exr_io import AP1, ExrPart, rec709_from_chromaticities, write_exr
+from mrbokeh.images.image_io import read_layer, write_image, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
@@ -137,6 +137,22 @@ def test_alpha_out_of_range_and_negative_light_are_found_but_not_where_the_plate
     write_image(files["out"], picture, half=False)
     found = checked(files, 1)["findings"]
     assert [each["check"] for each in found] == ["negative"] and found[0]["value"] == pytest.approx(-0.02, abs=1e-6)
+
+
+def test_rounding_in_other_primaries_is_no_negative_light(tmp_path: Path) -> None:
+    """Pure Rec.709 colours of up to 8 in ACEScg and half floats: their dark channels come back below 0, by thousandths at most."""
+    pure = np.eye(3, dtype=np.float64)[np.random.default_rng(2).integers(0, 3, SIZE)] * np.linspace(1.0, 8.0, SIZE[1])[:, None]
+    write_image(tmp_path / "plate.exr", pure.astype(np.float32), half=False)
+    matrix = rec709_from_chromaticities(AP1)
+    assert matrix is not None
+    for dark, code in ((0.0, 0), (-0.2, 1)):
+        pure[4, 4, pure[4, 4].argmin()] = dark
+        coded = np.linalg.solve(matrix, pure.reshape(-1, 3).T).T.reshape(pure.shape).astype(np.float16)
+        planes = {name: np.ascontiguousarray(coded[..., i]) for i, name in enumerate("RGB")}
+        write_exr(tmp_path / "aces.exr", ExrPart(planes, attributes={"chromaticities": AP1}))
+        assert read_layer(tmp_path / "aces.exr").rgb.min() < -5e-4
+        found = found_by(tmp_path / "aces.exr", "--against", tmp_path / "plate.exr", expected=code)
+        assert kinds(found) == ({"negative"} if code else set())
 
 
 @pytest.mark.parametrize("factor", [1.02, 0.97])
