@@ -13,7 +13,7 @@ from training.evaluation.methods import DISC, NO_BLUR, blur_of, disc_method, net
 from training.evaluation.run_data import RunData, affordable, data_of_run, scored_on
 from training.fitting.checkpoint import Progress, read_progress
 from training.fitting.run_folder import RunFacts, read_facts
-from training.fitting.settings import TrainSettings, nearest_preset, read_settings
+from training.fitting.settings import TrainSettings, read_settings, settings_words
 
 _MOST_SLICES = 12
 _NAME = "this network"
@@ -67,13 +67,10 @@ def _lens_words(facts: RunFacts, exported: NetworkFacts) -> str:
 def _data(card: Card) -> dict[str, str]:
     facts = card.facts
     slices = "" if card.data is None else f", {len(card.data.train)} slices"
-    apart = (
-        f"slices {', '.join(map(str, facts.held_out_slices))} of the only stack" if facts.held_out_slices else stacks_words(facts.held_out)
-    )
     return {
         "Learnt from": f"{stacks_words(facts.trained_on)}{slices}"
         + (f", begun from the run {facts.tuned_from}" if facts.tuned_from else ""),
-        "Held out": apart or "nothing",
+        "Held out": facts.held_out_words,
         "Licence of the data": " ".join(facts.licence.split()) or "unknown: ask whoever took the pictures before passing the network on",
     }
 
@@ -117,10 +114,10 @@ def _limits(card: Card, exported: NetworkFacts) -> dict[str, str]:
 
 
 def _made(card: Card) -> dict[str, str]:
-    (preset, changed), progress = nearest_preset(card.settings), card.progress
+    progress = card.progress
     stopped = f", of which those of step {progress.kept_step} are kept" if progress.kept_step != progress.step else ""
     return {
-        "Settings": f"preset `{preset}`" + (f" with {', '.join(changed)}" if changed else "") + f", seed {card.settings.seed}",
+        "Settings": settings_words(card.settings),
         "Training": f"{progress.step} steps{stopped}, {progress.pictures} {'crops' if card.settings.crop_px else 'pictures'}, "
         f"{progress.elapsed_s:.0f} s",
         "Machine": card.facts.machine or "unknown",

@@ -14,6 +14,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import lens_from_json, lens_to_json
 from mrbokeh.system.atomic_files import atomic_path, read_json, write_json
 from mrbokeh.system.errors import InputError
+from training.data.stacks import stacks_words
 from training.fitting.settings import TrainSettings, read_settings
 from training.networks.network import BlurNetwork, LensRanges, TileGrid
 
@@ -56,6 +57,11 @@ class RunFacts:
     def lens_ranges(self) -> LensRanges:
         one_f_number, one_focal_length_mm = (self.lens.f_number,) * 2, (self.lens.focal_length_mm,) * 2
         return self.f_numbers or one_f_number, self.focal_lengths_mm or one_focal_length_mm
+
+    @property
+    def held_out_words(self) -> str:
+        slices = f"slices {', '.join(map(str, self.held_out_slices))} of the only stack" if self.held_out_slices else ""
+        return slices or stacks_words(self.held_out) or "nothing"
 
     def to_json(self) -> dict[str, Any]:
         return {"format": FORMAT, "version": VERSION, **vars(self), "lens": lens_to_json(self.lens)}

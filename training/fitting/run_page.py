@@ -12,7 +12,7 @@ from mrbokeh.system.html_page import cell, inline_figure, section, table, write_
 from training.data.stacks import stacks_words
 from training.fitting.checkpoint import Progress
 from training.fitting.run_folder import RunFacts
-from training.fitting.settings import TrainSettings, nearest_preset
+from training.fitting.settings import TrainSettings, settings_words
 
 FILE_NAME = "index.html"
 SHEETS = "sheets"
@@ -51,18 +51,16 @@ def write_run_page(
 
 def facts_of_run(progress: Progress, settings: TrainSettings, facts: RunFacts, pairs: int) -> dict[str, str]:
     """Return what a reader of a run wants to know first, as text by name. pairs: slices to learn from."""
-    preset, changed = nearest_preset(settings)
     pictures = f"{progress.pictures} {'crops' if settings.crop_px else 'pictures'}, {progress.pictures / pairs:.1f} for each slice"
     lens = f"{facts.lens.focal_length_mm:g} mm f/{facts.lens.f_number:.3g}"
     size = f"{facts.width_px}x{facts.height_px} px, blur up to {facts.largest_coc_px:.1f} px, radiance up to {facts.radiance_scale:.3g}"
-    apart = stacks_words(facts.held_out) or (f"slices {', '.join(map(str, facts.held_out_slices))}" if facts.held_out_slices else "nothing")
     return {
         "State": _state(progress, settings, pairs),
         "Seen": pictures,
-        "Settings": f"preset {preset}{' with ' if changed else ''}{', '.join(changed)}, seed {settings.seed}",
+        "Settings": settings_words(settings),
         "Lens": lens,
         "Learnt from": f"{pairs} slices of {len(facts.trained_on)} stacks ({stacks_words(facts.trained_on)}), {size}",
-        "Held out": apart,
+        "Held out": facts.held_out_words,
         "Licence of the data": facts.licence or "unknown",
         "Machine": facts.machine or "unknown",
         "Source": facts.commit or "unknown",

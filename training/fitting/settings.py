@@ -17,7 +17,9 @@ VERSION = 1
 FILE_NAME = "settings.json"
 TUNING_RATE = 0.25
 _TRUTH = {"true": True, "false": False}
-_WHERE = ("device", "threads", "seed", "minutes", "epochs", "sheets", "checkpoint_every_s", "validate_every_s", "cache_mib")
+PLACE = ("threads", "device", "cache_mib", "checkpoint_every_s", "sheets")
+"""Where a run computes and what it keeps; a run that goes on may have others."""
+_NO_SHAPE = ("network", "seed", "minutes", "epochs", "validate_every_s", *PLACE)
 _BUDGETS = {"minutes": "epochs", "epochs": "minutes"}
 
 
@@ -242,14 +244,15 @@ def changed_settings(settings: TrainSettings, base: TrainSettings) -> list[str]:
     """Return name=value for each setting that differs from the base, but where and how fast it computes."""
     now, plain = asdict(settings), asdict(base)
     network = {f"network.{name}": value for name, value in now["network"].items() if value != plain["network"][name]}
-    own = {name: value for name, value in now.items() if name not in ("network", *_WHERE) and value != plain[name]}
+    own = {name: value for name, value in now.items() if name not in _NO_SHAPE and value != plain[name]}
     return [f"{name}={value}" for name, value in (network | own).items()]
 
 
-def nearest_preset(settings: TrainSettings) -> tuple[str, list[str]]:
-    """Return the preset with the fewest settings that differ, and these."""
-    changed = {name: changed_settings(settings, preset()) for name, preset in PRESETS.items()}
-    return min(changed.items(), key=lambda each: len(each[1]))
+def settings_words(settings: TrainSettings) -> str:
+    """Return settings as the preset with the fewest that differ, and these."""
+    differing = {name: changed_settings(settings, preset()) for name, preset in PRESETS.items()}
+    name, changed = min(differing.items(), key=lambda each: len(each[1]))
+    return f"preset {name}" + (f" with {', '.join(changed)}" if changed else "") + f", seed {settings.seed}"
 
 
 PRESETS: dict[str, Callable[[], TrainSettings]] = {"paper": TrainSettings, "demo": demo_settings, "better": better_settings}

@@ -24,12 +24,11 @@ from training.fitting.run import LEAST_STEPS, Run
 from training.fitting.run_folder import FILE_NAME as FACTS_NAME
 from training.fitting.run_folder import RunFacts, load_run, machine_line, read_facts, source_commit, write_facts
 from training.fitting.settings import FILE_NAME as SETTINGS_NAME
-from training.fitting.settings import TrainSettings, read_settings, write_settings
+from training.fitting.settings import PLACE, TrainSettings, read_settings, write_settings
 
 _SAME = 0.01
 TUNING_STEPS = 20
 """The least of a run that starts from another: it has a lens already."""
-_MAY_DIFFER = ("threads", "device", "cache_mib", "checkpoint_every_s", "sheets")
 
 
 def fit(
@@ -175,7 +174,7 @@ def _is_guessed(stack: Source) -> bool:
 def require_same_settings(run_folder: Path, settings: TrainSettings) -> None:
     """Raise InputError for settings that differ from the run's, except where and how fast it computes and how often it writes."""
     if _begun(run_folder, SETTINGS_NAME):
-        _require_same(run_folder, "settings", read_settings(run_folder), settings, _MAY_DIFFER)
+        _require_same(run_folder, "settings", read_settings(run_folder), settings, PLACE)
 
 
 def require_same_data(run_folder: Path, facts: RunFacts) -> None:
