@@ -7,12 +7,14 @@ may be anything beyond their last code (`SentinelReading`).
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 from typing import ClassVar
 
 from mrbokeh.images.apple_notes import apple_notes
 from mrbokeh.optics.lens import MM_PER_M, lens_distance_m
 
 UINT32_MAX = 0xFFFFFFFF
+_MOST_DIGITS = 20
 UINT16_MAX = 0xFFFF
 UINT8_MAX = 0xFF
 _CM_PER_M = 100.0
@@ -136,13 +138,19 @@ _APPLE = "65 112 112 108 101 "
 
 
 def rational(text: str | None) -> tuple[int, int] | None:
-    """Return (numerator, denominator) of "17/10", of "17" or of the first number of several; None where there is no number."""
+    """Return (numerator, denominator) of "17/10", "17", "1.7" or of the first number of several; None where there is no number.
+
+    Decimals are of files whose writer stored floating point, against Exif's rules; (17, 10) keeps their last digit.
+    """
     if not text or not text.split():
         return None
     numerator, _, denominator = text.split()[0].partition("/")
     try:
-        return int(numerator), int(denominator or 1)
-    except ValueError:
+        whole = Decimal(numerator)
+        exponent = int(whole.as_tuple().exponent)  # of what is no number a letter
+        scale = 10 ** max(0, -exponent)
+        return None if abs(exponent) > _MOST_DIGITS else (int(whole * scale), int(denominator or 1) * scale)
+    except (ValueError, ArithmeticError):
         return None
 
 

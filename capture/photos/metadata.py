@@ -171,7 +171,8 @@ def _as_exiv2(values: Any) -> str:
     """Return values as exiv2 prints them: fractions as n/d, several with spaces between them."""
     if isinstance(values, str):
         return values
-    parts = [f"{each.num}/{each.den}" if hasattr(each, "den") else str(each) for each in values]
+    plain = [each[0] if isinstance(each, tuple) else each for each in values]  # floating point comes as tuples of one
+    parts = [f"{each.num}/{each.den}" if hasattr(each, "den") else str(each) for each in plain]
     return " ".join(parts)
 
 
