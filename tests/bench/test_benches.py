@@ -20,6 +20,7 @@ def test_a_benchmark_finds_all_that_it_imports(name: str) -> None:
     import_module(f"tests.bench.{name}")
 
 
+@pytest.mark.slow
 def test_the_device_benchmark_writes_its_page_and_a_part_that_fails_hides_no_other(tmp_path: Path) -> None:
     """The first part is not there, the second is the smallest; each in a process of its own."""
     pytest.importorskip("torch")

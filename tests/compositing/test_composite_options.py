@@ -355,6 +355,7 @@ def test_an_object_beside_the_frame_is_a_mistake_and_an_empty_layer_is_none(file
     np.testing.assert_allclose(put_in(files, card="empty.exr"), plate_rgb(), atol=2e-3)
 
 
+@pytest.mark.slow
 def test_what_is_told_of_a_phones_lens_is_no_f_number(shared_data: Path, tmp_path: Path) -> None:
     words = ("--object", CAKE, "--at-pixel", "380,700", "--height", "200px", "--out", tmp_path / "out.png")
     done = mrbokeh("composite", shared_data / "rgbd" / "phone_lens_blur_gdepth.jpg", *words)

@@ -50,7 +50,7 @@ def errors(second_rgb: np.ndarray, baseline_m: float) -> tuple[float, float, flo
     return float(np.median(measured)), float((measured < 0.05).mean()), float((wrong < 0.05).mean())
 
 
-@pytest.mark.parametrize("way", WAYS_M)
+@pytest.mark.parametrize("way", ["right", *(pytest.param(each, marks=pytest.mark.slow) for each in WAYS_M if each != "right")])
 def test_depth_is_that_of_the_scene_in_whatever_direction_the_camera_moved(way: str) -> None:
     """A pixel of shift is 1.4 to 4 % of depth here, and matching is good to a quarter of one: 1 %; 0.3 to 0.5 % were measured, 98 % of
     what both see within 5 %, and 90 to 96 % of the whole. Edges, and strips that the second does not see, are the rest.
@@ -80,7 +80,11 @@ def test_the_scale_is_that_of_the_baseline() -> None:
 
 @pytest.mark.parametrize(
     ("place_m", "yaw_rad", "told"),
-    [((0.0, 0.0, 0.0), 0.05, "hardly moved"), ((0.002, 0.0, 0.0), 0.02, "hardly moved"), ((0.0, 0.0, 0.1), 0.0, "along its view")],
+    [
+        pytest.param((0.0, 0.0, 0.0), 0.05, "hardly moved", marks=pytest.mark.slow),
+        ((0.002, 0.0, 0.0), 0.02, "hardly moved"),
+        pytest.param((0.0, 0.0, 0.1), 0.0, "along its view", marks=pytest.mark.slow),
+    ],
 )
 def test_pictures_that_show_no_depth_are_refused(place_m: tuple[float, float, float], yaw_rad: float, told: str) -> None:
     """A turn alone, 2 mm before things 0.7 m away, and a step ahead."""

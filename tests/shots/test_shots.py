@@ -340,6 +340,7 @@ def test_a_killed_run_goes_on_where_it_was(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
+@pytest.mark.slow
 def test_two_runs_of_one_command_share_the_segments(tmp_path: Path) -> None:
     """As two machines on one disk: each makes what the other has not claimed, one joins, and the file is that of one run, though one of the
     first run's workers dies of signal 9 in the middle of a segment, which whoever is free takes over.

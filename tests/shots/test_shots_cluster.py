@@ -73,6 +73,7 @@ def test_a_cluster_makes_the_same_file(tmp_path: Path, address: str) -> None:
     assert not (tmp_path / "two.mp4.parts").exists()
 
 
+@pytest.mark.slow
 def test_a_worker_killed_while_it_works_loses_nothing(tmp_path: Path, address: str) -> None:
     """One of the two is killed by signal 9 from outside in the middle of its segment; its nanny starts another."""
     clip, pids, gate = clip_of_blobs(tmp_path), tmp_path / "pids", tmp_path / "gate"

@@ -167,7 +167,7 @@ def test_bad_picks_are_refused() -> None:
     refused("positive number of metres", ruler_scale, standing.views[2], Ruler(2, floor_px[:2], -1.0))
 
 
-def test_rulers_without_ground_and_resting_cameras_are_refused(tmp_path: Path) -> None:
+def test_grounds_rulers_and_distances_that_nobody_can_read_are_refused() -> None:
     for parse, texts in (
         (parse_ground, ("", "0", "0:1,2/3,4", "x:1,2/3,4/5,6", "-1:1,2/3,4/5,6", "0:1,2/3,4/5")),
         (parse_ruler, ("0:1,2/3,4", "0:1,2/3,4/x", "1,2/3,4/5")),
@@ -175,6 +175,10 @@ def test_rulers_without_ground_and_resting_cameras_are_refused(tmp_path: Path) -
     ):
         for text in texts:
             refused("must be FRAME", parse, text)
+
+
+@pytest.mark.slow
+def test_frames_beyond_the_clip_and_resting_cameras_are_refused(tmp_path: Path) -> None:
     clip = write_clip(tmp_path / "clip.mkv", turning(9))
     refused("frames 0 to 8", matchmove_clip, clip, tmp_path / "work", MatchmoveSettings(distance=(0, 9, 1.0)))
     clip = write_clip(tmp_path / "resting.mkv", walking(9)[:1] * 4)

@@ -212,7 +212,7 @@ def test_a_killed_run_goes_on_as_if_never_stopped(
     assert all(torch.equal(whole[name], resumed[name]) for name in whole)
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [pytest.param(signal.SIGINT, marks=pytest.mark.slow), signal.SIGTERM])
 def test_a_stopped_run_goes_on_to_the_last_bit(
     number: signal.Signals, scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

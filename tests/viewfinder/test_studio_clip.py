@@ -47,9 +47,10 @@ def state_of_clip(clip: tuple[LiveClip, Path], folder: Path, **changes: object) 
 
 @pytest.mark.parametrize(
     "changes",
-    [pytest.param({"turn_deg": 30.0}, marks=pytest.mark.slow), {"sun_deg": (-60.0, 35.0), "exposure": 1.4, "warmth_k": 9000.0}],
+    [{"turn_deg": 30.0}, {"sun_deg": (-60.0, 35.0), "exposure": 1.4, "warmth_k": 9000.0}],
     ids=["soft", "sun"],
 )
+@pytest.mark.slow
 def test_the_filmed_clip_begins_with_the_preview_and_follows_the_track(
     clip: tuple[LiveClip, Path], tmp_path: Path, changes: dict[str, object]
 ) -> None:
