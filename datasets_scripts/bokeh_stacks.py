@@ -162,8 +162,11 @@ def _trace(views: Sequence[StackView], workers: int) -> None:
     threads = max(1, (os.cpu_count() or 1) // workers)
     with ProcessPoolExecutor(workers, get_context("spawn"), initializer=load, initargs=(threads,)) as pool:
         running = [pool.submit(view.make) for view in waiting]
-        for done in track(as_completed(running), "tracing views", total=len(running)):
-            done.result()
+        try:
+            for done in track(as_completed(running), "tracing views", total=len(running)):
+                done.result()
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def _claim(out: Path, plan: StacksPlan, views: list[StackView], overwrite: bool, more: dict[str, int] | None = None) -> None:
@@ -218,7 +221,7 @@ def main(
     f_number: Annotated[float, typer.Option(help="Of the lens, 0 for that of the size; sets of several make a family of lenses.")] = 0.0,
     pull: Annotated[int, typer.Option(help="Also OUT.pull: one test view at so many focus distances.")] = 0,
     seed: Annotated[int, typer.Option(help="Viewpoints and sampling; scenes are numbered.")] = 1,
-    workers: Annotated[int, typer.Option(min=1, help="Processes that trace, each a view.")] = 1,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that trace, each a view; not for --pull.")] = 1,
     overwrite: Overwrite = False,
 ) -> None:
     """Trace the missing pictures of a set of focal stacks."""

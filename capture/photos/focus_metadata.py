@@ -148,8 +148,10 @@ def rational(text: str | None) -> tuple[int, int] | None:
     try:
         whole = Decimal(numerator)
         exponent = int(whole.as_tuple().exponent)  # of what is no number a letter
-        scale = 10 ** max(0, -exponent)
-        return None if abs(exponent) > _MOST_DIGITS else (int(whole * scale), int(denominator or 1) * scale)
+        if abs(exponent) > _MOST_DIGITS:
+            return None
+        scale = 1 if whole == whole.to_integral_value() else 10 ** max(0, -exponent)
+        return int(whole * scale), int(denominator or 1) * scale
     except (ValueError, ArithmeticError):
         return None
 

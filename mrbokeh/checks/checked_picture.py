@@ -49,8 +49,10 @@ class Storage:
 
         Not in EXR of our primaries; of others, rounding of a bright channel can. Colours of lossy films ring over the dark beside them.
         """
+        if self.is_linear and not self.mixes:
+            return np.zeros(rgb.shape[:2], np.float32)
         if self.is_linear:
-            return self._rounded(np.abs(np.nan_to_num(rgb, posinf=0.0, neginf=0.0)))[..., 0] * np.float32(self.mixes)
+            return self._rounded(np.abs(np.nan_to_num(rgb, posinf=0.0, neginf=0.0))).max(axis=2)
         lossy = self.step >= _LOSSY_STEP
         return np.full(rgb.shape[:2], np.inf if lossy else self.step / _STEEPEST, np.float32)
 

@@ -93,9 +93,8 @@ def check_numbers(report: CheckReport, picture: CheckedPicture, plate_rgb: Rgb |
     light = _in_bt2020(picture.rgb) if plate_rgb is None else picture.rgb - np.minimum(plate_rgb, np.float32(0.0))
     _check(report, picture.name, picture.rgb, picture.alpha, light, DARK_SLACK + picture.storage.dark_step(picture.rgb))
     for name, layer in picture.layers.items():
-        _check(
-            report, f"{picture.name}, layer {name}", layer.rgb, layer.alpha, layer.rgb, np.full(layer.alpha.shape, DARK_SLACK, np.float32)
-        )
+        slack = np.full_like(layer.alpha, DARK_SLACK) + (picture.storage.dark_step(layer.rgb) if picture.storage.is_linear else 0.0)
+        _check(report, f"{picture.name}, layer {name}", layer.rgb, layer.alpha, layer.rgb, slack)
 
 
 def _in_bt2020(rgb: Rgb) -> Rgb:
@@ -109,7 +108,8 @@ def _check(report: CheckReport, where: str, rgb: Rgb, alpha: Plane | None, light
         lost |= ~np.isfinite(alpha)
     _note(report, "nan", where, lost, "NaN or infinity", float(lost.sum()), 0.0)
     dark = np.where(np.isfinite(light), light, np.float32(0.0)).min(axis=2)
-    _note(report, "negative", where, dark < -slack, "negative light", float(dark.min()), -float(slack.min()))
+    worst = np.unravel_index(np.argmin(dark + slack), dark.shape)
+    _note(report, "negative", where, dark < -slack, "negative light", float(dark[worst]), -float(slack[worst]))
     if alpha is not None:
         known = np.where(np.isfinite(alpha), alpha, np.float32(0.0))
         above, below = known > 1.0 + ALPHA_SLACK, known < -ALPHA_SLACK

@@ -62,7 +62,7 @@ def host(
     from mrbokeh.system.errors import InputError
 
     name = _FILES[program].target
-    if out.suffix.lower() == Path(name).suffix or (out.exists() and not out.is_dir()):
+    if not out.is_dir() and (out.exists() or out.suffix.lower() == Path(name).suffix):
         raise InputError(f"expected a folder, in which {name} is put, got {out}: name a folder")
     target = out / name
     refuse_existing(target, overwrite)

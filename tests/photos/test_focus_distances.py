@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from capture.merging.registration.registration_file import breathing_of
-from capture.photos.focus_metadata import FocusReading, at_infinity, rational, read_focus
+from capture.photos.focus_metadata import UINT32_MAX, FocusReading, at_infinity, rational, read_focus
 from capture.photos.photo_metadata import PhotoMetadata
 from capture.photos.sidecar import StatedFocus
 from capture.report.findings import focus_spacing
@@ -247,8 +247,16 @@ def test_the_range_of_an_iphone_is_a_focus() -> None:
 
 @pytest.mark.parametrize(
     ("text", "parts"),
-    [("17/10", (17, 10)), ("17", (17, 1)), ("2.05", (205, 100)), ("1e-05", (1, 10**5)), ("2.8 x", (28, 10)), ("0/0", (0, 0))]
-    + [(text, None) for text in ("", "x", "1/x", "nan", "inf", "1e999", None)],
+    [
+        ("17/10", (17, 10)),
+        ("17", (17, 1)),
+        ("2.05", (205, 100)),
+        ("1e-05", (1, 10**5)),
+        ("2.8 x", (28, 10)),
+        ("0/0", (0, 0)),
+        ("4294967295.0", (UINT32_MAX, 1)),
+    ]
+    + [(text, None) for text in ("", "x", "1/x", "nan", "inf", "1e999", "1e-999999999", None)],
 )
 def test_numbers_of_tags_are_fractions_also_where_a_writer_stored_floating_point(text: str | None, parts: tuple[int, int] | None) -> None:
     assert rational(text) == parts

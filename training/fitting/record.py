@@ -167,19 +167,18 @@ class Record:
         self._draw_if_due()
         return 0 < self._task.settings.patience <= self._progress.looks_since_best
 
-    def save(self, stopped: bool = False) -> None:
-        """Write the checkpoint and the curve; not with weights that are no numbers, of which the next step tells.
+    def stop(self) -> None:
+        """Save a run that ends here for now; its page says so."""
+        self.save()
+        self._draw(stopped=True)
 
-        stopped: the run ends here for now, and its page says so.
-        """
+    def save(self) -> None:
+        """Write the checkpoint and the curve; not with weights that are no numbers, of which the next step tells."""
         if not self._learner.is_finite():
             return
         save_checkpoint(self._checkpoint, self._progress, self._learner, self._rng)
         write_curve(self._task.folder, self._progress.curve)
-        if stopped:
-            self._draw(stopped)
-        else:
-            self._draw_if_due()
+        self._draw_if_due()
 
     def _draw_if_due(self) -> None:
         if self._progress.elapsed_s - self._drawn_s >= _DRAWN_EVERY_S:

@@ -136,7 +136,7 @@ class Run:
             self._loop()
             if self._stopped_by is not None:
                 if self.ranks.first:
-                    self._record.save(stopped=True)
+                    self._record.stop()
                 kept = f"the checkpoint in {self.task.folder} is kept, run the same command again (without --overwrite) to go on"
                 raise StoppedError(self._stopped_by, kept)
             self.ranks.from_first(self._record.finish)

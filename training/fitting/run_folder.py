@@ -60,8 +60,9 @@ class RunFacts:
 
     @property
     def held_out_words(self) -> str:
-        slices = f"slices {', '.join(map(str, self.held_out_slices))} of the only stack" if self.held_out_slices else ""
-        return slices or stacks_words(self.held_out) or "nothing"
+        if self.held_out_slices:
+            return f"slices {', '.join(map(str, self.held_out_slices))} of the only stack"
+        return stacks_words(self.held_out) or "nothing"
 
     def to_json(self) -> dict[str, Any]:
         return {"format": FORMAT, "version": VERSION, **vars(self), "lens": lens_to_json(self.lens)}
