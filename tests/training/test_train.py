@@ -233,7 +233,7 @@ def test_a_stopped_run_goes_on_to_the_last_bit(
     assert done.returncode == 128 + number and "go on" in done.stderr
     assert torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)["progress"]["step"] == 3
     page = (tmp_path / "run" / "index.html").read_text()
-    assert "stopped, the same command goes on; 3 steps" in page and "refresh" not in page
+    assert "stopped, the same command goes on: 3 steps" in page and "refresh" not in page
     monkeypatch.setattr(Run, "_step", step)
     printed_by(app, *arguments, tmp_path / "run")
     whole, resumed = (torch.load(tmp_path / name / "checkpoint.pt", weights_only=True) for name in ("whole", "run"))

@@ -33,9 +33,7 @@ def write_run_page(
 ) -> None:
     """Write the page. slices: to learn from, and held-out ones that are looked at. stopped: before its end, to be gone on with."""
     settings, facts = made_of
-    rows = facts_of_run(progress, settings, facts, slices[0])
-    if stopped:
-        rows["State"] = f"stopped, the same command goes on; {rows['State']}"
+    rows = facts_of_run(progress, settings, facts, slices[0], stopped)
     strips = list(_strips(folder / SHEETS, slices[1]))
     words = "The sharp picture, what the network made of it step by step, and the photograph. Scroll sideways."
     none = "Nothing is held out, so nothing can tell how good the network is." if not slices[1] else "No sheets are written (sheets=false)."
@@ -49,13 +47,13 @@ def write_run_page(
     write_page(folder / FILE_NAME, f"{folder.resolve().name}, step {progress.step}", blocks, _STYLE)
 
 
-def facts_of_run(progress: Progress, settings: TrainSettings, facts: RunFacts, pairs: int) -> dict[str, str]:
+def facts_of_run(progress: Progress, settings: TrainSettings, facts: RunFacts, pairs: int, stopped: bool) -> dict[str, str]:
     """Return what a reader of a run wants to know first, as text by name. pairs: slices to learn from."""
     pictures = f"{progress.pictures} {'crops' if settings.crop_px else 'pictures'}, {progress.pictures / pairs:.1f} for each slice"
     lens = f"{facts.lens.focal_length_mm:g} mm f/{facts.lens.f_number:.3g}"
     size = f"{facts.width_px}x{facts.height_px} px, blur up to {facts.largest_coc_px:.1f} px, radiance up to {facts.radiance_scale:.3g}"
     return {
-        "State": _state(progress, settings, pairs),
+        "State": _state(progress, settings, pairs, stopped),
         "Seen": pictures,
         "Settings": settings_words(settings),
         "Lens": lens,
@@ -67,13 +65,14 @@ def facts_of_run(progress: Progress, settings: TrainSettings, facts: RunFacts, p
     }
 
 
-def _state(progress: Progress, settings: TrainSettings, pairs: int) -> str:
+def _state(progress: Progress, settings: TrainSettings, pairs: int, stopped: bool) -> str:
     budget = f"{settings.minutes:g} minutes" if settings.minutes is not None else f"{settings.epochs} epochs"
     steps = f"{progress.step} steps in {_duration(progress.elapsed_s)}"
     if progress.finished:
         return f"finished: {steps} ({budget})" + (", stopped early" if progress.stopped_early else "")
+    now = "stopped, the same command goes on" if stopped else "training"
     done = progress.elapsed_s / (60.0 * settings.minutes) if settings.minutes else progress.pictures / ((settings.epochs or 1) * pairs)
-    return f"{steps} of about {_duration(progress.elapsed_s / max(done, 1e-6))} ({budget})"
+    return f"{now}: {steps} of about {_duration(progress.elapsed_s / max(done, 1e-6))} ({budget})"
 
 
 def _duration(seconds: float) -> str:

@@ -19,7 +19,7 @@ TUNING_RATE = 0.25
 _TRUTH = {"true": True, "false": False}
 PLACE = ("threads", "device", "cache_mib", "checkpoint_every_s", "sheets")
 """Where a run computes and what it keeps; a run that goes on may have others."""
-_NO_SHAPE = ("network", "seed", "minutes", "epochs", "validate_every_s", *PLACE)
+_NOT_TOLD = ("network", "seed", "minutes", "epochs", "validate_every_s", *PLACE)
 _BUDGETS = {"minutes": "epochs", "epochs": "minutes"}
 
 
@@ -244,7 +244,7 @@ def changed_settings(settings: TrainSettings, base: TrainSettings) -> list[str]:
     """Return name=value for each setting that differs from the base, but where and how fast it computes."""
     now, plain = asdict(settings), asdict(base)
     network = {f"network.{name}": value for name, value in now["network"].items() if value != plain["network"][name]}
-    own = {name: value for name, value in now.items() if name not in _NO_SHAPE and value != plain[name]}
+    own = {name: value for name, value in now.items() if name not in _NOT_TOLD and value != plain[name]}
     return [f"{name}={value}" for name, value in (network | own).items()]
 
 
