@@ -4,7 +4,6 @@ The public names load on first use, so that `import mrbokeh` stays cheap.
 """
 
 from importlib import import_module
-from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 _PUBLIC = {
@@ -30,13 +29,10 @@ _PUBLIC = {
 }
 __all__ = sorted(_PUBLIC)
 
-try:
-    __version__ = version("mrbokeh")
-except PackageNotFoundError:
-    __version__ = "0+unknown"
-
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":
+        return _version()
     if name not in _PUBLIC:
         raise AttributeError(f"module 'mrbokeh' has no attribute {name!r}")
     return getattr(import_module(_PUBLIC[name]), name)
@@ -44,3 +40,12 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return [*__all__, "__version__"]
+
+
+def _version() -> str:
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        return version("mrbokeh")
+    except PackageNotFoundError:
+        return "0+unknown"

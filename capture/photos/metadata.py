@@ -177,6 +177,7 @@ def _as_exiv2(values: Any) -> str:
 
 
 _NO_MESSAGES = 4
+_READ_WHOLE = ("image/png", "image/jpeg")
 _BLOCKS = (("TileOffsets", "TileByteCounts"), ("StripOffsets", "StripByteCounts"))
 
 
@@ -187,11 +188,14 @@ def read_metadata(path: Path) -> PhotoMetadata:
 
 def read_metadata_of(paths: Sequence[Path], advance: Callable[[], None] = lambda: None) -> list[PhotoMetadata]:
     """Return the shooting data of photographs; `advance` is called after each."""
-    found = []
+    found, states_any = [], []
     for path in paths:
-        found.append(metadata_from_tags(read_tags(path)))
+        tags = read_tags(path)
+        found.append(metadata_from_tags(tags))
+        # A PNG or JPEG that exiv2 reads whole and finds empty is empty for the slower ones too.
+        states_any.append(tags.get("mime_type") not in _READ_WHOLE or any(name.startswith(("Exif.", "Xmp.")) for name in tags))
         advance()
-    gaps = [index for index, metadata in enumerate(found) if _has_gaps(metadata)]
+    gaps = [index for index, metadata in enumerate(found) if states_any[index] and _has_gaps(metadata)]
     for index, more in zip(gaps, read_with_exiftool([paths[index] for index in gaps]), strict=True):
         found[index] = found[index].filled_from(more)
         if _has_gaps(found[index]):

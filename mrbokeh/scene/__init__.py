@@ -13,7 +13,7 @@
     mesh, material  Mesh, Material, Texture, matte, emitter: glTF 2.0 metallic-roughness in linear light; sphere, rectangle, shadow_catcher
     light           Light (KHR_lights_punctual), sun; Environment (linear HDR panorama), split_sun, neutral_environment
     light_change    light_change: shadow and reflection of objects on a real surface
-    gltf/           load_glb(path, time_s, animation) -> Scene; GltfAsset for many moments of one file (needs pygltflib)
+    gltf/           load_glb(path, time_s, animation) -> Scene; GltfAsset for many moments of one file
     embree/         EmbreeRaycaster, the backend for any CPU (needs embreex and numba)
     wgpu/           WgpuRasterizer, the backend for graphics cards (needs wgpu)
     mitsuba/        MitsubaTracer, path tracing (needs mitsuba)

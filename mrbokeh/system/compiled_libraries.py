@@ -28,9 +28,9 @@ def link_once(kernel: Any) -> None:
     options, kind = kernel.targetoptions, JITCodeLibrary
     if not (options.get("parallel") or _reorders(options.get("fastmath", False))):
         kind = _LinkedOnce
-        twin = type(kernel)(kernel.py_func, targetoptions={**options, "no_cpython_wrapper": True, "no_cfunc_wrapper": True})
-        twin._compiling_counter = kernel._compiling_counter  # what calls itself is recognised by it
-        kernel.get_call_template, kernel.get_overload = twin.get_call_template, twin.get_overload
+        twin = cache(lambda: _twin(kernel))  # kernels that are loaded need none
+        kernel.get_call_template = lambda args, kws: twin().get_call_template(args, kws)
+        kernel.get_overload = lambda signature: twin().get_overload(signature)
     compile_now = kernel.compile
 
     def compile_as(signature: Any) -> Any:
@@ -38,6 +38,13 @@ def link_once(kernel: Any) -> None:
             return compile_now(signature)
 
     kernel.compile = compile_as
+
+
+def _twin(kernel: Any) -> Any:
+    """Return what other kernels call in place of this one."""
+    twin = type(kernel)(kernel.py_func, targetoptions={**kernel.targetoptions, "no_cpython_wrapper": True, "no_cfunc_wrapper": True})
+    twin._compiling_counter = kernel._compiling_counter  # what calls itself is recognised by it
+    return twin
 
 
 def _reorders(fastmath: bool | set[str]) -> bool:

@@ -7,7 +7,6 @@ import sys
 import tempfile
 import traceback
 from contextlib import suppress
-from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 
 INTERRUPTED = 130
@@ -62,6 +61,8 @@ def install_command(extra: str = "") -> str:
     chosen, checkout = f"[{extra}]" if extra else "", Path(__file__).resolve().parents[2]
     if (checkout / "pyproject.toml").is_file():
         return f"pip install -e '{checkout}{chosen}'"
+    from importlib.metadata import PackageNotFoundError, distribution
+
     source = ""
     with suppress(PackageNotFoundError, ValueError):
         # PEP 610: pip notes there what it was given.

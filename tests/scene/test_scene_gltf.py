@@ -15,6 +15,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.scene import Environment, Scene, world_from_scene_placing
 from mrbokeh.scene.embree.embree_raycaster import EmbreeRaycaster
 from mrbokeh.scene.gltf.gltf_loader import GltfAsset, load_glb
+from mrbokeh.system.errors import InputError
 from tests.support.refusals import refused
 
 OBJECTS = ("DepthOfFieldExample", "FlightHelmet", "Fox", "GolfBall", "alien", "cakeBirthday")
@@ -228,6 +229,36 @@ def test_broken_and_unsupported_files_say_what_to_do(tmp_path: Path) -> None:
     writer.square()
     writer.json["accessors"][0]["count"] = 4000
     refused("cut short", load_glb, writer.write(tmp_path / "short.glb"))
+
+
+JUNK = (None, -1, 10**9, "x", [], {}, 1.5)
+
+
+def _places(part: Any, path: tuple[Any, ...] = ()) -> list[tuple[Any, ...]]:
+    keys = part.keys() if isinstance(part, dict) else range(len(part)) if isinstance(part, list) else ()
+    return [each for key in keys for each in [(*path, key), *_places(part[key], (*path, key))]]
+
+
+@pytest.mark.filterwarnings("ignore:invalid value:RuntimeWarning")  # bytes of something else may be any number
+def test_any_wrong_value_is_refused_in_words(tmp_path: Path, shared_data: Path) -> None:
+    stored = (shared_data / "objects" / "Fox.glb").read_bytes()
+    length = struct.unpack_from("<I", stored, 12)[0]
+    text, rest = stored[20 : 20 + length], stored[20 + length :]
+    rng, path, refusals = np.random.default_rng(0), tmp_path / "wrong.glb", []
+    every = _places(json.loads(text))
+    for place in (every[number] for number in rng.permutation(len(every))[:60]):
+        whole = json.loads(text)
+        part = whole
+        for key in place[:-1]:
+            part = part[key]
+        part[place[-1]] = JUNK[rng.integers(len(JUNK))]
+        wrong = json.dumps(whole).encode()
+        path.write_bytes(stored[:12] + struct.pack("<I4s", len(wrong), b"JSON") + wrong + rest)
+        try:
+            load_glb(path, 0.1)
+        except InputError as reason:
+            refusals.append(str(reason))
+    assert len(refusals) > 10  # every other exception fails
 
 
 @pytest.fixture(scope="module")

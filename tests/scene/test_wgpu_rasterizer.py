@@ -110,7 +110,6 @@ class TestTwin:
 
     @pytest.mark.skipif(not FOX.exists(), reason="needs ../shared/data/objects/Fox.glb")
     def test_shadows_follow_the_skinned_pose(self, rasterizer: WgpuRasterizer, raycaster: EmbreeRaycaster) -> None:
-        pytest.importorskip("pygltflib")
         from mrbokeh.scene import world_from_scene_placing
         from mrbokeh.scene.gltf.gltf_loader import GltfAsset
 

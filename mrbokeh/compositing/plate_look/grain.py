@@ -46,10 +46,14 @@ FORMAT, VERSION = "mrbokeh-grain", 1
 
 
 def grain_texture(correlation: Correlation, seed: int) -> Float32[np.ndarray, "side side 3"]:
-    """Filter white noise by the root of the spectrum that belongs to the correlation (Wiener-Khinchin); mean 0, variance 1."""
+    """Filter white noise by the root of the spectrum that belongs to the correlation (Wiener-Khinchin); mean 0, variance 1.
+
+    The spectrum of white noise is white noise: it is drawn as such. In the two columns that belong to themselves only the part counts that
+    is alike at opposite frequencies, half of their light.
+    """
     kernels = np.fft.irfft2(_root_of_spectrum(correlation), (_GRID_PX, _GRID_PX), axes=(0, 1))
-    noise = np.random.default_rng(seed).standard_normal((SIDE_PX, SIDE_PX, 3), np.float32)
-    drawn = np.fft.rfft2(np.ascontiguousarray(noise.transpose(2, 0, 1)))
+    drawn = np.random.default_rng(seed).standard_normal((3, SIDE_PX, SIDE_PX // 2 + 1, 2), np.float32).view(np.complex64)[..., 0]
+    drawn[..., [0, -1]] *= np.sqrt(np.float32(2.0))
     mixed, turns = np.zeros_like(drawn), _turns()
     for i, j in np.ndindex(3, 3):
         mixed[i] += (turns @ kernels[..., i, j].astype(np.complex64) @ turns[: SIDE_PX // 2 + 1].T) * drawn[j]

@@ -6,7 +6,6 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
-from scipy.ndimage import affine_transform, binary_erosion
 
 from mrbokeh.optics.psf_bank import PsfBank
 from mrbokeh.renderers.kernels.laplacian_tables import Points, by_rows, joined_points, taps_of
@@ -105,6 +104,8 @@ class BankTables:
 
     @cached_property
     def _dense(self) -> Bool[np.ndarray, " cells"]:
+        from scipy.ndimage import binary_erosion
+
         supports = [kernel.any(axis=2) for kernel in self.bank.kernels]
         return np.array([seen.sum() <= max(_DENSE_TAPS, _DENSE_RIM * (seen & ~binary_erosion(seen)).sum()) for seen in supports])
 
@@ -166,6 +167,8 @@ def turned_kernel(kernel: Float32[np.ndarray, "size size channels"], angle_rad: 
     quarters = angle_rad / (0.5 * np.pi)
     if abs(quarters - round(quarters)) < 1e-9:
         return np.ascontiguousarray(np.rot90(kernel, -round(quarters))).astype(np.float64)
+    from scipy.ndimage import affine_transform
+
     radius = kernel.shape[0] // 2
     side = int(np.ceil(np.sqrt(2.0) * radius)) + 1 - radius
     wide = np.pad(kernel.astype(np.float64), ((side, side), (side, side), (0, 0)))

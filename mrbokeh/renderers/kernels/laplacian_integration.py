@@ -21,7 +21,6 @@ from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float, Float64
-from scipy import fft
 
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import workers
@@ -47,7 +46,9 @@ def laplacian(image: Float[np.ndarray, "height width *channels"]) -> Float64[np.
 
 def fast_width(width: int) -> int:
     """Return the next width at which the sine transform is quick."""
-    return fft.next_fast_len(width, real=True)
+    from scipy.fft import next_fast_len
+
+    return next_fast_len(width, real=True)
 
 
 def integrate(source: Channels, threads: int = 0) -> Channels:
@@ -56,17 +57,21 @@ def integrate(source: Channels, threads: int = 0) -> Channels:
     To the left and right the picture is continued antisymmetrically about the border, above and below by zeros. Widths
     as from `fast_width` are quickest. threads: 0 takes all cores; the result does not depend on it.
     """
+    from scipy.fft import dst, idst
+
     _check(source)
     with workers(source.shape[0] * source.shape[1], threads) as pool:
         count = _threads_of(pool)
-        modes = fft.dst(source, type=2, axis=1, workers=count)
+        modes = dst(source, type=2, axis=1, workers=count)
         solve_modes(modes, pool)
-        return fft.idst(modes, type=2, axis=1, workers=count, overwrite_x=True)
+        return idst(modes, type=2, axis=1, workers=count, overwrite_x=True)
 
 
 def rows_to_modes(rows: Channels) -> None:
     """The first step of `integrate`, in place, for some rows of the source (contiguous): they become sine modes."""
-    _in_place(fft.dst, rows)
+    from scipy.fft import dst
+
+    _in_place(dst, rows)
 
 
 def solve_modes(modes: Channels, pool: Executor) -> None:
@@ -81,7 +86,9 @@ def solve_modes(modes: Channels, pool: Executor) -> None:
 
 def modes_to_rows(modes: Channels) -> None:
     """The last step of `integrate`, in place, for the modes of some rows (contiguous): they become rows of the picture."""
-    _in_place(fft.idst, modes)
+    from scipy.fft import idst
+
+    _in_place(idst, modes)
 
 
 def _in_place(transform: Callable[..., Channels], rows: Channels) -> None:

@@ -30,7 +30,6 @@ from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float, Float64, Int16, Int64
-from scipy.ndimage import map_coordinates, spline_filter
 
 from mrbokeh.renderers.kernels.laplacian_integration import fast_width, integrate, laplacian
 from mrbokeh.system.errors import InputError
@@ -214,6 +213,8 @@ def turned(
     if abs(wanted - np.rint(wanted)).max() < 1e-9:
         order = np.lexsort((np.rint(wanted[:, 1]), np.rint(wanted[:, 0])))
         return places.astype(np.int16), values[order]
+    from scipy.ndimage import map_coordinates
+
     table = table_for(2 * int(np.abs(wanted).max() + 2.0) + 1)
     apart = np.abs(places[:, None] - wanted)
     between = map_coordinates(_spline(len(table)), [apart[..., 1], apart[..., 0]], order=3, mode="mirror", prefilter=False)
@@ -223,6 +224,8 @@ def turned(
 @lru_cache(maxsize=8)
 def _spline(side: int) -> Float64[np.ndarray, "side side"]:
     """Return coefficients that make a table of this size smooth between whole distances."""
+    from scipy.ndimage import spline_filter
+
     return spline_filter(biharmonic_table(side - 1), order=3, mode="mirror")
 
 

@@ -64,6 +64,14 @@ class GltfAsset:
 
     def scene_at(self, time_s: float = 0.0, animation: str | int | None = None) -> Scene:
         """The scene at a time; see `load_glb`."""
+        try:
+            return self._scene_at(time_s, animation)
+        except InputError:
+            raise
+        except (LookupError, TypeError, ValueError, AttributeError) as reason:
+            raise InputError(f"{self._file.path} is a damaged glTF file ({reason!r}): export it again") from reason
+
+    def _scene_at(self, time_s: float, animation: str | int | None) -> Scene:
         poses = poses_at(self._file, time_s, animation)
         world_from_node = _world_from_node(self._file, poses)
         meshes: list[Mesh] = []
@@ -191,8 +199,7 @@ def _chosen_animation(file: GltfFile, animation: str | int | None) -> Any:
 
 
 def _rest_pose(file: GltfFile, node: Any) -> NodePose:
-    # pygltflib does not read the weights of nodes, only those of meshes.
-    weights = file.gltf.meshes[node.mesh].weights if node.mesh is not None else None
+    weights = node.weights or (file.gltf.meshes[node.mesh].weights if node.mesh is not None else None)
     return NodePose(
         translation=np.array(node.translation or (0, 0, 0), np.float64),
         rotation=np.array(node.rotation or (0, 0, 0, 1), np.float64),

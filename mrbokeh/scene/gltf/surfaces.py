@@ -4,6 +4,8 @@ Materials: textures decoded to linear light. Primitives: vertex attributes with 
 """
 
 import base64
+import json
+import struct
 from dataclasses import dataclass, field
 from math import cos, sin
 from pathlib import Path
@@ -12,7 +14,6 @@ from urllib.parse import unquote
 
 import cv2
 import numpy as np
-import pygltflib
 from jaxtyping import Float, Float32, Int32, Shaped
 
 from mrbokeh.images.color import srgb_to_linear
@@ -33,12 +34,26 @@ _READABLE_EXTENSIONS = {
 }
 
 
+_LISTS = (
+    *("accessors", "animations", "buffers", "bufferViews", "images", "materials", "meshes", "nodes"),
+    *("samplers", "scenes", "skins", "textures"),
+)
+_MAGIC, _JSON_CHUNK, _BINARY_CHUNK = b"glTF", b"JSON", b"BIN\0"
+
+
+class _Part(dict[str, Any]):
+    """An object of the file's JSON, whose properties are attributes; what is absent is None."""
+
+    def __getattr__(self, name: str) -> Any:
+        return self.get(name)
+
+
 @dataclass(frozen=True, eq=False)
 class GltfFile:
-    """A parsed .glb or .gltf with its buffers in memory."""
+    """A parsed .glb or .gltf with its buffers in memory. gltf: its JSON; all lists of the specification are there, if only empty."""
 
     path: Path
-    gltf: pygltflib.GLTF2
+    gltf: Any
     buffers: tuple[bytes, ...]
 
     def accessor(self, index: int) -> Shaped[np.ndarray, "count width"]:
@@ -85,8 +100,8 @@ class GltfFile:
         strided = np.ndarray((count, width), dtype, self.buffers[view.buffer], start, (stride, dtype.itemsize))
         return np.array(strided)
 
-    def _with_sparse(self, values: Shaped[np.ndarray, "count width"], sparse: pygltflib.Sparse) -> Shaped[np.ndarray, "count width"]:
-        where, what = sparse.indices, sparse.values
+    def _with_sparse(self, values: Shaped[np.ndarray, "count width"], sparse: Any) -> Shaped[np.ndarray, "count width"]:
+        where, what = sparse["indices"], sparse["values"]
         index_dtype = np.dtype(_COMPONENTS[where.componentType])
         indices = self._view(where.bufferView, where.byteOffset or 0, sparse.count, 1, index_dtype)
         values[indices[:, 0]] = self._view(what.bufferView, what.byteOffset or 0, sparse.count, values.shape[1], values.dtype)
@@ -99,19 +114,35 @@ def open_gltf(path: str | Path) -> GltfFile:
     if not path.is_file():
         raise InputError(f"expected a .glb or .gltf file, found none at {path}: check the path")
     try:
-        gltf = pygltflib.GLTF2().load(str(path))
-        if gltf is None:
-            raise ValueError("neither .glb nor .gltf")
-        blob = gltf.binary_blob()
+        text, blob = _chunks(path.read_bytes())
+        gltf = json.loads(text, object_hook=_Part)
+        for name in _LISTS:
+            if not all(isinstance(each, _Part) for each in gltf.setdefault(name, [])):
+                raise ValueError(f"its {name} are no list of objects")
         buffers = tuple(blob if buffer.uri is None else _read_uri(buffer.uri, path) for buffer in gltf.buffers)
     except InputError:
         raise
-    except Exception as reason:  # pygltflib lets through whatever struct, json and dataclasses_json raise
+    except (ValueError, TypeError, AttributeError, RecursionError, struct.error) as reason:
         raise InputError(f"{path} is not a readable glTF 2.0 file ({reason}): export it again as .glb") from reason
     missing = sorted(set(gltf.extensionsRequired or ()) - _READABLE_EXTENSIONS)
     if missing:
         raise InputError(f"{path} requires {', '.join(missing)}, which is not supported: export it without compression or extensions")
     return GltfFile(path, gltf, buffers)
+
+
+def _chunks(stored: bytes) -> tuple[bytes, bytes]:
+    """Return the JSON of a file and the buffer that a .glb holds beside it, else nothing (glTF 2.0, 4.4)."""
+    if stored[:4] != _MAGIC:
+        return stored, b""
+    chunks: dict[bytes, bytes] = {}
+    start = 12
+    while start + 8 <= len(stored):
+        length, kind = struct.unpack_from("<I4s", stored, start)
+        chunks.setdefault(kind, stored[start + 8 : start + 8 + length])
+        start += 8 + length
+    if _JSON_CHUNK not in chunks:
+        raise ValueError("a .glb without JSON")
+    return chunks[_JSON_CHUNK], chunks.get(_BINARY_CHUNK, b"")
 
 
 def _read_uri(uri: str, beside: Path) -> bytes:
@@ -140,7 +171,7 @@ class _Textures:
     decoded: dict[tuple[int, bool], Float32[np.ndarray, "height width channels"]] = field(default_factory=dict)
 
     def read(self, reference: Any, is_srgb: bool) -> Texture | None:
-        """The texture of a TextureInfo (an object of pygltflib or the dictionary of an extension)."""
+        """The texture of a TextureInfo (or of an extension that is like one)."""
         if reference is None:
             return None
         gltf = self.file.gltf
@@ -293,13 +324,12 @@ def read_primitive(file: GltfFile, primitive: Any, morph_weights: Float[np.ndarr
     attributes = primitive.attributes
 
     def read(name: str) -> Float32[np.ndarray, "vertices width"] | None:
-        index = getattr(attributes, name, None)
+        index = attributes.get(name)
         return None if index is None else file.floats(index)
 
     def morphed(name: str) -> Float[np.ndarray, "vertices width"] | None:
         values = read(name)
         for weight, target in zip(morph_weights, primitive.targets or (), strict=False):
-            target = target if isinstance(target, dict) else vars(target)
             if values is not None and weight and target.get(name) is not None:
                 values[:, :3] += weight * file.floats(target[name])[:, :3]
         return None if values is None else values.astype(np.float64)
@@ -311,7 +341,7 @@ def read_primitive(file: GltfFile, primitive: Any, morph_weights: Float[np.ndarr
     colors = read("COLOR_0")
     if colors is not None and colors.shape[1] == 3:
         colors = np.concatenate([colors, np.ones_like(colors[:, :1])], axis=1)
-    joints = [file.accessor(index) for index in (attributes.JOINTS_0, getattr(attributes, "JOINTS_1", None)) if index is not None]
+    joints = [file.accessor(index) for index in (attributes.JOINTS_0, attributes.JOINTS_1) if index is not None]
     weights = [values for values in (read("WEIGHTS_0"), read("WEIGHTS_1")) if values is not None]
     corners = np.arange(len(positions)) if primitive.indices is None else file.accessor(primitive.indices)[:, 0]
     return Primitive(
