@@ -35,7 +35,7 @@ class PlateOptions(shared.NearOptions):
     depth: Annotated[
         Path | None,
         typer.Option(
-            help="Depth of the photograph: EXR with Z, PNG or TIFF, a phone's photograph, disparity (.npz) or a depth network (.onnx). "
+            help="Depth of the photograph: EXR with Z, PNG or TIFF, a phone's photograph, an array (.npz) or a depth network (.onnx). "
             "Default: PHOTO's own."
         ),
     ] = None

@@ -29,7 +29,7 @@ class SharpOptions:
     rgb: Annotated[Path | None, typer.Option(help="All-in-focus picture, scene-linear: .exr, .hdr or float .tif.")] = None
     depth: Annotated[
         Path | None,
-        typer.Option(help="Its depth in metres: EXR channel Z, depth.Z or Y (inf or <= 0: background), or one number."),
+        typer.Option(help="Its depth in metres: EXR channel Z, depth.Z or Y (inf or <= 0: background), array (.npz, .npy), or one number."),
     ] = None
     disparity: DisparityOption = None
     exact_depth: ExactDepthOption = False

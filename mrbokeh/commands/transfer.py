@@ -49,7 +49,7 @@ class DepthOptions:
     depth: Annotated[
         Path | None,
         typer.Option(
-            help="EXR with Z, PNG or TIFF, disparity (.npz), a phone's photograph, or a depth network (.onnx). Default: PHOTO's own."
+            help="EXR with Z, PNG or TIFF, an array (.npz), a phone's photograph, or a depth network (.onnx). Default: PHOTO's own."
         ),
     ] = None
     disparity: DisparityOption = None

@@ -7,12 +7,13 @@ file cannot say stands in a JSON of its name beside it (model.onnx: model.json).
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.depth.depth_filters import refined_dioptres
-from mrbokeh.depth.depth_map import DepthMap, DepthSettings, with_holes_filled, without_steps
+from mrbokeh.depth.depth_map import DepthMap, DepthSettings, StereoCalibration, with_holes_filled, without_steps
 from mrbokeh.depth.mended_depth import mended_aloud
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.color import linear_to_srgb
@@ -174,12 +175,17 @@ def _cut(plane: Plane, cut: tuple[int, int, int, int], size: tuple[int, int]) ->
 
 
 def read_number_map(path: Path, settings: DepthSettings) -> DepthMap:
-    """Read a picture of plain numbers: depth with metres_per_unit (0: unknown), dioptres with near_far_m, the largest number nearest.
+    """Read plain numbers of a picture or an array: depth with metres_per_unit (0: unknown), dioptres with near_far_m, the largest nearest.
 
     For near_far_m the whole range of an integer format counts (0 is FAR, 65535 is NEAR), of floats the range that occurs.
     """
-    pixels = stored_pixels(path)
-    numbers = pixels if pixels.ndim == 2 else pixels[..., 0]
+    if path.suffix.lower() in _ARRAYS:
+        numbers, name = _array_of(path)
+        if name == _METRES and settings.near_far_m is None and settings.metres_per_unit is None:
+            settings = replace(settings, metres_per_unit=1.0)
+    else:
+        pixels = stored_pixels(path)
+        numbers = pixels if pixels.ndim == 2 else pixels[..., 0]
     known = np.isfinite(numbers)
     if settings.metres_per_unit is not None:
         known &= numbers > 0
@@ -188,7 +194,7 @@ def read_number_map(path: Path, settings: DepthSettings) -> DepthMap:
     if settings.near_far_m is None:
         raise InputError(
             f"{path} does not say what its numbers mean: give --disparity NEAR:FAR in metres (largest number nearest, even steps of "
-            f"1/distance), or --depth-scale METRES_PER_STEP"
+            f"1/distance), or --depth-scale METRES_PER_STEP{_OF_ARRAYS if path.suffix.lower() in _ARRAYS else ''}"
         )
     return DepthMap.of_levels(_levels(numbers), settings.near_far_m, known, f"{path.name}, linear in dioptres")
 
@@ -202,13 +208,13 @@ def _levels(numbers: np.ndarray) -> Plane:
 
 
 def depth_of_file(path: Path, near_far_m: tuple[float, float] | None = None, *, with_holes: bool = False) -> Plane:
-    """Read depth in metres as a file stores it: EXR with Z, or with near_far_m a picture that is even in 1/distance.
+    """Read depth in metres as a file stores it: EXR with Z or an array (.npz, .npy), or with near_far_m numbers even in 1/distance.
 
     with_holes: what is unknown is NaN; else an EXR with NaN is refused, and a picture's holes take the nearest depth.
     """
-    if near_far_m is None:
+    if near_far_m is None and path.suffix.lower() not in _ARRAYS:
         return read_depth(path, with_holes=with_holes)
-    depth = read_number_map(path, DepthSettings(near_far_m))
+    depth = read_number_map(path, DepthSettings(near_far_m, metres_per_unit=None if near_far_m else 1.0))
     return _holed(depth) if with_holes else with_holes_filled(depth).depth_m
 
 
@@ -216,32 +222,41 @@ def _holed(depth: DepthMap) -> Plane:
     return np.where(depth.valid, depth.depth_m, np.float32(np.nan))
 
 
-def read_stereo(path: Path, settings: DepthSettings) -> DepthMap:
-    """Read disparity in pixels (.npz, .npy: its first array), as in the Middlebury data sets; what is not finite is unknown."""
-    if settings.stereo is None:
-        raise InputError(f"{path} holds disparity: state the cameras with --stereo-cameras FOCAL_PX,BASELINE_M,OFFSET_PX")
+_ARRAYS = (".npz", ".npy")
+_METRES = "depth"
+"""Name under which networks of metric depth write metres into an .npz."""
+_OF_ARRAYS = " (1 where they are metres), or --stereo-cameras FOCAL_PX,BASELINE_M,OFFSET_PX where they are pixels of disparity"
+
+
+def _array_of(path: Path) -> tuple[Plane, str]:
+    """Return the depth or else the first array of an .npz, or that of an .npy, and its name."""
     try:
         loaded = np.load(path)
-        disparity = np.asarray(loaded[loaded.files[0]] if hasattr(loaded, "files") else loaded, np.float32)
-    except (OSError, ValueError, IndexError) as error:
-        raise InputError(f"{path} cannot be read as an array of disparity: {error}") from None
-    if disparity.ndim != 2:
-        raise InputError(f"{path}: expected disparity (H, W) in pixels, got an array of shape {disparity.shape}")
-    calibration = settings.stereo
+        name = "" if isinstance(loaded, np.ndarray) else _METRES if _METRES in loaded else loaded.files[0]
+        numbers = np.squeeze(np.asarray(loaded[name] if name else loaded, np.float32))
+    except (OSError, ValueError, IndexError, BadZipFile) as error:
+        raise InputError(f"{path}: expected an array of numbers as numpy.save writes it, but it is damaged or something else") from error
+    if numbers.ndim != 2:
+        raise InputError(f"{path}: expected depth or disparity (H, W), got an array of shape {numbers.shape}")
+    return numbers, name
+
+
+def _of_stereo(path: Path, calibration: StereoCalibration) -> DepthMap:
+    """Read disparity in pixels, as in the Middlebury data sets; what is not finite is unknown."""
+    disparity, _ = _array_of(path)
     known = np.isfinite(disparity)
     dioptres = (np.where(known, disparity, 0.0) + calibration.offset_px) / (calibration.focal_px * calibration.baseline_m)
     return DepthMap.of_dioptres(dioptres.astype(np.float32), known, f"{path.name}, stereo of {calibration.baseline_m:g} m")
 
 
-_ARRAYS = (".npz", ".npy")
 _SAME_ASPECT, _SMALLER = 0.02, 0.75
 
 
 def open_depth(source: Path, photo_rgb: Rgb, settings: DepthSettings | None = None) -> DepthMap:
     """Read depth from any source and bring it to the photograph's size along its edges.
 
-    source: EXR with Z, PNG or TIFF (settings say what the numbers mean), disparity of stereo (.npz, .npy), a phone's photograph
-    with depth inside, or a depth network (.onnx). photo_rgb: (H, W, 3) linear.
+    source: EXR with Z, PNG or TIFF (settings say what the numbers mean), an array (.npz, .npy; one named depth holds metres), a phone's
+    photograph with depth inside, or a depth network (.onnx). photo_rgb: (H, W, 3) linear.
     Raises InputError if the source cannot be read, does not say what it means, or is of another shape than the photograph.
     """
     settings = settings or DepthSettings()
@@ -278,7 +293,7 @@ def _read(source: Path, photo_rgb: Rgb, settings: DepthSettings) -> tuple[DepthM
         known = ~np.isnan(depth_m)
         return DepthMap(np.where(known, depth_m, np.float32(np.inf)), known, source.name), False
     if suffix in _ARRAYS:
-        return read_stereo(source, settings), False
+        return (_of_stereo(source, settings.stereo) if settings.stereo else read_number_map(source, settings)), False
     phone = read_phone_photo(source, settings.near_far_m)
     return (read_number_map(source, settings), settings.metres_per_unit is None) if phone is None else (phone.depth, True)
 

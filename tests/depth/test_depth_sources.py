@@ -11,7 +11,7 @@ import pytest
 
 from mrbokeh.depth.depth_filters import guided_upsampling, refined_dioptres
 from mrbokeh.depth.depth_map import DepthSettings, StereoCalibration, parse_known, parse_near_far, parse_stereo, without_steps
-from mrbokeh.depth.open_depth import open_depth
+from mrbokeh.depth.open_depth import depth_of_file, open_depth
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.color import linear_to_srgb, srgb_to_linear
 from mrbokeh.images.exr_io import ExrPart, write_exr
@@ -58,6 +58,25 @@ def test_sixteen_bit_depth_and_stereo_disparity(tmp_path: Path) -> None:
     found = open_depth(tmp_path / "d.npz", GREY, DepthSettings(stereo=StereoCalibration(1000.0, 0.2, 20.0)))
     assert np.allclose(found.depth_m, 4.0) and found.valid.sum() == 24 * 32 - 1
     refused("--stereo-cameras", open_depth, tmp_path / "d.npz", GREY)
+
+
+def test_arrays_hold_metres_by_name_or_as_stated(tmp_path: Path) -> None:
+    """Networks of metric depth write an array named depth; of others only the user knows what they mean. 0 and NaN are unknown."""
+    depth_m = np.linspace(1.0, 4.0, 24 * 32, dtype=np.float32).reshape(1, 24, 32)
+    depth_m[0, 3, 4:6] = 0.0, np.nan
+    np.savez(tmp_path / "named.npz", focallength_px=900.0, depth=depth_m)
+    np.save(tmp_path / "plain.npy", depth_m)
+    settings = {"named.npz": DepthSettings(exact=True), "plain.npy": DepthSettings(metres_per_unit=1.0, exact=True)}
+    known = np.nan_to_num(depth_m[0]) > 0
+    for name, stated in settings.items():
+        found = open_depth(tmp_path / name, GREY, stated)
+        assert np.array_equal(found.depth_m[known], depth_m[0][known]) and np.isfinite(found.depth_m).all()
+        assert np.array_equal(depth_of_file(tmp_path / name, with_holes=True)[known], depth_m[0][known])
+    near = open_depth(tmp_path / "plain.npy", GREY, DepthSettings((1.0, 2.0), exact=True))
+    assert near.depth_m[-1, -1] == pytest.approx(1.0) and near.depth_m[0, 0] == pytest.approx(1.6)  # a quarter of the way from 0 to 4
+    refused("--depth-scale METRES_PER_STEP", open_depth, tmp_path / "plain.npy", GREY)
+    (tmp_path / "junk.npz").write_bytes(b"no array")
+    refused("damaged or something else", open_depth, tmp_path / "junk.npz", GREY)
 
 
 @pytest.mark.parametrize(("dtype", "full"), [(np.uint8, 255), (np.uint16, 65535)])
