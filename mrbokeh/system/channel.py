@@ -24,7 +24,8 @@ LOG_TIME = "%Y-%m-%d %H:%M:%S"
 class Channel:
     """Way of a command's words, and what --json says of it.
 
-    inputs: by option; outputs: files and folders that were finished; kept: what is left after Ctrl-C.
+    inputs: by option; outputs: files and folders that were finished; kept: what is left after Ctrl-C. spinner: what turns on the terminal
+    while the command says nothing, if anything does (a Live of rich).
     """
 
     quiet: bool = False
@@ -38,6 +39,7 @@ class Channel:
     figures: dict[str, Any] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
     started_s: float = field(default_factory=time.monotonic)
+    spinner: Any = None
 
     def said(self, text: str) -> None:
         """Put a text into the log, each line with its time."""
@@ -96,6 +98,8 @@ def opened() -> Iterator[Channel]:
         yield _channel
     finally:
         logging.getLogger().removeHandler(handler)
+        if _channel.spinner:
+            _channel.spinner.stop()
         if _channel.log:
             _channel.log.close()
         _channel = before
@@ -123,11 +127,26 @@ def write_object(file: Any, exit_code: int, error: str) -> None:
     print(json.dumps(channel().document(exit_code, error), indent=2), file=file, flush=True)
 
 
+@contextmanager
+def resting() -> Iterator[None]:
+    """Take the command's spinner off the terminal in the block, which writes there itself."""
+    spinner = _channel.spinner
+    if spinner is None or not spinner.is_started:
+        yield
+        return
+    spinner.stop()
+    try:
+        yield
+    finally:
+        spinner.start()
+
+
 def say(text: str, err: bool = False) -> None:
     """Say what is good to know. err: on standard error, as progress and warnings are."""
     channel().said(text)
     if not channel().quiet:
-        print(text, file=sys.stderr if err else sys.stdout, flush=True)
+        with resting():
+            print(text, file=sys.stderr if err else sys.stdout, flush=True)
 
 
 def tell(text: str, known: Mapping[str, Any] | None = None, **figures: Any) -> None:
@@ -135,7 +154,8 @@ def tell(text: str, known: Mapping[str, Any] | None = None, **figures: Any) -> N
     channel().said(text)
     channel().known |= known or {}
     channel().figures |= figures
-    print(text, flush=True)
+    with resting():
+        print(text, flush=True)
 
 
 def show(renderable: Any, **figures: Any) -> None:
@@ -144,7 +164,8 @@ def show(renderable: Any, **figures: Any) -> None:
 
     channel().figures |= figures
     console, logged = Console(highlight=False, emoji=False), Console(width=200, force_terminal=False, emoji=False)
-    console.print(renderable, soft_wrap=not console.is_terminal)
+    with resting():
+        console.print(renderable, soft_wrap=not console.is_terminal)
     with logged.capture() as text:
         logged.print(renderable, soft_wrap=True)
     channel().said(text.get())

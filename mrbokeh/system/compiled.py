@@ -31,6 +31,7 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.runtime import rtsys
 from numba.misc.appdirs import AppDirs
 
+from mrbokeh.system.channel import say
 from mrbokeh.system.compiled_libraries import link_once
 
 _config: Any = numba.config
@@ -101,7 +102,8 @@ def fingerprint(file: Path, module: str) -> str | None:
         return None
     sources = sorted(_with_imported(root, module))
     versions = f"{numba.__version__} {llvmlite.__version__} {np.__version__.split('.')[:2]} {sys.version_info[:2]}"
-    hashed = hashlib.sha256(versions.encode())
+    # Kernels for the processor of a wheel lie apart: in a folder of this machine's own numba would not find them.
+    hashed = hashlib.sha256(f"{versions} {_config.CPU_NAME or ''}".encode())
     for source in sources:
         hashed.update(source.encode() + b"\0" + hashlib.sha256(_text_of(root, source).encode()).digest())
     return hashed.hexdigest()[:32]
@@ -284,10 +286,10 @@ class _Compiling(event.Listener):  # type: ignore[misc]
             return
         self.count, self._began_s = self.count + 1, _now_s()
         if self.count == 2:
-            print("compiling for this machine, which happens once and takes up to a minute ...", file=sys.stderr, flush=True)
+            say("compiling for this machine, which happens once and takes up to a minute ...", err=True)
             self._told_s = self._began_s
         elif self.count > 2 and self._began_s - self._told_s > TELL_EVERY_S:
-            print(f"compiled {self.count - 1} kernels in {self._took_s:.0f} s ...", file=sys.stderr, flush=True)
+            say(f"compiled {self.count - 1} kernels in {self._took_s:.0f} s ...", err=True)
             self._told_s = self._began_s
 
     def on_end(self, _event: Any) -> None:

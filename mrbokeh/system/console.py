@@ -4,14 +4,16 @@ On a terminal progress is drawn as bars, in a log as a plain line now and then.
 """
 
 from collections.abc import Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from datetime import timedelta
 from typing import Any, TypeVar
 
 from rich.console import Console
+from rich.live import Live
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.spinner import Spinner
 
-from mrbokeh.system.channel import channel
+from mrbokeh.system.channel import channel, resting
 
 Item = TypeVar("Item")
 
@@ -89,7 +91,7 @@ def progress_bars() -> Iterator[Progress]:
         TimeRemainingColumn(),
     )
     console = Console(stderr=True, emoji=False)
-    with Progress(*columns, console=console) if console.is_terminal else PlainLines(console) as progress:
+    with resting(), Progress(*columns, console=console) if console.is_terminal else PlainLines(console) as progress:
         yield progress
 
 
@@ -103,9 +105,20 @@ def track(items: Iterable[Item], description: str, total: int | None = None) -> 
             progress.advance(task)
 
 
-def working(description: str) -> AbstractContextManager[object]:
+@contextmanager
+def working(description: str) -> Iterator[None]:
     """Show a spinner on the terminal while something of unknown length runs."""
-    return Console(stderr=True, emoji=False).status(description)
+    with resting(), Console(stderr=True, emoji=False).status(description):
+        yield
+
+
+def begin(command: str) -> None:
+    """Let a spinner turn on the terminal, if there is one, whenever the command neither says nor shows anything."""
+    console = Console(stderr=True, emoji=False)
+    if console.is_terminal:
+        spinner = Spinner("dots", f"{command} ...")
+        channel().spinner = Live(spinner, console=console, transient=True, redirect_stdout=False, redirect_stderr=False)
+        channel().spinner.start(refresh=True)
 
 
 @contextmanager

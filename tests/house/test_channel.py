@@ -7,11 +7,14 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from mrbokeh.cli import SUB_COMMANDS, command_of
+from mrbokeh.optics.lens import Lens
+from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.atomic_files import atomic_folder, writing_alone
 from mrbokeh.system.channel import opened, write_object
 from mrbokeh.system.errors import InputError
@@ -177,3 +180,25 @@ def test_nobody_speaks_past_the_channel() -> None:
         for path in sorted((root / package).rglob("*.py")):
             text = path.read_text(encoding="utf-8")
             assert path in speaking or not re.search(r"typer\.echo|(?<![.\w])print\(|[^r]Console\(\)", text), path
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs a terminal of its own, which Windows has not")
+def test_a_terminal_shows_at_once_what_runs_and_keeps_only_the_words(tmp_path: Path) -> None:
+    import pty
+
+    write_lens(tmp_path / "lens.json", Lens.default())
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.environ["TERM"] = "xterm"
+        os.execv(sys.executable, [sys.executable, "-m", "mrbokeh.cli", "lens", "coc", str(tmp_path / "lens.json"), "1", "2"])
+    seen = b""
+    with suppress(OSError):  # the terminal is gone when the command has ended
+        while part := os.read(terminal, 4096):
+            seen += part
+    assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
+    assert seen.index(b"lens ...") < seen.index(b"1 m: ")
+    words = seen[seen.index(b"1 m: ") :]
+    for line in re.findall(rb"[12] m: [^\r\n]*", words):
+        assert b"..." not in line and b"\x1b" not in line
+    erased, shown = b"\x1b[2K", b"\x1b[?25h"
+    assert seen.rindex(erased) > seen.rindex(b"lens ...") and seen.rindex(shown) > seen.rindex(b"\x1b[?25l")
