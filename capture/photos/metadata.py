@@ -1,6 +1,7 @@
 """Shooting data of photographs: through pyexiv2, then exiftool and exifread for what is still open; and files cut short in copying.
 
-exiftool, which reads more maker notes than any library, is used where it is on PATH; exifread is pure Python.
+exifread is pure Python and always there; where pyexiv2 is not, it comes first: exiftool, which reads more maker notes than any library and
+is used where it is on PATH, states sensors of pictures that were made smaller or turned wrongly.
 """
 
 import json
@@ -190,7 +191,7 @@ def read_metadata_of(paths: Sequence[Path], advance: Callable[[], None] = lambda
     """Return the shooting data of photographs; `advance` is called after each."""
     found, states_any = [], []
     for path in paths:
-        tags = read_tags(path)
+        tags = read_tags(path) or read_tags_with_exifread(path)
         found.append(metadata_from_tags(tags))
         # A PNG or JPEG that exiv2 reads whole and finds empty is empty for the slower ones too.
         states_any.append(tags.get("mime_type") not in _READ_WHOLE or any(name.startswith(("Exif.", "Xmp.")) for name in tags))

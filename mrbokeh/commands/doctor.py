@@ -36,8 +36,8 @@ class Component(NamedTuple):
 
 PACKAGES = (
     ("rawpy", "reading RAW photographs", "capture"),
-    ("pyexiv2", "focus distance, focal length and f-number from photographs", "capture"),
-    ("exifread", "metadata of photographs that pyexiv2 cannot open", "capture"),
+    ("pyexiv2", "focus distances, and all that XMP and makers' notes say of photographs", "capture"),
+    ("exifread", "focal length and f-number from photographs", ""),
     ("lensfunpy", "sensor sizes of cameras that do not state theirs", "capture"),
     ("pycolmap", "camera poses and depth from several viewpoints", "capture"),
     ("gphoto2", "shooting focal stacks with a tethered camera", "tether"),

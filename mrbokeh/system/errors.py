@@ -20,7 +20,6 @@ FAULT = 1
 EXTRA_OF_MODULE = {
     "rawpy": "capture",
     "pyexiv2": "capture",
-    "exifread": "capture",
     "lensfunpy": "capture",
     "pycolmap": "capture",
     "gphoto2": "tether",
