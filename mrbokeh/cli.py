@@ -13,6 +13,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 from rich.console import Console
+from typer._click.exceptions import NoArgsIsHelpError
 from typer.core import TyperGroup
 from typer.main import get_command
 
@@ -192,17 +193,20 @@ def main() -> None:
                 code = code or FAULT
             return code
 
-        code = ended(*_run(wants_object, _noted_interrupts(lambda: ended(INTERRUPTED, _stopped()))))
+        code = ended(*_run(_noted_interrupts(lambda: ended(INTERRUPTED, _stopped()))))
     sys.exit(code)
 
 
-def _run(wants_object: bool, interrupted: list[int]) -> tuple[int, str]:
+def _run(interrupted: list[int]) -> tuple[int, str]:
     """Run the command and return its exit code, and the sentence to end with or ""."""
     code: Any = 0
     try:
-        code = app(standalone_mode=False) if wants_object else app()
+        code = app(standalone_mode=False)
     except SystemExit as left:
         code = left.code
+    except NoArgsIsHelpError as nothing:
+        typer.echo(nothing.format_message(), err=True)
+        return 2, ""
     except Exception as error:
         if mistake := mistake_in(error):
             return 2, mistake

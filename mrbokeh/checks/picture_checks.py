@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float32, Int32
 
 from mrbokeh.checks.checked_picture import SHADOW, SHARP, VIRTUAL, CheckedPicture
 from mrbokeh.images.color import convert
-from mrbokeh.images.exr_io import BT2020_from_rec709
+from mrbokeh.images.exr_io import ACESCG_from_rec709, BT2020_from_rec709
 from mrbokeh.images.layer import Layer
 from mrbokeh.images.picture_codec import write_stored
 from mrbokeh.optics.lens import Lens
@@ -87,27 +87,34 @@ _SAME_DEPTH = 1e-3
 def check_numbers(report: CheckReport, picture: CheckedPicture, plate_rgb: Rgb | None) -> None:
     """Check the picture and its layers for NaN, alpha outside [0, 1] and negative light.
 
-    Layers are rendered in Rec.709 and have nothing below 0. Strong colours of a camera are negative in Rec.709: in the picture only what is
-    below the plate counts or, without one, what no colour of BT.2020 has. What storing explains is allowed; lossy films cannot be judged.
+    Strong colours of a camera are negative in Rec.709: in the picture only what is below the plate counts or, without one, what no colour
+    of BT.2020 has. In layers, and in files of other primaries, colours that only ACEScg has are none of ours. What storing explains is
+    allowed; lossy films cannot be judged.
     """
-    light = _in_bt2020(picture.rgb) if plate_rgb is None else picture.rgb - np.minimum(plate_rgb, np.float32(0.0))
-    _check(report, picture.name, picture.rgb, picture.alpha, light, DARK_SLACK + picture.storage.dark_step(picture.rgb))
+    light = _in(BT2020_from_rec709, picture.rgb) if plate_rgb is None else picture.rgb - np.minimum(plate_rgb, np.float32(0.0))
+    darkest = _least(light, picture.rgb) if picture.storage.mixes else light.min(axis=2)
+    _check(report, picture.name, picture.rgb, picture.alpha, darkest, DARK_SLACK + picture.storage.dark_step(picture.rgb))
     for name, layer in picture.layers.items():
         slack = np.full_like(layer.alpha, DARK_SLACK) + (picture.storage.dark_step(layer.rgb) if picture.storage.is_linear else 0.0)
-        _check(report, f"{picture.name}, layer {name}", layer.rgb, layer.alpha, layer.rgb, slack)
+        _check(report, f"{picture.name}, layer {name}", layer.rgb, layer.alpha, _least(layer.rgb, layer.rgb), slack)
 
 
-def _in_bt2020(rgb: Rgb) -> Rgb:
-    return np.where(np.isfinite(rgb), convert(np.nan_to_num(rgb, posinf=0.0, neginf=0.0), BT2020_from_rec709), np.float32(np.nan))
+def _least(light: Rgb, rgb: Rgb) -> Plane:
+    """Return the least channel of the light, or that of the colour in ACEScg where that is more."""
+    return np.maximum(light.min(axis=2), _in(ACESCG_from_rec709, rgb).min(axis=2))
 
 
-def _check(report: CheckReport, where: str, rgb: Rgb, alpha: Plane | None, light: Rgb, slack: Plane) -> None:
-    """Check one picture or layer. light: the picture as far as it must not be negative by more than the slack."""
+def _in(other_from_rec709: np.ndarray, rgb: Rgb) -> Rgb:
+    return np.where(np.isfinite(rgb), convert(np.nan_to_num(rgb, posinf=0.0, neginf=0.0), other_from_rec709), np.float32(np.nan))
+
+
+def _check(report: CheckReport, where: str, rgb: Rgb, alpha: Plane | None, darkest: Plane, slack: Plane) -> None:
+    """Check one picture or layer. darkest: the least of its channels, which must not be negative by more than the slack."""
     lost = ~np.isfinite(rgb).all(axis=2)
     if alpha is not None:
         lost |= ~np.isfinite(alpha)
     _note(report, "nan", where, lost, "NaN or infinity", float(lost.sum()), 0.0)
-    dark = np.where(np.isfinite(light), light, np.float32(0.0)).min(axis=2)
+    dark = np.where(np.isfinite(darkest), darkest, np.float32(0.0))
     worst = np.unravel_index(np.argmin(dark + slack), dark.shape)
     _note(report, "negative", where, dark < -slack, "negative light", float(dark[worst]), -float(slack[worst]))
     if alpha is not None:

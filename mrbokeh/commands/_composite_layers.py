@@ -96,6 +96,12 @@ class _FileLayers:
         from mrbokeh.shots.layer_sources import layer_sequence
 
         sequences = [layer_sequence(path, object_names) for path in paths]
+        for path, sequence in zip(paths, sequences, strict=True):
+            if len(sequence.paths) > 1:
+                one = next(iter(sequence.paths.values()))
+                raise InputError(
+                    f"--layer {path} is {len(sequence.paths)} pictures: name one, such as {one}, or put all into a clip with `video`"
+                )
         flat = [layer for each in sequences if not each.is_deep for layer in each.layers(each.frames[0])]
         return cls(flat, [each.samples(each.frames[0]) for each in sequences if each.is_deep])
 

@@ -113,7 +113,7 @@ def blur_told(plate: Plate, sharp: Sequence[Layer]) -> tuple[str, dict[str, Any]
     if not len(seen_m):
         return told, known, {}
     nearest_m, farthest_m = seen_m.min(), seen_m.max()
-    coc_px = np.abs(lens.coc_px(np.array([nearest_m, farthest_m, np.clip(lens.focus_distance_m, nearest_m, farthest_m)]), width_px))
+    coc_px = np.abs(lens.coc_px(seen_m, width_px))
     size = f", {_size_px(sharp)} px" if plate.metres_guessed else ""
     far = f"{nearest_m:.3g} to {farthest_m:.3g} {unit} from the lens"
     told = f"{told}; put in at {far}{size}, blurred by {coc_px.min():.1f} to {coc_px.max():.1f} px"

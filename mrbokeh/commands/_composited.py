@@ -91,8 +91,11 @@ def composited(
         warn(f"{touching:.0%} of what is put in all but touches the lens, where its blur is wider than two pictures: it is left out")
     if options.standing.at_pixel:
         plate = with_ground_behind(plate, options.standing.pixels, sharp)
-    if asked is not None and asked.object_ and (warning := placing_warning(drawn, plate, mode, " ".join(asked.height or ()))):
+    if asked is not None and asked.object_ and (warning := placing_warning(drawn, " ".join(asked.height or ()))):
         warn(warning)
+    much = _MUCH_HIDDEN if asked is not None and asked.object_ else _ALL_HIDDEN  # layers of others may have a sky behind all
+    if asked is not None and (warning := hidden_warning(drawn, plate, mode, much)):
+        warn(warning + ("" if asked.object_ else "; is Z of the layers in metres along the axis?"))
     with nullcontext() if kept else working("blurring"):
         inserted = insertion.insert(plate, sharp, renderer)
         if options.standing.object_ and not options.standing.plain and is_monochrome(plate):
@@ -129,10 +132,10 @@ def _nothing_seen(standing: ObjectOptions, virtual: VirtualOptions) -> None:
     warn("nothing of the layers is in the picture: their alpha is 0 everywhere")
 
 
-def placing_warning(sharp: Sequence[Layer], plate: Plate, mode: str, height: str) -> str | None:
-    """Return a warning if an object is smaller than a pixel, reaches across the whole picture, or is mostly hidden; None else.
+def placing_warning(sharp: Sequence[Layer], height: str) -> str | None:
+    """Return a warning if an object is smaller than a pixel or reaches across the whole picture; None else.
 
-    height: the option --height as typed, which mends the first two; "" without it.
+    height: the option --height as typed, which mends it; "" without it.
     """
     alpha = np.maximum.reduce([layer.alpha for layer in sharp])
     rows, columns = np.nonzero(alpha > 0.5)
@@ -145,12 +148,20 @@ def placing_warning(sharp: Sequence[Layer], plate: Plate, mode: str, height: str
     whole = len(rows) and (np.ptp(rows) + 1, np.ptp(columns) + 1) == alpha.shape
     if whole:
         return f"what is put in reaches across the whole picture; {mend}"
+    return None
+
+
+def hidden_warning(sharp: Sequence[Layer], plate: Plate, mode: str, much: float) -> str | None:
+    """Return a warning if more than a share of what is put in lies behind what the depth has before it, or all behind the matte."""
+    alpha = np.maximum.reduce([layer.alpha for layer in sharp])
+    if not alpha.any():
+        return None
     if plate.near_alpha is not None and float(alpha[plate.near_alpha > 0.5].sum()) > _ALL_HIDDEN * float(alpha.sum()):
         return "all of it lies behind what the matte shows in front: white is in front, black is behind"
     if plate.depth_m is None or mode == "front":
         return None
     depth_m = np.minimum.reduce([np.where(layer.alpha > 0.5, layer.depth_m, np.inf) for layer in sharp])
     hidden = float(nearer_than(plate.depth_m, depth_m, _NEARER).sum() / max(1, np.isfinite(depth_m).sum()))
-    if hidden < _MUCH_HIDDEN:
+    if hidden < much:
         return None
     return f"{hidden:.0%} of it lies behind what the depth says is nearer; --mode front ignores depth"

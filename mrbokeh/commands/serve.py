@@ -8,6 +8,7 @@ import hmac
 import json
 import os
 import secrets
+import signal
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -71,6 +72,8 @@ def serve(
         listening.token, listening.queue = token, queue
         _write_connection(path, {"format": FORMAT, "port": listening.server_port, "token": token})
         unfinished(path)  # so that it goes however this ends
+        with suppress(ValueError):  # not the main thread
+            signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
         try:
             Thread(target=listening.serve_forever, daemon=True).start()
             tell(f"blurring for programs on this machine: port {listening.server_port}, token in {path}; Ctrl-C ends it")

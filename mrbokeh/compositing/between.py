@@ -61,6 +61,8 @@ LEAST_LIGHT = np.float32(1e-5)
 _ALL = 1e-4
 _MOST_NEAR = 0.995
 _ROUND = 1e-9
+_NOISE = 0.01
+"""Light below 0 that noise of a camera explains."""
 _MOST_CHANGE, _LEAST_PART = 3.0, 0.02
 _UNEXPLAINED = 0.5
 Colours = Float32[np.ndarray, "places 3"]
@@ -259,6 +261,10 @@ class Between:
         same_size(plate, layers)
         if not any(shows_anything(layer) for layer in layers):
             return Inserted(plate.rgb, flatten(layers) if layers else clear(*plate.rgb.shape[:2]))
+        lift = _Lift.of(plate, layers)
+        return lift.taken_back(self._inserted(lift.plate(plate), [lift.layer(each) for each in layers], renderer), plate)
+
+    def _inserted(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> Inserted:
         sharp = flatten([replace(layer, extra={}) for layer in layers])
         depth_m = virtual_depth_m(sharp)
         blurred = renderer.render(layers, plate.lens)
@@ -337,6 +343,10 @@ class Rerendered:
             )
         if not any(shows_anything(layer) for layer in layers):
             return Inserted(plate.rgb, flatten(layers) if layers else clear(*plate.rgb.shape[:2]))
+        lift = _Lift.of(plate, layers)
+        return lift.taken_back(self._inserted(lift.plate(plate), [lift.layer(each) for each in layers], renderer), plate)
+
+    def _inserted(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> Inserted:
         scene = Between(self.tolerance, refine_edges=self.refine_edges).cut(plate, layers, renderer)
         near = [scene.near] if scene.near.alpha.any() else []
         picture = renderer.render([*near, *layers, scene.far], plate.lens)
@@ -346,6 +356,38 @@ class Rerendered:
         touched = (seen.alpha > LEAST_LIGHT) | (np.abs(seen.rgb).max(axis=2) > LEAST_LIGHT)
         left = np.where(touched[..., None], np.maximum(picture.rgb - seen.rgb, 0.0), plate.rgb)
         return Inserted(left, Layer(seen.rgb * touched[..., None], seen.alpha * touched, seen.depth_m))
+
+
+@dataclass(frozen=True, eq=False)
+class _Lift:
+    """Light (3,) that is added everywhere while colours are parted, which takes light for what is not below 0.
+
+    Colours of a wider gamut than Rec.709 are. What covers all of a pixel has all of it, what covers a part its part, so that it leaves
+    again with no trace.
+    """
+
+    rgb: Float32[np.ndarray, "3"]
+
+    @classmethod
+    def of(cls, plate: Plate, layers: Sequence[Layer]) -> "_Lift":
+        pictures = [plate.rgb, *(() if plate.sharp_rgb is None else (plate.sharp_rgb,)), *(layer.rgb for layer in layers)]
+        lowest = np.min([picture.min(axis=(0, 1)) for picture in pictures], axis=0)
+        return cls(np.where(lowest < -_NOISE, -lowest, 0.0).astype(np.float32))
+
+    def plate(self, plate: Plate) -> Plate:
+        if not self.rgb.any():
+            return plate
+        return replace(plate, rgb=plate.rgb + self.rgb, sharp_rgb=None if plate.sharp_rgb is None else plate.sharp_rgb + self.rgb)
+
+    def layer(self, layer: Layer) -> Layer:
+        return replace(layer, rgb=layer.rgb + layer.alpha[..., None] * self.rgb) if self.rgb.any() else layer
+
+    def taken_back(self, found: Inserted, plate: Plate) -> Inserted:
+        if not self.rgb.any():
+            return found
+        alpha = found.virtual.alpha[..., None]
+        left = np.where(found.photo_rgb == plate.rgb + self.rgb, plate.rgb, found.photo_rgb - (np.float32(1.0) - alpha) * self.rgb)
+        return Inserted(left, replace(found.virtual, rgb=found.virtual.rgb - alpha * self.rgb))
 
 
 def clean_colours(picture: Picture, alpha: Plane) -> tuple[Picture, Picture]:

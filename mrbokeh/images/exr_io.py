@@ -250,3 +250,4 @@ def _known(matrix: Float64[np.ndarray, "3 3"] | None) -> Float64[np.ndarray, "3 
 
 
 BT2020_from_rec709 = np.linalg.inv(_known(rec709_from_chromaticities(BT2020)))
+ACESCG_from_rec709 = np.linalg.inv(_known(rec709_from_chromaticities(AP1)))

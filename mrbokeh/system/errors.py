@@ -7,7 +7,9 @@ import sys
 import tempfile
 import traceback
 from contextlib import suppress
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 INTERRUPTED = 130
 """Exit code of a command that Ctrl-C stopped, as shells have it."""
@@ -74,8 +76,8 @@ def mistake_in(error: Exception) -> str:
     """Return the sentence for an error that the user can mend, else ""."""
     if isinstance(error, InputError):
         return str(error)
-    if hasattr(error, "format_message"):  # of the parser, where it does not print itself
-        return str(error.format_message())
+    if hasattr(error, "format_message"):
+        return _of_parser(error)
     if isinstance(error, ModuleNotFoundError):
         extra = EXTRA_OF_MODULE.get((error.name or "").partition(".")[0])
         return str(MissingExtraError(str(error.name), extra)) if extra else ""
@@ -88,6 +90,25 @@ def mistake_in(error: Exception) -> str:
     if isinstance(error, OSError) and isinstance(error.filename, str | bytes):
         return _refused(error)
     return ""
+
+
+_PARSERS_WORDS = {
+    "Input should be a valid number, unable to parse string as a number": "expected a number",
+    "Input should be a valid integer, unable to parse string as an integer": "expected a whole number",
+}
+
+
+def _of_parser(error: Any) -> str:
+    """Return the sentence of the command line's parser, with what was typed and where it is told what may be."""
+    text = str(error.format_message()).rstrip(".")
+    for theirs, ours in _PARSERS_WORDS.items():
+        text = text.replace(theirs, ours)
+    words, context = sys.argv[1:], getattr(error, "ctx", None)
+    names = getattr(getattr(error, "param", None), "opts", ())
+    typed = [value for name, value in pairwise(words) if name in names]
+    typed += [word.partition("=")[2] for word in words if word.partition("=")[0] in names and "=" in word]
+    got = f", got {typed[0]}" if typed and typed[0] not in text and not text.startswith("Missing") else ""
+    return f"{text}{got}: see `{context.command_path} --help`" if context is not None else text + got
 
 
 def fault_in(error: Exception) -> str:

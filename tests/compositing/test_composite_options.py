@@ -380,9 +380,8 @@ def test_glass_is_no_speck() -> None:
     speck[20, 20] = 0.6
     black, far = np.zeros((HEIGHT, WIDTH, 3), np.float32), np.float32(np.inf)
     layers = [Layer(black, each, np.where(each > 0, np.float32(1.0), far)) for each in (alpha, speck)]
-    plate = plate_of(plate_rgb(), LENS)
-    assert placing_warning(layers[:1], plate, "over", "0.1") is None
-    assert "smaller than a pixel" in str(placing_warning(layers[1:], plate, "over", "0.1"))
+    assert placing_warning(layers[:1], "0.1") is None
+    assert "smaller than a pixel" in str(placing_warning(layers[1:], "0.1"))
 
 
 def test_panoramas_are_refused_or_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

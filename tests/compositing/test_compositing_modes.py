@@ -67,6 +67,21 @@ def test_no_layers_or_pixels_without_virtual_light_give_the_plate_bit_for_bit(mo
 
 
 @each_mode
+def test_colours_that_rec709_has_not_stay_as_they_are(mode: str) -> None:
+    """Green of ACEScg is (-0.15, 0.38, 0.05) in Rec.709; in the middle of a card only it is seen, of a plate below 0 nothing."""
+    green = (-0.15, 0.38, 0.05)
+    picture = inserted(mode, [card(1.0, green)], plate()).rgb
+    np.testing.assert_allclose(picture[16:32, 24:40], np.broadcast_to(np.float32(green), (16, 16, 3)), atol=2e-4)
+    photo = plate()
+    photo.rgb[..., 2] -= 0.4
+    assert photo.sharp_rgb is not None
+    photo.sharp_rgb[..., 2] -= 0.4
+    picture = inserted(mode, [card(1.0)], photo).rgb
+    np.testing.assert_allclose(picture[16:32, 24:40], np.broadcast_to(np.float32(RED), (16, 16, 3)), atol=2e-4)
+    assert (picture[:, 60:] == photo.rgb[:, 60:]).all()
+
+
+@each_mode
 @pytest.mark.parametrize("renderer", [ScatterReference(), PolygonDifferences()], ids=["scatter", "polygon"])
 def test_pixels_without_virtual_light_are_the_plates_bit_for_bit(mode: str, renderer: Renderer) -> None:
     photo = plate()

@@ -127,7 +127,7 @@ def test_an_interrupt_that_became_another_error_is_still_an_interrupt(monkeypatc
     """As numba's compiler turns it into one of its own; without an interrupt it is a fault, and said to be one."""
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
 
-    def interrupted() -> None:
+    def interrupted(**_: object) -> None:
         try:
             os.kill(os.getpid(), signal.SIGINT)
             signal.pause()

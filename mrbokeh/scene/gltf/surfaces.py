@@ -115,7 +115,10 @@ def open_gltf(path: str | Path) -> GltfFile:
         raise InputError(f"expected a .glb or .gltf file, found none at {path}: check the path")
     try:
         text, blob = _chunks(path.read_bytes())
-        gltf = json.loads(text, object_hook=_Part)
+        try:
+            gltf = json.loads(text, object_hook=_Part)
+        except UnicodeDecodeError:
+            raise ValueError("neither .glb nor the JSON of a .gltf") from None
         for name in _LISTS:
             if not all(isinstance(each, _Part) for each in gltf.setdefault(name, [])):
                 raise ValueError(f"its {name} are no list of objects")
