@@ -72,6 +72,7 @@ def test_another_exposure_and_white_balance_match_as_well() -> None:
     assert whole > 0.85
 
 
+@pytest.mark.slow
 def test_the_scale_is_that_of_the_baseline() -> None:
     rgb, second_rgb = first()[0], seen_from(*WAYS_M["right"])[0]
     one, double = (stereo_depth(rgb, second_rgb, camera(), baseline_m, PHOTOS).depth_m for baseline_m in (0.06, 0.12))

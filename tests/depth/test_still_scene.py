@@ -40,6 +40,7 @@ def shares_right(depth: np.ndarray, truth: np.ndarray) -> float:
     return float((np.abs(depth / truth - 1.0) < 0.02).mean())
 
 
+@pytest.mark.slow
 def test_a_picture_that_was_not_swept_has_the_scenes_depth(views: TracedViews, scene: StillScene) -> None:
     """Within 2 %: wrong pixels lie beside the card's edges, where windows of 5 px reach over 4 edges of 112 px in 160x112."""
     found = scene.depth_of(pictures(views)[-1])

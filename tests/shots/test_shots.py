@@ -313,6 +313,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGKILL")
+@pytest.mark.slow
 def test_a_killed_run_goes_on_where_it_was(tmp_path: Path) -> None:
     """The whole program dies of signal 9 after its first segments; its workers leave by themselves; the same again ends as in one go."""
     clip = clip_of_blobs(tmp_path)

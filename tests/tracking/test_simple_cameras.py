@@ -133,6 +133,7 @@ def test_a_rolling_shutter_does_not_pass_for_a_tilt() -> None:
     assert solve.kind == FLAT and abs(middle.camera.camera_from_world[2, :3] @ normal) > np.cos(np.radians(3.0))
 
 
+@pytest.mark.slow
 def test_a_room_with_depth_is_left_to_colmap() -> None:
     """Walked through, neither simple camera explains it; a stated focal length is kept to the pixel."""
     walking = [room_camera((-0.8 + 1.2 * t, 0.1 * np.sin(6 * t), -0.3 + 0.4 * t), (0.2, 0.05, 3.0)) for t in np.linspace(0.0, 1.0, COUNT)]

@@ -152,6 +152,7 @@ def test_pages_hold_tables_and_finished_runs_are_not_trained_again(
     refused("other settings \\(epochs\\)", ablate, scene, *common, "--epochs", 2)
 
 
+@pytest.mark.slow
 def test_a_stopped_table_goes_on(scene: Path, small_base: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Stopped in the second row: the first is kept and has its table; the same command trains the second alone."""
     fit, trained = train.fit, list[str]()

@@ -232,6 +232,7 @@ def test_many_networks_on_stacks_that_none_has_seen(scene: Path, runs: list[Path
     assert {each.name for each in (tmp_path / "out").iterdir()} == {f"evaluation{end}" for end in (".md", ".csv", ".png", "_crops.png")}
 
 
+@pytest.mark.slow
 def test_one_network_with_its_data_behind_it(scene: Path, runs: list[Path]) -> None:
     """The short form; the network is called "network" and its results lie in its run. No weights of LPIPS: the table says so."""
     told = printed_by(app, "evaluate", runs[0], scene, "--renderer", "none", "--pull", "0")

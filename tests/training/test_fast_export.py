@@ -83,6 +83,7 @@ def _facts(largest_px: float = 5.0) -> RunFacts:
     return RunFacts(Lens(35.0, 2.8, 1.0, 23.5), 64, 48, largest_px, TOP, (), (), None)
 
 
+@pytest.mark.slow
 def test_the_file_is_an_ordinary_network_and_a_record_lies_beside_it(tmp_path: Path) -> None:
     settings = replace(GATED, width=1)
     network, path = untrained(settings, 5.0), tmp_path / "fast.onnx"

@@ -169,6 +169,7 @@ def test_the_trained_range_goes_from_minus_1_to_1_in_stops_and_little_is_hardly_
     assert scale(torch.tensor([[2.8 * 1.005, 35.0]]))[0, 0].item() == pytest.approx(0.0144, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_ranges_are_the_runs_not_the_weights_and_one_lens_is_one(exported: OnnxNetwork) -> None:
     """Weights of a run load into a network that is built from its facts; without ranges in the facts those of its one lens hold."""
     network = _network()

@@ -166,6 +166,7 @@ def looks_of(values: list[float], monkeypatch: pytest.MonkeyPatch) -> list[dict[
     return seen
 
 
+@pytest.mark.slow
 def test_patience_ends_a_run_and_keeps_the_best_across_an_interruption(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
