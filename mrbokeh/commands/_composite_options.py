@@ -57,6 +57,9 @@ class PlateOptions(shared.NearOptions):
     ] = None
     disparity: shared.DisparityOption = None
     depth_scale: Annotated[float | None, typer.Option(help="--depth holds distance: metres for each step; 0 is unknown.")] = None
+    stereo_cameras: Annotated[
+        str | None, typer.Option(metavar="FOCAL_PX,BASELINE_M,OFFSET_PX", help="--depth holds disparity in pixels, of these two cameras.")
+    ] = None
     exact_depth: shared.ExactDepthOption = False
 
     def require_meant(self, photo: Path) -> None:
@@ -70,7 +73,12 @@ class PlateOptions(shared.NearOptions):
             )
         if self.stereo is None:
             return
-        other = {"--depth": self.depth, "--disparity": self.disparity, "--depth-scale": self.depth_scale}
+        other = {
+            "--depth": self.depth,
+            "--disparity": self.disparity,
+            "--depth-scale": self.depth_scale,
+            "--stereo-cameras": self.stereo_cameras,
+        }
         given = [name for name, value in other.items() if value is not None]
         if given:
             raise InputError(f"--stereo takes depth from two photographs, and {given[0]} tells another: leave one of them out")
@@ -402,7 +410,10 @@ class CompositeOptions:
     def _require_options_of_stacks(self) -> None:
         """Raise InputError if an option is given that is of one picture, and that --all-slices would not follow."""
         one_picture = (
-            (self.taken, ("slice_", "depth", "stereo", "baseline", "rgb", "disparity", "depth_scale", "matte", "near_distance")),
+            (
+                self.taken,
+                ("slice_", "depth", "stereo", "baseline", "rgb", "disparity", "depth_scale", "stereo_cameras", "matte", "near_distance"),
+            ),
             (self.optics, ("focus", "focus_at")),
             (self.look, tuple(vars(self.look))),
             (self.colour, ("input_space", "output_space")),

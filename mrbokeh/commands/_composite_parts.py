@@ -21,7 +21,7 @@ from mrbokeh.compositing.plate import (
     with_own_alpha,
     with_stereo,
 )
-from mrbokeh.depth.depth_map import DepthSettings, parse_near_far
+from mrbokeh.depth.depth_map import DepthSettings, parse_near_far, parse_stereo
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.alpha_io import HOLDING_ALPHA, alpha_with, write_finished
 from mrbokeh.images.color_management import NamedSpace
@@ -62,10 +62,9 @@ def plate_by(whole: CompositeOptions, bundle: CaptureBundle | None, *, lens: Len
         plate = with_stereo(plate, _rgb_of(options.stereo, colour), options.baseline, (photo, options.stereo), exact=options.exact_depth)
     source = options.depth or (photo if near_far_m or options.depth_scale else None)
     if source is not None:
-        before_m, plate = (
-            plate.depth_m,
-            with_depth(plate, source, DepthSettings(near_far_m, options.depth_scale, exact=options.exact_depth)),
-        )
+        cameras = None if options.stereo_cameras is None else parse_stereo(options.stereo_cameras)
+        settings = DepthSettings(near_far_m, options.depth_scale, cameras, exact=options.exact_depth)
+        before_m, plate = plate.depth_m, with_depth(plate, source, settings)
         plate = replace(plate, depth_note="", metres_guessed=plate.metres_guessed and photo.is_dir())
         if own is not None and plate.blur_from and before_m is not None:
             plate = with_blur_in_metres(plate, before_m, focus_m)

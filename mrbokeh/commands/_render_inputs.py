@@ -98,8 +98,10 @@ def read_sharp(sources: SharpOptions) -> dict[str, Layer]:
 
 
 def _read(sources: SharpOptions) -> dict[str, Layer]:
+    from mrbokeh.depth.open_depth import one_distance_m
+
     rgb, depth = sources.rgb, sources.depth
-    near_far_m = near_far_of(sources.disparity, None if rgb is None or depth is None or _is_distance(depth) else depth)
+    near_far_m = near_far_of(sources.disparity, None if rgb is None or depth is None or one_distance_m(depth) else depth)
     sharp = {str(path): _whole_layer(path) for path in sources.layer or ()}
     if (rgb is None) != (depth is None):
         raise InputError("--rgb and --depth belong together: give both, or only --layer")
@@ -129,30 +131,19 @@ def _whole_layer(path: Path) -> Layer:
 
 def _picture(rgb: Path, depth: Path, near_far_m: tuple[float, float] | None, sources: SharpOptions) -> Layer:
     from mrbokeh.depth.mended_depth import mended_aloud
-    from mrbokeh.depth.open_depth import depth_of_file
+    from mrbokeh.depth.open_depth import depth_of_file, one_distance_m
     from mrbokeh.images.image_io import read_image, read_linear
     from mrbokeh.images.layer import opaque
 
     linear_or = "develop the RAW file to EXR first, or say with --srgb that it is sRGB if that is all there is"
     colour = read_image(rgb) if sources.srgb else read_linear(rgb, linear_or)
-    if _is_distance(depth):
-        return opaque(colour, np.full(colour.shape[:2], float(str(depth)), np.float32))
+    if distance_m := one_distance_m(depth):
+        return opaque(colour, np.full(colour.shape[:2], distance_m, np.float32))
     depth_m = depth_of_file(depth, near_far_m, with_holes=not sources.exact_depth)
     if colour.shape[:2] != depth_m.shape:
         sizes = f"{rgb} is {colour.shape[1]}x{colour.shape[0]} px, {depth} {depth_m.shape[1]}x{depth_m.shape[0]} px"
         raise InputError(f"picture and depth must be of one size, but {sizes}: resize the depth with its nearest pixels, not between them")
     return opaque(colour, depth_m if sources.exact_depth else mended_aloud(depth_m, colour))
-
-
-def _is_distance(depth: Path) -> bool:
-    """Return whether --depth is one distance for all, such as 4, and no file. Raises InputError for one that is not above 0."""
-    try:
-        distance_m = float(str(depth))
-    except ValueError:
-        return False
-    if not depth.exists() and not distance_m > 0.0:
-        raise InputError(f"--depth: expected a file, or metres above 0 such as 4, got {depth}")
-    return not depth.exists()
 
 
 def _moving(sharp: dict[str, Layer], sources: SharpOptions) -> dict[str, Layer]:

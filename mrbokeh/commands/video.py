@@ -389,7 +389,8 @@ def video(
         say(carried)
     note = _made(shot, _executor(work, len(shot.segments)), result.overwrite)
     frames = len(shot.taken)
-    told = f"wrote {out} ({source.info.width_px}x{source.info.height_px} px, {frames} frame{'' if frames == 1 else 's'}, {note})"
+    size = f"{source.info.width_px}x{source.info.height_px} px"
+    told = f"wrote {out} ({size}, {frames} frame{'' if frames == 1 else 's'}, {note}; {recipe.mode})"
     tell(told, known=recipe.stated_lens.facts, frames=frames, size_px=(source.info.width_px, source.info.height_px))
 
 

@@ -255,11 +255,15 @@ _SAME_ASPECT, _SMALLER = 0.02, 0.75
 def open_depth(source: Path, photo_rgb: Rgb, settings: DepthSettings | None = None) -> DepthMap:
     """Read depth from any source and bring it to the photograph's size along its edges.
 
-    source: EXR with Z, PNG or TIFF (settings say what the numbers mean), an array (.npz, .npy; one named depth holds metres), a phone's
-    photograph with depth inside, or a depth network (.onnx). photo_rgb: (H, W, 3) linear.
+    source: one distance for all (a number in place of a file), EXR with Z, PNG or TIFF (settings say what the numbers mean), an array
+    (.npz, .npy; one named depth holds metres), a phone's photograph with depth inside, or a depth network (.onnx).
+    photo_rgb: (H, W, 3) linear.
     Raises InputError if the source cannot be read, does not say what it means, or is of another shape than the photograph.
     """
     settings = settings or DepthSettings()
+    if distance_m := one_distance_m(source):
+        shape = photo_rgb.shape[:2]
+        return DepthMap(np.full(shape, distance_m, np.float32), np.ones(shape, bool), f"{distance_m:g} m everywhere")
     require_file(source, "depth")
     if settings.stereo is not None and source.suffix.lower() not in _ARRAYS:
         raise InputError(f"--stereo-cameras is for a file of disparity ({', '.join(_ARRAYS)}), got {source}: leave it out")
@@ -272,6 +276,19 @@ def open_depth(source: Path, photo_rgb: Rgb, settings: DepthSettings | None = No
     if refine and smaller:
         return at_size_of(_mended(depth, photo_rgb), photo_rgb, refine)
     return _mended(at_size_of(depth, photo_rgb, False), photo_rgb)
+
+
+def one_distance_m(depth: Path) -> float | None:
+    """Return the distance of all that is seen where --depth is a number such as 4, and no file. Raises InputError if it is not above 0."""
+    try:
+        distance_m = float(str(depth))
+    except ValueError:
+        return None
+    if depth.exists():
+        return None
+    if not distance_m > 0.0:
+        raise InputError(f"--depth: expected a file, or metres above 0 such as 4, got {depth}")
+    return distance_m
 
 
 def _mended(depth: DepthMap, photo_rgb: Rgb) -> DepthMap:
