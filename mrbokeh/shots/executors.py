@@ -160,8 +160,9 @@ class _Tally:
         self._progress, self._told = progress, 0
 
     def tell(self, what: str, number: int) -> None:
-        self._made[number] = self._made[number] + 1 if what == "made" else 0
-        self.update()
+        if number in self._missing:  # words about a part that was found finished may come late
+            self._made[number] = self._made[number] + 1 if what == "made" else 0
+            self.update()
 
     @property
     def missing(self) -> int:

@@ -282,7 +282,7 @@ class Stage:
         wanted, drawn, setup = self._wanted, self._thread.newest, self._thread.setup
         if drawn is None or wanted is None or self.seen is None:
             return Remark(self._thread.problem or preparing(self._thread.busy))
-        if self.seen.overlay.rgb.size or drawn.setup is not setup:
+        if self.seen.overlay.rgb.size or drawn.setup is not setup or drawn.drawing is not self.seen.drawing:
             return None
         remark = reason_unseen(setup.staged.description.objects, drawn.drawing.extent_m, self.seen.camera)
         soon_seen = remark.arrow is None and is_outdated(drawn.drawing, wanted, setup.staged.is_animated)
