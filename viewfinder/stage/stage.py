@@ -282,11 +282,12 @@ class Stage:
         wanted, drawn, setup = self._wanted, self._thread.newest, self._thread.setup
         if drawn is None or wanted is None or self.seen is None:
             return Remark(self._thread.problem or preparing(self._thread.busy))
-        if self.seen.overlay.rgb.size or drawn.setup is not setup or drawn.drawing is not self.seen.drawing:
+        if self.seen.overlay.rgb.size or drawn.setup is not setup:
             return None
         remark = reason_unseen(setup.staged.description.objects, drawn.drawing.extent_m, self.seen.camera)
-        soon_seen = remark.arrow is None and is_outdated(drawn.drawing, wanted, setup.staged.is_animated)
-        return None if soon_seen else remark
+        # What the picture shows may be older than the newest drawing, which comes with the next frame.
+        is_old = drawn.drawing is not self.seen.drawing or is_outdated(drawn.drawing, wanted, setup.staged.is_animated)
+        return None if remark.arrow is None and is_old else remark
 
     def picture(self, view: str, plate_bgr: Bgr, tables: CodeTables) -> Bgr:
         """Return one of `views`, of the frame for which `overlay` was asked last."""
