@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import cv2
 import numpy as np
@@ -36,7 +37,7 @@ Light = UInt8[np.ndarray, "height width"]
 class FocusVolume:
     """Focus energies of a stack.
 
-    energies (slices, h, w): local energy of fine detail in every slice, over that of noise at this brightness.
+    energies (slices, h, w): local energy of fine detail in every slice, over that of noise in the noisiest slice of the place.
     lights (slices, h, w): mean over the channels of the square root of light, 255 at display white. shape: (H, W) of the pictures,
     h = ceil(H / shrink). details: of every slice, by blocks (`block_detail`).
     """
@@ -111,9 +112,7 @@ def focus_volume(registered: Iterable[Rgb], valid: Callable[[int], Mask] | None 
         lights.append(np.minimum(cv2.transform(small, np.full((1, 3), _WHITE / 3.0)), _WHITE).astype(np.uint8))
         levels.append(np.minimum(cv2.transform(small, np.full((1, 3), _LEVELS / 3.0)), _LEVELS - 1).astype(np.uint8))
     volume = np.stack(energies)
-    floors = noise_floors(volume, levels)
-    for energy, level in zip(volume, levels, strict=True):
-        energy /= floors[level]
+    _as_noisy_as_the_noisiest(volume, levels, noise_floors(volume, levels))
     return FocusVolume(volume, np.stack(lights), (rgb.shape[0], rgb.shape[1]), tuple(details))
 
 
@@ -142,6 +141,18 @@ def noise_floors(energies: Volume, levels: list[Light]) -> Float32[np.ndarray, "
         return np.full(_LEVELS, (np.percentile(energy, _NOISE_PERCENTILE) if energy.size else 0.0) + 1e-9, np.float32)
     floors = np.exp(np.interp(np.arange(_LEVELS), list(lows), np.log(np.array(list(lows.values())) + 1e-12)))
     return np.maximum(floors, max(_LEAST_OF_MEDIAN * np.median(list(lows.values())), 1e-9)).astype(np.float32)
+
+
+def _as_noisy_as_the_noisiest(energies: Volume, levels: list[Light], floors: Float32[np.ndarray, " levels"]) -> None:
+    """Give each slice the noise that it lacks beside the noisiest one of a place, then divide all by that; 0 stays 0.
+
+    One divisor for all: beside a strong edge noise is nothing, but there a blurred slice may be nearly white, where it has a fifth of the
+    noise of the sharp slice, and would win by that.
+    """
+    largest = reduce(np.maximum, (floors[level] for level in levels))
+    for energy, level in zip(energies, levels, strict=True):
+        energy += (energy > 0) * (largest - floors[level])
+        energy /= largest
 
 
 def share_above(energy: Plane, half_at: float) -> Plane:

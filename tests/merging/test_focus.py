@@ -171,6 +171,24 @@ def test_noise_is_measured_at_every_brightness() -> None:
     assert index[10:-10, 50:78].max() < 0.5
 
 
+def test_little_noise_near_white_makes_no_blurred_slice_sharp() -> None:
+    """Near white the noise has a sixteenth of the energy. Where a spread sky brightens a blurred slice, its wave has a quarter of the
+    energy of the sharp one, however little noise is there."""
+    rng = np.random.default_rng(4)
+    wave = np.cos(2.0 * np.pi * np.arange(SIZE[1], dtype=np.float32) / 8.0)
+    places = np.arange(SIZE[1])
+    slices = []
+    for grey, amplitude in ((0.45, 0.08), (0.9, 0.04)):
+        level = np.where(places < 40, 0.45, np.where(places < 88, grey, 0.9))
+        roots = level + np.where((places >= 40) & (places < 88), amplitude * wave, 0.0)
+        noise = np.where(level < 0.7, 0.008, 0.002)[:, None] * rng.standard_normal((*SIZE, 3))
+        slices.append(((roots[:, None] + noise) ** 2).astype(np.float32))
+    volume = focus_volume(slices)
+    sharp, blurred = volume.energies[:, 10:-10, 24:40].mean(axis=(1, 2))
+    assert sharp / blurred == pytest.approx(4.0, rel=0.2)
+    assert focus_map(volume, no_lights(SIZE)).focus_index[10:-10, 48:80].max() < 0.5
+
+
 def test_close_slices_cross_over_all_the_way() -> None:
     """Up to 2 px from slice to slice both neighbours are within 1 px of sharp in the middle."""
     assert crossover_of(1.2) == crossover_of(2.0) == 1.0
