@@ -19,7 +19,7 @@ from typer.main import get_command
 
 from mrbokeh.commands._option_words import with_words
 from mrbokeh.system.atomic_files import writing_alone
-from mrbokeh.system.channel import channel, object_on_stdout, opened, remove_unfinished, write_object
+from mrbokeh.system.channel import channel, end_spinner, object_on_stdout, opened, remove_unfinished, write_object
 from mrbokeh.system.console import begin
 from mrbokeh.system.errors import FAULT, INTERRUPTED, InputError, fault_in, mistake_in
 
@@ -29,8 +29,8 @@ os.environ.setdefault("OPENCV_THREAD_POOL_ACTIVE_WAIT_WORKER", "0")
 EVERY = "Every command"
 SHARING = ("video",)
 """Commands that may write one result together: they claim parts of it (`mrbokeh.shots.claims`)."""
-SPEAK_FOR_THEMSELVES = {"viewfinder", "studio", "serve", "shoot", "--quiet", "--help", "-h"}
-"""Commands that go on until they are stopped or ask for keys, and what asks for no more words: no spinner turns meanwhile."""
+SPEAK_FOR_THEMSELVES = {"viewfinder", "studio", "serve", "shoot", "demo", "doctor", "--quiet", "--help", "-h"}
+"""Commands that go on until they are stopped, ask for keys or start others, and what asks for no more words: no spinner turns."""
 LATEST_S = 1.5
 """Time from Ctrl-C to the end of the process at the latest."""
 
@@ -142,7 +142,7 @@ class LazyGroup(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         name, command, rest = super().resolve_command(ctx, args)
-        if name in SUB_COMMANDS and not {name, *rest} & SPEAK_FOR_THEMSELVES:
+        if name in SUB_COMMANDS and rest and _is_first() and not {name, *rest} & SPEAK_FOR_THEMSELVES:
             begin(name)
         return name, command_of(name) if name in SUB_COMMANDS else command, rest
 
@@ -180,8 +180,7 @@ def main() -> None:
             """Say the last words, unless another thread does, and return the exit code."""
             if not speaking.acquire(timeout=0.5):
                 return code
-            if channel().spinner:
-                channel().spinner.stop()
+            end_spinner()
             if error:
                 _complain(error, err, stopped=code >= INTERRUPTED)
             try:
@@ -204,8 +203,7 @@ def _run(interrupted: list[int]) -> tuple[int, str]:
         code = app(standalone_mode=False)
     except SystemExit as left:
         code = left.code
-    except NoArgsIsHelpError as nothing:
-        typer.echo(nothing.format_message(), err=True)
+    except NoArgsIsHelpError:  # it has shown the help
         return 2, ""
     except Exception as error:
         if mistake := mistake_in(error):

@@ -37,7 +37,7 @@ Light = UInt8[np.ndarray, "height width"]
 class FocusVolume:
     """Focus energies of a stack.
 
-    energies (slices, h, w): local energy of fine detail in every slice, over that of noise in the noisiest slice of the place.
+    energies (slices, h, w): local energy of fine detail in every slice, with the noise of the noisiest of the place, over that noise.
     lights (slices, h, w): mean over the channels of the square root of light, 255 at display white. shape: (H, W) of the pictures,
     h = ceil(H / shrink). details: of every slice, by blocks (`block_detail`).
     """

@@ -1,7 +1,7 @@
 """Shooting data of photographs: through pyexiv2, then exiftool and exifread for what is still open; and files cut short in copying.
 
-exifread is pure Python and always there; where pyexiv2 is not, it comes first: exiftool, which reads more maker notes than any library and
-is used where it is on PATH, states sensors of pictures that were made smaller or turned wrongly.
+exifread is pure Python and always there; where pyexiv2 is not, or cannot open a file, it comes first. exiftool, which reads more maker
+notes than any library and is used where it is on PATH, misstates the sensor of pictures that were made smaller or turned.
 """
 
 import json
@@ -193,12 +193,14 @@ def read_metadata_of(paths: Sequence[Path], advance: Callable[[], None] = lambda
     for path in paths:
         tags = read_tags(path) or read_tags_with_exifread(path)
         found.append(metadata_from_tags(tags))
-        # A PNG or JPEG that exiv2 reads whole and finds empty is empty for the slower ones too.
+        # A PNG or JPEG in which exiv2 finds nothing at all is not worth the start of exiftool.
         states_any.append(tags.get("mime_type") not in _READ_WHOLE or any(name.startswith(("Exif.", "Xmp.")) for name in tags))
         advance()
-    gaps = [index for index, metadata in enumerate(found) if states_any[index] and _has_gaps(metadata)]
-    for index, more in zip(gaps, read_with_exiftool([paths[index] for index in gaps]), strict=True):
+    gaps = [index for index, metadata in enumerate(found) if _has_gaps(metadata)]
+    asked = [index for index in gaps if states_any[index]]
+    for index, more in zip(asked, read_with_exiftool([paths[index] for index in asked]), strict=True):
         found[index] = found[index].filled_from(more)
+    for index in gaps:
         if _has_gaps(found[index]):
             found[index] = found[index].filled_from(metadata_from_tags(read_tags_with_exifread(paths[index])))
     # HEIC is decoded upright (irot, imir); its Exif tells the same turn again.

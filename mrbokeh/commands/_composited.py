@@ -95,7 +95,8 @@ def composited(
         warn(warning)
     much = _MUCH_HIDDEN if asked is not None and asked.object_ else _ALL_HIDDEN  # layers of others may have a sky behind all
     if asked is not None and (warning := hidden_warning(drawn, plate, mode, much)):
-        warn(warning + ("" if asked.object_ else "; is Z of the layers in metres along the axis?"))
+        in_metres = "; is Z of the layers in metres along the axis?" if plate.near_alpha is None and not asked.object_ else ""
+        warn(warning + in_metres)
     with nullcontext() if kept else working("blurring"):
         inserted = insertion.insert(plate, sharp, renderer)
         if options.standing.object_ and not options.standing.plain and is_monochrome(plate):

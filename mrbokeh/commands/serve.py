@@ -73,7 +73,8 @@ def serve(
         _write_connection(path, {"format": FORMAT, "port": listening.server_port, "token": token})
         unfinished(path)  # so that it goes however this ends
         with suppress(ValueError):  # not the main thread
-            signal.signal(signal.SIGTERM, signal.getsignal(signal.SIGINT))
+            interrupt = signal.getsignal(signal.SIGINT)  # in the background of a script it is ignored
+            signal.signal(signal.SIGTERM, interrupt if callable(interrupt) else signal.default_int_handler)
         try:
             Thread(target=listening.serve_forever, daemon=True).start()
             tell(f"blurring for programs on this machine: port {listening.server_port}, token in {path}; Ctrl-C ends it")

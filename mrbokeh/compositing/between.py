@@ -61,6 +61,7 @@ LEAST_LIGHT = np.float32(1e-5)
 _ALL = 1e-4
 _MOST_NEAR = 0.995
 _ROUND = 1e-9
+_LEAST_COVERED = np.float32(0.02)
 _NOISE = 0.01
 """Light below 0 that noise of a camera explains."""
 _MOST_CHANGE, _LEAST_PART = 3.0, 0.02
@@ -370,8 +371,10 @@ class _Lift:
 
     @classmethod
     def of(cls, plate: Plate, layers: Sequence[Layer]) -> "_Lift":
-        pictures = [plate.rgb, *(() if plate.sharp_rgb is None else (plate.sharp_rgb,)), *(layer.rgb for layer in layers)]
-        lowest = np.min([picture.min(axis=(0, 1)) for picture in pictures], axis=0)
+        pictures = [plate.rgb, *(() if plate.sharp_rgb is None else (plate.sharp_rgb,))]
+        for layer in layers:
+            pictures.append(layer.rgb / np.maximum(layer.alpha, _LEAST_COVERED)[..., None])
+        lowest = np.min([np.where(np.isfinite(picture), picture, 0.0).min(axis=(0, 1)) for picture in pictures], axis=0)
         return cls(np.where(lowest < -_NOISE, -lowest, 0.0).astype(np.float32))
 
     def plate(self, plate: Plate) -> Plate:

@@ -4,6 +4,7 @@ The user brings the network (.onnx), such as MiDaS (Ranftl et al. 2020) or Depth
 file cannot say stands in a JSON of its name beside it (model.onnx: model.json).
 """
 
+import zlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -188,7 +189,7 @@ def read_number_map(path: Path, settings: DepthSettings) -> DepthMap:
         numbers = pixels if pixels.ndim == 2 else pixels[..., 0]
     known = np.isfinite(numbers)
     if settings.metres_per_unit is not None:
-        known &= numbers > 0
+        known = numbers > 0  # inf is background
         depth_m = np.where(known, numbers * np.float32(settings.metres_per_unit), np.inf).astype(np.float32)
         return DepthMap(depth_m, known, f"{path.name}, {settings.metres_per_unit:g} m per step")
     if settings.near_far_m is None:
@@ -228,13 +229,13 @@ _METRES = "depth"
 _OF_ARRAYS = " (1 where they are metres), or --stereo-cameras FOCAL_PX,BASELINE_M,OFFSET_PX where they are pixels of disparity"
 
 
-def _array_of(path: Path) -> tuple[Plane, str]:
-    """Return the depth or else the first array of an .npz, or that of an .npy, and its name."""
+def _array_of(path: Path, preferred: str = _METRES) -> tuple[Plane, str]:
+    """Return the array of that name, or else the first, of an .npz, or that of an .npy, and its name."""
     try:
         loaded = np.load(path)
-        name = "" if isinstance(loaded, np.ndarray) else _METRES if _METRES in loaded else loaded.files[0]
+        name = "" if isinstance(loaded, np.ndarray) else preferred if preferred in loaded else loaded.files[0]
         numbers = np.squeeze(np.asarray(loaded[name] if name else loaded, np.float32))
-    except (OSError, ValueError, IndexError, BadZipFile) as error:
+    except (OSError, ValueError, TypeError, IndexError, EOFError, BadZipFile, zlib.error) as error:
         raise InputError(f"{path}: expected an array of numbers as numpy.save writes it, but it is damaged or something else") from error
     if numbers.ndim != 2:
         raise InputError(f"{path}: expected depth or disparity (H, W), got an array of shape {numbers.shape}")
@@ -243,7 +244,7 @@ def _array_of(path: Path) -> tuple[Plane, str]:
 
 def _of_stereo(path: Path, calibration: StereoCalibration) -> DepthMap:
     """Read disparity in pixels, as in the Middlebury data sets; what is not finite is unknown."""
-    disparity, _ = _array_of(path)
+    disparity, _ = _array_of(path, "disparity")
     known = np.isfinite(disparity)
     dioptres = (np.where(known, disparity, 0.0) + calibration.offset_px) / (calibration.focal_px * calibration.baseline_m)
     return DepthMap.of_dioptres(dioptres.astype(np.float32), known, f"{path.name}, stereo of {calibration.baseline_m:g} m")
@@ -262,6 +263,8 @@ def open_depth(source: Path, photo_rgb: Rgb, settings: DepthSettings | None = No
     """
     settings = settings or DepthSettings()
     if distance_m := one_distance_m(source):
+        if settings.near_far_m or settings.metres_per_unit or settings.stereo:
+            raise InputError(f"--depth {source} is one distance in metres: leave out what says how a file's numbers count")
         shape = photo_rgb.shape[:2]
         return DepthMap(np.full(shape, distance_m, np.float32), np.ones(shape, bool), f"{distance_m:g} m everywhere")
     require_file(source, "depth")

@@ -15,6 +15,7 @@ from contextlib import contextmanager, redirect_stdout, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import RLock
 from typing import Any
 
 LOG_TIME = "%Y-%m-%d %H:%M:%S"
@@ -79,6 +80,8 @@ class _Warnings(logging.Handler):
 
 _channel = Channel()
 _apart: ContextVar[Channel | None] = ContextVar("apart", default=None)
+_terminal, _resting = RLock(), 0
+"""How many blocks, of all threads, have the terminal to themselves."""
 _UNFINISHED: set[Path] = set()
 """Temporary files and folders under way, which a process that leaves at once removes."""
 
@@ -98,8 +101,7 @@ def opened() -> Iterator[Channel]:
         yield _channel
     finally:
         logging.getLogger().removeHandler(handler)
-        if _channel.spinner:
-            _channel.spinner.stop()
+        end_spinner()
         if _channel.log:
             _channel.log.close()
         _channel = before
@@ -130,15 +132,25 @@ def write_object(file: Any, exit_code: int, error: str) -> None:
 @contextmanager
 def resting() -> Iterator[None]:
     """Take the command's spinner off the terminal in the block, which writes there itself."""
-    spinner = _channel.spinner
-    if spinner is None or not spinner.is_started:
-        yield
-        return
-    spinner.stop()
+    global _resting
+    with _terminal:
+        _resting += 1
+        if _resting == 1 and _channel.spinner:
+            _channel.spinner.stop()
     try:
         yield
     finally:
-        spinner.start()
+        with _terminal:
+            _resting -= 1
+            if _resting == 0 and _channel.spinner:
+                _channel.spinner.start()
+
+
+def end_spinner() -> None:
+    """Take the command's spinner off the terminal for good."""
+    spinner, _channel.spinner = _channel.spinner, None
+    if spinner:
+        spinner.stop()
 
 
 def say(text: str, err: bool = False) -> None:

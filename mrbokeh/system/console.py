@@ -3,6 +3,7 @@
 On a terminal progress is drawn as bars, in a log as a plain line now and then.
 """
 
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from datetime import timedelta
@@ -115,7 +116,7 @@ def working(description: str) -> Iterator[None]:
 def begin(command: str) -> None:
     """Let a spinner turn on the terminal, if there is one, whenever the command neither says nor shows anything."""
     console = Console(stderr=True, emoji=False)
-    if console.is_terminal:
+    if console.is_terminal and sys.stdout.isatty():  # not over the page of a pager
         spinner = Spinner("dots", f"{command} ...")
         channel().spinner = Live(spinner, console=console, transient=True, redirect_stdout=False, redirect_stderr=False)
         channel().spinner.start(refresh=True)

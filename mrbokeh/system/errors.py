@@ -104,10 +104,10 @@ def _of_parser(error: Any) -> str:
     for theirs, ours in _PARSERS_WORDS.items():
         text = text.replace(theirs, ours)
     words, context = sys.argv[1:], getattr(error, "ctx", None)
-    names = getattr(getattr(error, "param", None), "opts", ())
+    names: list[str] = list(getattr(getattr(error, "param", None), "opts", ()))
     typed = [value for name, value in pairwise(words) if name in names]
     typed += [word.partition("=")[2] for word in words if word.partition("=")[0] in names and "=" in word]
-    got = f", got {typed[0]}" if typed and typed[0] not in text and not text.startswith("Missing") else ""
+    got = f", got {typed[-1]!r}" if typed and names[0].startswith("-") and not text.startswith("Missing") else ""
     return f"{text}{got}: see `{context.command_path} --help`" if context is not None else text + got
 
 

@@ -72,6 +72,10 @@ def test_colours_that_rec709_has_not_stay_as_they_are(mode: str) -> None:
     green = (-0.15, 0.38, 0.05)
     picture = inserted(mode, [card(1.0, green)], plate()).rgb
     np.testing.assert_allclose(picture[16:32, 24:40], np.broadcast_to(np.float32(green), (16, 16, 3)), atol=2e-4)
+    glass = card(1.0, green)
+    glass = replace(glass, rgb=0.2 * glass.rgb, alpha=np.float32(0.2) * glass.alpha)
+    lower = inserted(mode, [glass], plate()).rgb - inserted(mode, [replace(glass, rgb=np.zeros_like(glass.rgb))], plate()).rgb
+    np.testing.assert_allclose(lower[16:32, 24:40], np.broadcast_to(np.float32(0.2) * np.float32(green), (16, 16, 3)), atol=1e-3)
     photo = plate()
     photo.rgb[..., 2] -= 0.4
     assert photo.sharp_rgb is not None

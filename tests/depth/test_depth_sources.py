@@ -64,13 +64,14 @@ def test_arrays_hold_metres_by_name_or_as_stated(tmp_path: Path) -> None:
     """Networks of metric depth write an array named depth; of others only the user knows what they mean. 0 and NaN are unknown."""
     depth_m = np.linspace(1.0, 4.0, 24 * 32, dtype=np.float32).reshape(1, 24, 32)
     depth_m[0, 3, 4:6] = 0.0, np.nan
+    depth_m[0, 9, 9] = np.inf  # background, and no hole
     np.savez(tmp_path / "named.npz", focallength_px=900.0, depth=depth_m)
     np.save(tmp_path / "plain.npy", depth_m)
     settings = {"named.npz": DepthSettings(exact=True), "plain.npy": DepthSettings(metres_per_unit=1.0, exact=True)}
-    known = np.nan_to_num(depth_m[0]) > 0
+    known = depth_m[0] > 0
     for name, stated in settings.items():
         found = open_depth(tmp_path / name, GREY, stated)
-        assert np.array_equal(found.depth_m[known], depth_m[0][known]) and np.isfinite(found.depth_m).all()
+        assert np.array_equal(found.depth_m[known], depth_m[0][known]) and not np.isnan(found.depth_m).any()
         assert np.array_equal(depth_of_file(tmp_path / name, with_holes=True)[known], depth_m[0][known])
     near = open_depth(tmp_path / "plain.npy", GREY, DepthSettings((1.0, 2.0), exact=True))
     assert near.depth_m[-1, -1] == pytest.approx(1.0) and near.depth_m[0, 0] == pytest.approx(1.6)  # a quarter of the way from 0 to 4

@@ -82,7 +82,7 @@ class GltfFile:
             encoded = self.buffers[view.buffer][start : start + view.byteLength]
         else:
             encoded = _read_uri(image.uri, self.path)
-        pixels = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED)
+        pixels = cv2.imdecode(np.frombuffer(encoded, np.uint8), cv2.IMREAD_UNCHANGED) if encoded else None
         if pixels is None:
             raise InputError(f"{self.path}: image {index} ({image.mimeType}) cannot be decoded: export it as PNG or JPEG")
         if pixels.ndim == 2:
@@ -123,11 +123,11 @@ def open_gltf(path: str | Path) -> GltfFile:
             if not all(isinstance(each, _Part) for each in gltf.setdefault(name, [])):
                 raise ValueError(f"its {name} are no list of objects")
         buffers = tuple(blob if buffer.uri is None else _read_uri(buffer.uri, path) for buffer in gltf.buffers)
+        missing = sorted(set(gltf.extensionsRequired or ()) - _READABLE_EXTENSIONS)
     except InputError:
         raise
     except (ValueError, TypeError, AttributeError, RecursionError, struct.error) as reason:
         raise InputError(f"{path} is not a readable glTF 2.0 file ({reason}): export it again as .glb") from reason
-    missing = sorted(set(gltf.extensionsRequired or ()) - _READABLE_EXTENSIONS)
     if missing:
         raise InputError(f"{path} requires {', '.join(missing)}, which is not supported: export it without compression or extensions")
     return GltfFile(path, gltf, buffers)
