@@ -61,18 +61,18 @@ class DepthSettings:
 
 def parse_near_far(text: str) -> tuple[float, float]:
     """Parse NEAR:FAR in metres, such as 0.5:inf."""
-    near, far = numbers_in(text, "expected NEAR:FAR in metres, such as 0.5:8 or 0.5:inf", (2,), separator=":")
+    near, far = numbers_in(text, "--disparity: expected NEAR:FAR in metres, such as 0.5:8 or 0.5:inf", (2,), separator=":")
     return near, far
 
 
 def parse_stereo(text: str) -> StereoCalibration:
     """Parse FOCAL_PX,BASELINE_M or FOCAL_PX,BASELINE_M,OFFSET_PX."""
-    return StereoCalibration(*numbers_in(text, "expected FOCAL_PX,BASELINE_M or FOCAL_PX,BASELINE_M,OFFSET_PX", (2, 3)))
+    return StereoCalibration(*numbers_in(text, "--stereo-cameras: expected FOCAL_PX,BASELINE_M or FOCAL_PX,BASELINE_M,OFFSET_PX", (2, 3)))
 
 
 def parse_known(text: str) -> KnownDistance:
     """Parse X,Y,METRES."""
-    known = KnownDistance(*numbers_in(text, "expected X,Y,METRES of a pixel whose distance is known", (3,)))
+    known = KnownDistance(*numbers_in(text, "--distance-at: expected X,Y,METRES of a pixel whose distance is known", (3,)))
     if not known.depth_m > 0:
         raise InputError(f"expected a known distance above 0 m, got {text!r}")
     return known
