@@ -15,6 +15,8 @@ Pixel = tuple[float, float]
 _SAME_SURFACE, _SURELY_SAME = 0.02, 0.01
 """Largest shares by which depth changes from pixel to pixel of one surface: along a table, and where no edge may be missed."""
 _FARTHER, _JUST_BEFORE = 0.05, np.float32(0.999)
+_NEARER = (0.05, 0.12)
+"""Shares by which what stands on the ground is nearer than its plane: the first still catches the shadow whole, the second none of it."""
 _FOUND = 2
 _NEAR_FOOT = 0.05
 """Half width of the ground that is looked at around a foot, in widths of the picture."""
@@ -83,7 +85,8 @@ def ended_shadow(plate: Plate, feet_px: Sequence[Pixel], objects: Layer, shadow:
 
     It was drawn on a plane without end, and would hang sharp in the air over what lies blurred beyond a table's edge: past a jump of depth,
     and clearly farther than the plane. A shadow apart from the feet, as of a thing in the air, stays. On the ground itself it lies as far
-    away as that: a plane that is a little too far would be hidden by what it darkens.
+    away as that: a plane that is a little too far would be hidden by what it darkens. What stands on the ground goes on from it without a
+    jump, but is ever nearer than the plane the higher one looks: it catches ever less.
     """
     covered = (objects.alpha > 0.0) | (shadow.alpha > 0.0)
     if plate.depth_m is None or not shadow.alpha.any():
@@ -92,13 +95,14 @@ def ended_shadow(plate: Plate, feet_px: Sequence[Pixel], objects: Layer, shadow:
     beside = np.logical_or.reduce([_same_surface(even, foot_px, covered, _SURELY_SAME) for foot_px in feet_px])
     same = np.logical_or.reduce([_same_surface(plate.depth_m, foot_px, covered, _SURELY_SAME) for foot_px in feet_px])
     beyond = beside & ~same & (plate.depth_m > shadow.depth_m * np.float32(1.0 + _FARTHER))
+    caught = np.clip((plate.depth_m / shadow.depth_m - np.float32(1.0 - _NEARER[1])) / np.float32(_NEARER[1] - _NEARER[0]), 0.0, 1.0)
+    caught = np.where(beyond, np.float32(0.0), np.where(same, caught, np.float32(1.0)))
+    moved = same & (shadow.alpha > 0.0) & (objects.alpha == 0.0)
     return replace(
         shadow,
-        alpha=np.where(beyond, np.float32(0.0), shadow.alpha),
-        rgb=np.where(beyond[..., None], np.float32(0.0), shadow.rgb),
-        depth_m=np.where(
-            same & (shadow.alpha > 0.0) & (objects.alpha == 0.0), np.minimum(shadow.depth_m, plate.depth_m * _JUST_BEFORE), shadow.depth_m
-        ),
+        alpha=shadow.alpha * caught,
+        rgb=shadow.rgb * caught[..., None],
+        depth_m=np.where(moved, np.minimum(shadow.depth_m, plate.depth_m * _JUST_BEFORE), shadow.depth_m),
     )
 
 

@@ -160,6 +160,19 @@ def test_a_shadow_ends_where_the_table_ends() -> None:
     np.testing.assert_array_equal(ended_shadow(plate, [(20, 60)], shadow, shadow).alpha, alpha)
 
 
+def test_what_stands_on_the_ground_does_not_catch_its_shadow() -> None:
+    """A post from row 64 upwards, whose depth goes on from the ground at its foot: it is as near at all heights, the ground is not."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    plane_m = 1.0 + (HEIGHT - 1 - rows) / HEIGHT
+    post = (abs(columns - 90) < 12) & (rows < 64)
+    plate = plate_of(plate_rgb(), replace(LENS, focus_distance_m=1.5), np.where(post, plane_m[64, 0], plane_m))
+    alpha = ((abs(rows - 50) < 40) & (abs(columns - 80) < 40)).astype(np.float32)
+    ended = ended_shadow(plate, [(60, 60)], *[Layer(np.zeros((HEIGHT, WIDTH, 3), np.float32), alpha, plane_m)] * 2)
+    higher = post & (plane_m[64, 0] < 0.87 * plane_m)
+    assert higher.any() and ended.alpha[higher & (alpha > 0)].max() == 0.0
+    np.testing.assert_array_equal(ended.alpha[~post], alpha[~post])
+
+
 @pytest.mark.parametrize(
     ("at", "height", "told"),
     [
