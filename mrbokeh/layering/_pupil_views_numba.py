@@ -283,8 +283,19 @@ def darken(dark: np.ndarray, places: np.ndarray, values: np.ndarray, lit: np.nda
                 for x in range(max(column - 2, 0), min(column + 3, width)):
                     alpha = values[y * width + x, 3]
                     if alpha > _MUCH and not lit[y * width + x]:
-                        around[count] = values[y * width + x, c] / alpha
+                        _sort_in(around, count, values[y * width + x, c] / alpha)
                         count += 1
-            dark[i, c] = min(own[3] * np.median(around[:count]), own[c]) if count else 0.0
+            median = 0.5 * (around[(count - 1) // 2] + around[count // 2]) if count else 0.0
+            dark[i, c] = min(own[3] * median, own[c])
         if max(own[0], own[1], own[2]) <= ratio * max(dark[i, 0], dark[i, 1], dark[i, 2]):
-            dark[i] = own[:3]
+            for c in range(3):  # a slice would bring numba's texts of errors with it, a second to compile
+                dark[i, c] = own[c]
+
+
+@njit(cache=True, nogil=True)
+def _sort_in(ordered: np.ndarray, count: int, value: float) -> None:
+    """Put a value in its place among the first `count`, which ascend."""
+    while count > 0 and ordered[count - 1] > value:
+        ordered[count] = ordered[count - 1]
+        count -= 1
+    ordered[count] = value

@@ -93,16 +93,16 @@ def cover(
     values: np.ndarray,
     coc_px: np.ndarray,
     sharp_px: np.float32,
-    first_place: int,
-    end_place: int,
+    first: int,
+    end: int,
 ) -> None:
-    """Let pixels of values (N, C) cover what is free (H W) from one place to another; shown (N,) is what was free at their places before.
+    """Let pixels of values (N, C), from the first to before an end, cover what is free (H W).
 
-    crossing (N,): the rest, if the pixel lies behind the focus and the nearest so far (nearest_px (H W), not above 0) in front of it.
-    Ranges of places can be worked through side by side.
+    shown (N,) is set to what was free at their places before; crossing (N,) to the rest, if the pixel lies behind the focus and the nearest
+    so far (nearest_px (H W), not above 0) in front of it. Ranges of pixels at different places can be worked through side by side.
     """
     one, nothing = np.float32(1.0), np.float32(0.0)
-    for i in range(np.searchsorted(places, first_place), np.searchsorted(places, end_place)):
+    for i in range(first, end):
         place, coverage = places[i], values[i, 3]
         shown[i] = free[place]
         crossing[i] = one - free[place] if coc_px[i] > sharp_px and nearest_px[place] < -sharp_px else nothing

@@ -172,7 +172,8 @@ def _shown_in_order(layers: Sequence[Pixels], slicing: Slicing) -> _Shown:
 
     def cover_band(first: int, end: int) -> None:
         for each, across, layer in zip(shown, crossing, layers, strict=True):
-            cover(each, across, free, nearest_px, layer.places, layer.values, layer.coc_px, SHARP_PX, first, end)
+            start, stop = np.searchsorted(layer.places, (first, end))
+            cover(each, across, free, nearest_px, layer.places, layer.values, layer.coc_px, SHARP_PX, start, stop)
 
     in_bands(slicing.pool, pixels, _BAND_PIXELS, cover_band)
     return shown, crossing

@@ -34,7 +34,7 @@ def lay_out(
             plane[corner] -= elements if turned[corner, edge] else 0
         for k in range(4):
             place[corner, k] = 4 * (places[corner, k, 0] + stride * places[corner, k, 1])
-        below[corner] = place[corner].max() + 4 * stride
+        below[corner] = max(max(place[corner, 0], place[corner, 1]), max(place[corner, 2], place[corner, 3])) + 4 * stride
 
 
 BLOCK_ROWS = 64
