@@ -254,11 +254,18 @@ def test_any_wrong_value_is_refused_in_words(tmp_path: Path, shared_data: Path) 
         part[place[-1]] = JUNK[rng.integers(len(JUNK))]
         wrong = json.dumps(whole).encode()
         path.write_bytes(stored[:12] + struct.pack("<I4s", len(wrong), b"JSON") + wrong + rest)
-        try:
-            load_glb(path, 0.1)
-        except InputError as reason:
-            refusals.append(str(reason))
+        for read in (lambda: load_glb(path, 0.1), lambda: GltfAsset(path).animation_durations_s):
+            try:
+                read()
+            except InputError as reason:
+                refusals.append(str(reason))
     assert len(refusals) > 10  # every other exception fails
+    whole = json.loads(text)
+    whole["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = -1
+    wrong = json.dumps(whole).encode()
+    path.write_bytes(stored[:12] + struct.pack("<I4s", len(wrong), b"JSON") + wrong + rest)
+    with pytest.raises(InputError, match="no number -1"):
+        load_glb(path)
 
 
 @pytest.fixture(scope="module")

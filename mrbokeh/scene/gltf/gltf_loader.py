@@ -4,6 +4,7 @@ See the glTF 2.0 specification, section 3.11 and appendix C.
 """
 
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf, pi
@@ -60,12 +61,18 @@ class GltfAsset:
     @property
     def animation_durations_s(self) -> dict[str, float]:
         """Names and lengths of the animations."""
-        return animation_durations_s(self._file)
+        with self._undamaged():
+            return animation_durations_s(self._file)
 
     def scene_at(self, time_s: float = 0.0, animation: str | int | None = None) -> Scene:
         """The scene at a time; see `load_glb`."""
-        try:
+        with self._undamaged():
             return self._scene_at(time_s, animation)
+
+    @contextmanager
+    def _undamaged(self) -> Iterator[None]:
+        try:
+            yield
         except InputError:
             raise
         except (LookupError, TypeError, ValueError, AttributeError) as reason:

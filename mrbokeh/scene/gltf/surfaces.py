@@ -48,6 +48,15 @@ class _Part(dict[str, Any]):
         return self.get(name)
 
 
+class _Numbered(list[_Part]):
+    """A list of the file. Its numbers begin with 0: -1 is a mistake, not the last."""
+
+    def __getitem__(self, number: Any) -> Any:
+        if number < 0:
+            raise IndexError(f"there is no number {number}")
+        return super().__getitem__(number)
+
+
 @dataclass(frozen=True, eq=False)
 class GltfFile:
     """A parsed .glb or .gltf with its buffers in memory. gltf: its JSON; all lists of the specification are there, if only empty."""
@@ -122,6 +131,7 @@ def open_gltf(path: str | Path) -> GltfFile:
         for name in _LISTS:
             if not all(isinstance(each, _Part) for each in gltf.setdefault(name, [])):
                 raise ValueError(f"its {name} are no list of objects")
+            gltf[name] = _Numbered(gltf[name])
         buffers = tuple(blob if buffer.uri is None else _read_uri(buffer.uri, path) for buffer in gltf.buffers)
         missing = sorted(set(gltf.extensionsRequired or ()) - _READABLE_EXTENSIONS)
     except InputError:
