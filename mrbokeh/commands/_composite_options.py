@@ -211,6 +211,8 @@ class ObjectOptions:
         if self.at and self.at_pixel:
             raise InputError("--at and --at-pixel both say where the object stands: give one of them")
         self.require_places()
+        for path in self.object_ or ():
+            _require_object(path)
         of_place = ((self.at, typed_place_m), (self.at_pixel, typed_pixel), (self.height, typed_height))
         for given, typed in of_place:
             for text in given or ():
@@ -268,6 +270,15 @@ _NO_USE_OF_HEIGHT = (
 def _for_each(given: Sequence[Any] | None, count: int) -> Sequence[Any]:
     """Return a value for each of the objects: those given, the only one for all, or None."""
     return [None] * count if not given else [*given] * count if len(given) == 1 else given
+
+
+def _require_object(path: Path) -> None:
+    """Raise InputError where a file is surely no 3D object."""
+    require_file(path, "a 3D object (.glb, .gltf)")
+    with path.open("rb") as file:
+        begins = file.read(64).lstrip()
+    if not begins.startswith((b"glTF", b"{")):
+        raise InputError(f"--object {path} is no 3D object: expected a .glb or .gltf file; a rendered picture goes in as --layer")
 
 
 def typed_place_m(text: str) -> tuple[float, float, float]:

@@ -96,7 +96,7 @@ def composite(
     from mrbokeh.images.image_io import read_layer
 
     known_lens, spreads = _optics(lens, renderer)
-    focus_m = None if focus is None or isinstance(focus, tuple) else float(focus)
+    focus_m = None if focus is None or isinstance(focus, tuple) else focus_in_metres(focus)
     if isinstance(photo, (str, Path)):
         plate = open_plate(Path(photo), slice_index, known_lens, focus_m, exact_depth=exact_depth)
     elif known_lens is None:
@@ -174,4 +174,12 @@ def _optics(lens: Lens | File | None, renderer: str | Renderer | None) -> tuple[
 def _focused(lens: Lens, focus: float | tuple[float, float] | None, depth_m: Plane) -> Lens:
     if isinstance(focus, tuple):
         return lens.focused_on(depth_m, focus[0] + 0.5, focus[1] + 0.5)
-    return lens if focus is None else lens.focused_at(float(focus))
+    return lens if focus is None else lens.focused_at(focus_in_metres(focus))
+
+
+def focus_in_metres(focus: object) -> float:
+    """Return a distance as a number; InputError for what is none."""
+    try:
+        return float(focus)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        raise InputError(f"focus: expected metres, or the pixel (x, y) to focus on, got {focus!r}") from None
