@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.merging.all_in_focus import NARROW_CROSSOVER, crossover_of, sharp_all_in_focus
+from capture.merging.depth_edges import with_edges_of_light
 from capture.merging.depth_from_focus import focus_map, vetoed
 from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import Extremes, no_lights, spread_light
@@ -81,9 +82,9 @@ def _merged(stack: FocalStack, overwrite: bool, registration: Path | None, prefe
         sharp, focus = with_restored_lights(sharp, restored), focus_map(volume, lights, slices.saturated)
     merged = _with_highlights(merged, restored)
     if stack.is_metric:
-        write_merged(
-            stack.folder, sharp, focus.focus_index, focus.confidence, depth_m_of(merged, focus.focus_index), stack.rec709_from_camera
-        )
+        placed = with_edges_of_light(focus, sharp, near_first=_is_nearest_first(stack))
+        depth_m = depth_m_of(merged, placed.focus_index)
+        write_merged(stack.folder, sharp, placed.focus_index, placed.confidence, depth_m, stack.rec709_from_camera)
     else:
         write_camera_rgb(stack.all_in_focus_path, sharp, stack.rec709_from_camera, half=False)
         merged = with_solved_blur(merged, slices, sharp, focus)
@@ -96,6 +97,11 @@ def _merged(stack: FocalStack, overwrite: bool, registration: Path | None, prefe
     write_focal_stack(merged)
     write_merge_sheet(merged, sharp, codes)
     return merged
+
+
+def _is_nearest_first(stack: FocalStack) -> bool:
+    first_m, last_m = stack.focus_distances_m[0], stack.focus_distances_m[-1]
+    return first_m is not None and last_m is not None and first_m < last_m
 
 
 def _with_highlights(stack: FocalStack, restored: Sequence[RestoredLight]) -> FocalStack:

@@ -11,8 +11,6 @@ import numpy as np
 from mrbokeh.system.compiled import njit
 
 _FAR_AWAY = 99.0
-_PER_STEP = np.float32(2.5e-5)
-"""What a pixel of distance adds to the square of a difference of colours."""
 _ROUND = np.float32(0.03)
 _UNLIKE, _BESIDE, _DIAGONAL, _HALF = np.float32(44.0), np.float32(1.0), np.float32(0.7), np.float32(0.5)
 """Neighbours count about exp(-44 d), d the square of the difference of their colours; those at a corner less."""
@@ -80,20 +78,22 @@ def likeness(
     other: np.ndarray,
     away_px: np.ndarray,
     sure: np.ndarray,
-    reach_px: int,
     window_px: int,
+    per_step: np.float32,
     top: int,
     bottom: int,
 ) -> None:
     """Set rows of like: from 1, the pixel has the colour of its own side, to -1, that of the other; 0 where nothing tells.
 
     Each side is stood for by its sure pixel within the window that is the most alike: surfaces have textures of several colours.
+    away_px: how far the other side is, 99 where nobody asks. per_step: what a pixel of distance, squared, adds to the square of a
+    difference of colours.
     """
     height, width = values.shape
     for y in range(top, bottom):
         for x in range(width):
             like[y, x] = 0.0
-            if away_px[y, x] > reach_px:
+            if away_px[y, x] >= _FAR_AWAY:
                 continue
             mine, others = values[y, x], other[y, x]
             most, nearest, next_to = 0.5 * abs(mine - others), np.float32(9.0), np.float32(9.0)
@@ -106,7 +106,7 @@ def likeness(
                     if min(to_mine, to_others) > most:
                         continue
                     r, g, b = rgb[v, u, 0] - red, rgb[v, u, 1] - green, rgb[v, u, 2] - blue
-                    square = r * r + g * g + b * b + _PER_STEP * ((v - y) * (v - y) + (u - x) * (u - x))
+                    square = r * r + g * g + b * b + per_step * ((v - y) * (v - y) + (u - x) * (u - x))
                     if to_mine < to_others:
                         nearest = min(nearest, square)
                     else:

@@ -6,6 +6,7 @@ things. The most alike of each side stands for it, because surfaces have texture
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from jaxtyping import Bool, Float32
@@ -20,7 +21,10 @@ Picture = Float32[np.ndarray, "height width 3"]
 SURE_PX = 2
 """How far a hard edge may be misplaced."""
 _WINDOW_PX = 5
+_PER_STEP, _NO_MATTER = np.float32(2.5e-5), np.float32(0.0)
+"""What a pixel of distance, squared, adds to the square of a difference of colours."""
 _VOTE_WEIGHT, _VOTES = np.float32(0.1), 4
+_OUT_OF_REACH = np.float32(99.0)
 _GREY, _WHITE, _LAMP = 0.25, np.float32(4.0), 0.8
 _ROWS = 16
 """The least rows that are worth a thread."""
@@ -103,10 +107,10 @@ def sides_of(values: Plane, guide: Guide, jump: float, reach_px: int) -> Sides:
     sure, like = np.empty(values.shape, bool), np.empty_like(values)
     by_rows(values.size, len(values), lambda top, bottom: mark_sure(sure, values, away_px, jump, SURE_PX, top, bottom))
     sure &= ~guide.lit
-    seen_px = np.where(guide.lit, np.float32(99.0), away_px)
+    seen_px = np.where(guide.lit | (away_px > reach_px), _OUT_OF_REACH, away_px)
 
     def look(top: int, bottom: int) -> None:
-        likeness(like, guide.root, values, other, seen_px, sure, reach_px, _WINDOW_PX, top, bottom)
+        likeness(like, guide.root, values, other, seen_px, sure, _WINDOW_PX, _PER_STEP, top, bottom)
 
     by_rows(values.size, len(values), look)
     return Sides(other, away_px, like)
@@ -126,6 +130,32 @@ def voted(values: Plane, sides: Sides, guide: Guide, may: Mask, stays: float | P
         by_rows(values.size, len(values), count)
         now, following = following, np.empty_like(values) if now is values else now
     return now
+
+
+_SETTLED_PX, _WIDER_BY, _NARROWED_STAYS = 2, 3, 0.05
+
+
+def narrowed(values: Plane, guide: Guide, jump: float, trusted: Mask, reach_px: int) -> Plane:
+    """Return the values with near things no wider than their colours are, where these are too wide by up to a reach.
+
+    What lies two pixels beside such a thing is surely far; the thing itself is sure only farther inside, or in its middle. trusted: pixels
+    whose value may stand for their surface.
+    """
+    from mrbokeh.depth._mended_depth_numba import likeness, mark_sure
+
+    other, away_px = other_sides(values, jump, reach_px + 1)
+    near, inside, like = values > other, np.empty(values.shape, bool), np.empty_like(values)
+    by_rows(values.size, len(values), partial(mark_sure, inside, values, away_px, jump, reach_px))
+    sure = np.where(near, inside, away_px > _SETTLED_PX) & trusted & ~guide.lit
+    asked = near & (away_px <= reach_px)
+    seen_px = np.where(asked & ~guide.lit, away_px, _OUT_OF_REACH)
+    by_rows(
+        values.size,
+        len(values),
+        partial(likeness, like, guide.root, values, other, seen_px, sure, reach_px + _WIDER_BY, _NO_MATTER),
+    )
+    may = asked & (like != 0.0) & ~guide.lamps
+    return voted(values, Sides(other, away_px, like), guide, may, _NARROWED_STAYS)
 
 
 _RIM_PX = 1.5

@@ -92,7 +92,7 @@ def sharpened(values: Plane, guide: Guide, jump: float, sigma_px: float, most: t
 
 def _surfaces(soft: Plane, guide: Guide, jump: float, sigma_px: float, rounds: int) -> Plane:
     """Return the map without its blur, lamps apart."""
-    reach_px, hard = round(1.5 * sigma_px), _steepened(soft, jump, sigma_px)
+    reach_px, hard = round(1.5 * sigma_px), steepened(soft, jump, sigma_px)
     for _ in range(rounds):
         sides = sides_of(hard, guide, jump, reach_px)
         hard = voted(hard, sides, guide, sides.away_px <= reach_px, _STAYS)
@@ -100,7 +100,8 @@ def _surfaces(soft: Plane, guide: Guide, jump: float, sigma_px: float, rounds: i
     return hard
 
 
-def _steepened(soft: Plane, jump: float, sigma_px: float) -> Plane:
+def steepened(soft: Plane, jump: float, sigma_px: float) -> Plane:
+    """Return a map whose edges rise from one pixel to the next where they were soft by sigma."""
     from cv2 import CV_32F, Laplacian
 
     from mrbokeh.depth._mended_depth_numba import steepen

@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter, grey_dilation, grey_erosion
 
 import mrbokeh
-from mrbokeh.depth.edge_votes import Guide
+from mrbokeh.depth.edge_votes import Guide, narrowed
 from mrbokeh.depth.mended_depth import filled, mended
 from mrbokeh.depth.soft_edges import softness
 from mrbokeh.system.errors import InputError
@@ -111,6 +111,20 @@ def test_edges_a_pixel_off_are_moved_to_those_of_the_picture(damage: Callable[..
     off_m = damage(depth_m, (3, 3))
     assert wrong(off_m, near) > 150, "a pixel all around"
     assert wrong(mended(off_m, rgb).depth_m, near) <= 10
+
+
+@pytest.mark.parametrize("width_px", [4, 50])
+def test_what_is_far_too_wide_is_as_wide_as_its_colour(width_px: int) -> None:
+    """Depth from focus takes what lies up to 7 px beside a near thing for it; a thing thinner than that is found by its middle."""
+    near = np.zeros(SIZE, bool)
+    near[20:70, 40 : 40 + width_px] = True
+    depth_m, rgb = board(near)
+    wide = (1.0 / grey_erosion(depth_m, (15, 15))).astype(np.float32)
+    now = narrowed(wide, Guide.of(rgb), float(HALF_OF_THE_JUMP), np.ones(SIZE, bool), 8)
+    assert wrong(1.0 / wide, near) > 750
+    assert wrong(1.0 / now, near) <= 40
+    grey = np.repeat(rgb.mean(axis=(0, 1), keepdims=True).mean(axis=2, keepdims=True), 3, axis=2) * np.ones((*SIZE, 1), np.float32)
+    np.testing.assert_array_equal(narrowed(wide, Guide.of(grey), float(HALF_OF_THE_JUMP), np.ones(SIZE, bool), 8), wide)
 
 
 def test_holes_take_the_surface_whose_colour_they_have() -> None:

@@ -62,6 +62,20 @@ def test_depth_of_the_raw_stack(desk: FocalStack) -> None:
     assert np.median(error[textured]) < np.median(error[~textured]), "confidence knows where depth is worse"
 
 
+def test_near_things_are_as_wide_as_they_are(desk: FocalStack) -> None:
+    """Beside an edge the window of the focus energy sees only the sharp near side: before edges were moved, 64 % of the pixels up
+    to 4 px outside near things had their depth.
+    """
+    truth = 1.0 / read_exr(DATA / "raw_stack" / "truth" / VIEW / "depth.exr")[0].stacked(["Z"])[..., 0]
+    window = np.ones((9, 9), np.uint8)
+    near, far = cv2.dilate(truth, window), cv2.erode(truth, window)
+    middle, jump = (near + far) / 2, near - far > 0.15 * np.ptp(truth)
+    outside, inside = jump & (truth < middle), jump & (truth > middle)
+    taken = 1.0 / desk.depth_m() > middle
+    assert taken[outside].mean() < 0.2
+    assert taken[inside].mean() > 0.8
+
+
 def test_registration_of_the_raw_stack_is_the_breathing_of_its_lens(desk: FocalStack) -> None:
     """Thin lens: magnification goes with the image distance; on a tripod nothing else moves, so the prior stands."""
     truth = json.loads((DATA / "raw_stack" / "truth.json").read_text())

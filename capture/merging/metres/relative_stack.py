@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Float32
 
+from capture.merging.depth_edges import with_edges_of_light
 from capture.merging.depth_from_focus import FocusMap
 from capture.merging.metres.focus_order import Contours, Direction, focus_order
 from capture.merging.metres.relative_focus import RelativeFocus, solve_relative_focus
@@ -103,7 +104,8 @@ def with_solved_blur(merged: FocalStack, slices: RegisteredSlices, all_in_focus:
     size_px = all_in_focus.shape[1], all_in_focus.shape[0]
     gauge = gauge_of(merged, nearness_px(relative.positions_px, direction), size_px)
     guessed = with_guessed_metres(merged, relative, direction, gauge, size_px)
-    write_relative_depth(guessed, focus, relative, direction, gauge)
+    focus = with_edges_of_light(focus, all_in_focus, near_first=direction.near_first)
+    write_relative_depth(guessed, focus, relative.with_index(index, focus.focus_index), direction, gauge)
     return guessed
 
 
