@@ -14,7 +14,7 @@ Pixel = tuple[float, float]
 
 _SAME_SURFACE, _SURELY_SAME = 0.02, 0.01
 """Largest shares by which depth changes from pixel to pixel of one surface: along a table, and where no edge may be missed."""
-_FARTHER, _JUST_BEFORE = 0.05, np.float32(0.999)
+_FARTHER, _STANDS_BEFORE, _JUST_BEFORE = 0.05, 0.25, np.float32(0.999)
 _NEARER = (0.05, 0.12)
 """Shares by which what stands on the ground is nearer than its plane: the first still catches the shadow whole, the second none of it."""
 _FOUND = 2
@@ -68,7 +68,8 @@ def with_ground_behind(plate: Plate, feet_px: Sequence[Pixel], layers: Sequence[
     """Return the plate with the ground on which things stand no nearer than those, where it is seen above their feet.
 
     A floor or a table is the farther the higher it is in the picture, so that it never hides what stands on it; depth that says otherwise
-    is wrong. The ground is what goes on from a foot without a jump of depth, but not below the foot, where near things stand.
+    is wrong. The ground is what goes on from a foot without a jump of depth, but not below the foot, where near things stand, nor what is
+    clearly nearer than the foot although it is higher: that stands before the object.
     """
     if plate.depth_m is None:
         return plate
@@ -76,6 +77,8 @@ def with_ground_behind(plate: Plate, feet_px: Sequence[Pixel], layers: Sequence[
     ground = np.zeros(covered_m.shape, bool)
     for foot_px in feet_px:
         above = np.broadcast_to(np.arange(len(covered_m))[:, None] <= int(foot_px[1]), covered_m.shape)
+        foot_m = plate.depth_m[int(foot_px[1]), int(foot_px[0])]
+        above = above & (plate.depth_m > np.float32(1.0 - _STANDS_BEFORE) * foot_m)
         ground |= _same_surface(plate.depth_m, foot_px, above, _SAME_SURFACE) & np.isfinite(covered_m)
     return replace(plate, depth_m=np.where(ground, np.maximum(plate.depth_m, covered_m), plate.depth_m))
 

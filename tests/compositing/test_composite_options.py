@@ -117,8 +117,10 @@ def test_the_ground_never_hides_what_stands_on_it_and_a_post_before_it_does() ->
     """A table whose depth grows upwards from 1 to 2 m, wrong by a third in its right half above the foot, where it seems nearer."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     table_m = 1.0 + (HEIGHT - 1 - rows) / HEIGHT
-    wrong_m = table_m * (1.0 - np.clip((columns - WIDTH / 2) / 100, 0, 0.33) * (rows < 70)).astype(np.float32)
+    wrong_m = table_m * (1.0 - np.clip((columns - WIDTH / 2) / 80, 0, 0.33) * (rows < 70)).astype(np.float32)
     wrong_m[50:, 20:40] = 0.5
+    # A can whose depth goes on from the table over 30 columns, less than 2 % from one to the next, as depth from focus does.
+    wrong_m[:, 100:130] = table_m[70, 72] * np.maximum(1.0 - 0.019 * (columns[:, 100:130] - 99), 0.6)
     alpha = ((rows >= 30) & (rows <= 70) & (columns >= 10) & (columns < 130)).astype(np.float32)
     foot_m = float(table_m[70, 72])
     card = Layer(np.repeat(alpha[..., None], 3, axis=2), alpha, np.where(alpha > 0, foot_m, np.inf).astype(np.float32))
@@ -126,8 +128,9 @@ def test_the_ground_never_hides_what_stands_on_it_and_a_post_before_it_does() ->
     hidden, whole = (
         insertion_of("over").insert(each, [card], ScatterReference()).rgb for each in (plate, with_ground_behind(plate, [(72, 70)], [card]))
     )
-    assert hidden[40, 120].max() < 0.5 < 0.95 < whole[40, 120].min(), "where depth is wrong"
+    assert hidden[40, 98].max() < 0.5 < 0.95 < whole[40, 98].min(), "where depth is wrong"
     assert whole[60, 30].max() < 0.5, "the post, whose own foot is nearer"
+    assert whole[60, 125].max() < 0.5, "the can, which is nearer than the foot"
     np.testing.assert_array_equal(hidden[80:], whole[80:])
 
 

@@ -59,6 +59,7 @@ def test_depth_of_the_raw_stack(desk: FocalStack) -> None:
     error = np.abs(desk.depth_m() / true_depth_m - 1.0)
     assert textured.mean() > 0.6
     assert np.median(error[textured]) < 0.03
+    assert np.median(error) < 0.008, "surfaces are evened out by what is sure of them: 0.0085 before"
     assert np.median(error[textured]) < np.median(error[~textured]), "confidence knows where depth is worse"
 
 
