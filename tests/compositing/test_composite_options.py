@@ -120,7 +120,7 @@ def test_the_ground_never_hides_what_stands_on_it_and_a_post_before_it_does() ->
     wrong_m = table_m * (1.0 - np.clip((columns - WIDTH / 2) / 80, 0, 0.33) * (rows < 70)).astype(np.float32)
     wrong_m[50:, 20:40] = 0.5
     # A can whose depth goes on from the table over 22 columns, less than 2 % from one to the next, as depth from focus does.
-    wrong_m[:, 44:66] = table_m[70, 72] * (1.0 - 0.018 * (66 - columns[:, 44:66]))
+    wrong_m[:, 44:66] = table_m[70, 72] * np.exp(-0.018 * (66 - columns[:, 44:66]))
     alpha = ((rows >= 30) & (rows <= 70) & (columns >= 10) & (columns < 130)).astype(np.float32)
     foot_m = float(table_m[70, 72])
     card = Layer(np.repeat(alpha[..., None], 3, axis=2), alpha, np.where(alpha > 0, foot_m, np.inf).astype(np.float32))
