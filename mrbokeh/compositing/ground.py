@@ -98,9 +98,11 @@ def ended_shadow(plate: Plate, feet_px: Sequence[Pixel], objects: Layer, shadow:
     beside = np.logical_or.reduce([_same_surface(even, foot_px, covered, _SURELY_SAME) for foot_px in feet_px])
     same = np.logical_or.reduce([_same_surface(plate.depth_m, foot_px, covered, _SURELY_SAME) for foot_px in feet_px])
     beyond = beside & ~same & (plate.depth_m > shadow.depth_m * np.float32(1.0 + _FARTHER))
-    caught = np.clip((plate.depth_m / shadow.depth_m - np.float32(1.0 - _NEARER[1])) / np.float32(_NEARER[1] - _NEARER[0]), 0.0, 1.0)
-    caught = np.where(beyond, np.float32(0.0), np.where(same, caught, np.float32(1.0)))
-    moved = same & (shadow.alpha > 0.0) & (objects.alpha == 0.0)
+    lies = same & (shadow.alpha > 0.0)
+    caught = np.where(beyond, np.float32(0.0), np.float32(1.0))
+    nearer = plate.depth_m[lies] / shadow.depth_m[lies]
+    caught[lies] = np.clip((nearer - np.float32(1.0 - _NEARER[1])) / np.float32(_NEARER[1] - _NEARER[0]), 0.0, 1.0)
+    moved = lies & (objects.alpha == 0.0)
     return replace(
         shadow,
         alpha=shadow.alpha * caught,
