@@ -340,8 +340,8 @@ async def darkest(page: Page, canvas: str, x_px: float, y_px: float) -> int:
 
 
 async def test_an_enlarged_picture_shows_the_photographs_own_pixels(tmp_path: Path) -> None:
-    """A line of one dark pixel in 2 megapixels is lost in the preview, and there at full size, with and without an object."""
-    photo = write_floor(tmp_path / "floor.png", 1600, 1200)
+    """A line of one dark pixel in 3 megapixels is lost in the preview, and there at full size, with and without an object."""
+    photo = write_floor(tmp_path / "floor.png", 2000, 1500)
     light = read_image(photo).copy()
     light[300:500, 999] = 0.0
     write_image(photo, light)
