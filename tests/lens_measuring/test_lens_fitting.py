@@ -294,7 +294,6 @@ def test_the_command_writes_a_bank_that_renders(tmp_path: Path) -> None:
     bank = read_bank(out)
     assert (bank.model, bank.channels) == ("measured", 3)
     np.testing.assert_allclose(bank.throughput, 1.0, atol=1e-5)
-    run("show", out, "--out", tmp_path / "sheet.png")
     run("export", out, "--out", tmp_path / "kernels")
     assert len(list((tmp_path / "kernels").glob("*.exr"))) == len(bank.kernels) == len(bank.settings["pixels"])
     sharp, slice_rgb = stack.all_in_focus(), stack.slice_rgb(0)

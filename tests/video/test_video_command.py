@@ -134,7 +134,8 @@ def test_a_bank_is_a_lens(clip: Path, settings: list[str], tmp_path: Path, worke
     """The same film as by the lens file, in workers too, which read the bank themselves."""
     bank = bank_folder(tmp_path / "bank", LENS)
     run(clip, *settings, "--frames", "0-5", "--out", tmp_path / "by_file.mkv")
-    run(clip, *settings[:2], "--lens", bank, "--frames", "0-5", "--workers", workers, "--segment", "0.12", "--out", tmp_path / "by_bank.mkv")
+    words = ("--frames", "0-5", "--workers", workers, "--segment", "0.12", "--out", tmp_path / "by_bank.mkv")
+    run(clip, *settings[:2], "--lens", bank, *words)
     by_file, by_bank = (list(read_frames(tmp_path / f"by_{way}.mkv")) for way in ("file", "bank"))
     assert len(by_bank) == 6 and all(psnr(a.rgb, b.rgb) > 40.0 for a, b in zip(by_file, by_bank, strict=True))
 

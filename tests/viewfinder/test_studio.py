@@ -393,25 +393,25 @@ async def test_previews_come_with_what_is_told_of_them(photo: Path, tmp_path: Pa
         assert made.desk.state.turn_deg == 0.0, "asked for, not kept"
 
 
-async def test_a_saved_picture_is_that_of_the_command_line_bit_for_bit(photo: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("kind", "suffix"), [("png", ".png"), pytest.param("exr", ".exr", marks=pytest.mark.slow)])
+async def test_a_saved_picture_is_that_of_the_command_line_bit_for_bit(photo: Path, tmp_path: Path, kind: str, suffix: str) -> None:
     """As a process of its own makes it, in each format; a second one gets another name; one is cancelled and leaves nothing."""
     async with made_studio(tmp_path, whole_state(photo)) as made, aiohttp.ClientSession() as one:
         await comes_true(lambda: made.desk.photograph is not None and made.desk.busy == "")
-        for kind, suffix in (("png", ".png"), ("exr", ".exr")):
-            _, told = await asked(one, made.url + "save", {"format": kind})
-            save = told["saves"][0]
-            await comes_true(lambda: made.desk.saves.told()[0]["state"] != "running", 60.0)
-            assert made.desk.saves.told()[0]["state"] == "done", made.desk.saves.told()
-            async with one.get(f"{made.url}saved/{save['number']}") as answer:
-                saved = await answer.read()
-            own = tmp_path / f"own{suffix}"
-            assert mrbokeh(*words_of(options_of(made.desk.state), own)).returncode == 0
-            assert saved == own.read_bytes() == Path(save["path"]).read_bytes() and f"_mrbokeh{suffix}" in save["command"]
-        await asked(one, made.url + "save", {"format": "png"})
-        _, told = await asked(one, made.url + "cancel", {"number": 3})
+        _, told = await asked(one, made.url + "save", {"format": kind})
+        save = told["saves"][0]
+        await comes_true(lambda: made.desk.saves.told()[0]["state"] != "running", 60.0)
+        assert made.desk.saves.told()[0]["state"] == "done", made.desk.saves.told()
+        async with one.get(f"{made.url}saved/{save['number']}") as answer:
+            saved = await answer.read()
+        own = tmp_path / f"own{suffix}"
+        assert mrbokeh(*words_of(options_of(made.desk.state), own)).returncode == 0
+        assert saved == own.read_bytes() == Path(save["path"]).read_bytes() and f"_mrbokeh{suffix}" in save["command"]
+        await asked(one, made.url + "save", {"format": kind})
+        _, told = await asked(one, made.url + "cancel", {"number": 2})
         await comes_true(lambda: not made.desk.saves._tasks)
-        assert told["saves"][0]["name"] == "a floor_mrbokeh_2.png" and made.desk.saves.told()[0]["state"] == "cancelled"
-        assert not (tmp_path / "a floor_mrbokeh_2.png").exists()
+        assert told["saves"][0]["name"] == f"a floor_mrbokeh_2{suffix}" and made.desk.saves.told()[0]["state"] == "cancelled"
+        assert not (tmp_path / f"a floor_mrbokeh_2{suffix}").exists()
 
 
 def test_a_studio_that_was_killed_goes_on_where_it_was(photo: Path, tmp_path: Path) -> None:
