@@ -95,7 +95,7 @@ def test_rows_are_the_convolution_with_the_kernel() -> None:
     sharp, coc_px = rng.random((48, 64, 3)), np.full((48, 64), -11.3, np.float32)
     sums = np.zeros((49, 65, 3))
     sums[1:, 1:] = sharp.cumsum(axis=0).cumsum(axis=1)
-    where = np.argwhere(np.ones((20, 30), bool)) + np.array([14, 17])
+    where = np.ascontiguousarray(np.argwhere(np.ones((20, 30), bool)) + np.array([14, 17]))
     rows = np.empty((len(where), 3, len(grid.places)), np.float32)
     gather_rows(rows, sums, coc_px, where, np.tile([1.0, 0.0], (len(where), 1)), grid.places, grid.cell)
     kernel = kernel_of(grid, picture, -11.3)[..., 0].astype(np.float64)
