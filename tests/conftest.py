@@ -106,7 +106,6 @@ LONG_FILES = (
     "compositing/test_composite_command.py",
     "photos/test_raw_stack.py",
     "training/test_train_one_stack.py",
-    "renderers/test_between_network.py",
     "viewfinder/test_page_browser.py",
     "compositing/test_compositing_rims.py",
     "house/test_demo.py",

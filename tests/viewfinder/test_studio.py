@@ -91,7 +91,7 @@ def test_the_command_line_of_a_state_says_its_options(photo: Path, changes: dict
     assert "--mode" not in words and command_line(options, Path("out.png")).startswith("mrbokeh composite '")
 
 
-@pytest.mark.parametrize("changes", STATES)
+@pytest.mark.parametrize("changes", [pytest.param(each, marks=() if each in STATES[::2] else pytest.mark.slow) for each in STATES])
 def test_the_preview_of_a_small_photograph_is_the_picture_of_its_command_line(photo: Path, tmp_path: Path, changes: dict[str, Any]) -> None:
     options = options_of(whole_state(photo, **changes))
     out = tmp_path / "out.png"
