@@ -35,8 +35,8 @@ RESTS = "studio.shown && !studio.shown.draft && !studio.isChanging"
 
 @asynccontextmanager
 async def opened(folder: Path, size_px: tuple[int, int], state: StudioState | None = None) -> AsyncIterator[tuple[Page, MadeStudio]]:
-    """The page of a studio with a photograph, once that is opened and its camera looked for."""
-    first = state or StudioState(photo=write_floor(folder / "floor.png"), pitch_deg=0.0)
+    """The page of a studio with a photograph, once that is opened and its camera looked for; without shadows, half of a picture's time."""
+    first = state or StudioState(photo=write_floor(folder / "floor.png"), pitch_deg=0.0, shadow=0.0)
     async with made_studio(folder, first) as made, shared_page(made.url, size_px) as page:
         await page.comes_true("window.studio?.told?.photo && studio.told.busy === ''", 40.0)
         yield page, made
@@ -554,7 +554,8 @@ async def test_the_objects_light_gets_warmer_at_once_and_the_ground_keeps_its_co
         return [0, 2].map((channel) => [...light(channel)].reduce((sum, code) => sum + ((code / 255 + 0.055) / 1.055) ** 2.4, 0));
     }})()"""
     on_cake, in_shadow = seen.format(low=0.4, high=0.8), seen.format(low=1.02, high=1.08)
-    async with opened(tmp_path, size_px) as (page, made):
+    shadowed = StudioState(photo=write_floor(tmp_path / "floor.png"), pitch_deg=0.0)
+    async with opened(tmp_path, size_px, shadowed) as (page, made):
         await placed(page, made)
         before, ground = np.array(await page.value(on_cake)), np.array(await page.value(in_shadow))
         await page.value("document.getElementById('warmth').scrollIntoView({block: 'center'})")
