@@ -60,14 +60,23 @@ def photo(tmp_path: Path) -> Path:
 
 
 def whole_state(photo: Path, **more: Any) -> StudioState:
-    first = {"photo": str(photo), "object": str(CAKE), "at_px": AT_PX, "height": "0.4", "camera_height_m": 1.2, "pitch_deg": 3.0}
-    return state_of(first | more)
+    """Without a shadow, half of a picture's time, unless one is asked for."""
+    first = {
+        "photo": str(photo),
+        "object": str(CAKE),
+        "at_px": AT_PX,
+        "height": "0.4",
+        "camera_height_m": 1.2,
+        "pitch_deg": 3.0,
+        "shadow": 0,
+    }
+    return state_of(first | {"pitch_deg": 3.0, "shadow": 0} | more)
 
 
 STATES: list[dict[str, Any]] = [
     {},
     {"turn_deg": -33.3, "sun_deg": [-60, 40], "shadow": 0.5, "exposure": 1.3, "warmth_k": 9000, "roll_deg": 4},
-    {"before": [{"object": str(ALIEN), "at_px": [60, 150], "height": "0.3", "turn_deg": 20}], "turn_deg": 5},
+    {"before": [{"object": str(ALIEN), "at_px": [60, 150], "height": "0.3", "turn_deg": 20}], "turn_deg": 5, "shadow": 1},
     {"height": "60px", "f_number": 2.8, "focus_m": 6.25, "focal_length_mm": 35, "sensor_width_mm": 23.5, "matched": False},
 ]
 
@@ -122,7 +131,7 @@ def test_a_smaller_preview_shows_the_same_place_and_size(photo: Path) -> None:
 def test_the_loupe_shows_the_finished_picture_pixel_by_pixel(tmp_path: Path) -> None:
     """Of a photograph larger than its preview, 1200 by 900 px; grain would differ. Beyond the frame it is black."""
     photo = write_floor(tmp_path / "large.png", 1200, 900)
-    options = options_of(whole_state(photo, at_px=(600, 700), f_number=1.4, focus_m=2.0, matched=False, warmth_k=9000.0))
+    options = options_of(whole_state(photo, at_px=(600, 700), f_number=1.4, focus_m=2.0, matched=False, warmth_k=9000.0, shadow=1.0))
     opened, _rgb = open_photograph(photo)
     kept = KeptParts()
     kept.small = True
