@@ -102,24 +102,31 @@ class Page:
         return np.asarray(cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR))[..., ::-1]
 
 
-@asynccontextmanager
-async def chromium_page(
-    url: str, profile: Path, *flags: str, size_px: tuple[int, int] = (390, 844), script: str = ""
-) -> AsyncIterator[Page]:
-    """Yield a page of a browser with a profile of its own; it has touch and the size of a phone. script: runs before the page's own."""
-    command = [str(CHROMIUM), *_FLAGS, f"--user-data-dir={profile}", *flags, "about:blank"]
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    try:
-        port_file = profile / "DevToolsActivePort"
-        while not (port_file.exists() and port_file.read_text().strip()):
-            assert process.poll() is None, f"Chromium ended with {process.returncode}"
+class Chromium:
+    """A running headless Chromium that shows pages, each with cookies and storage of its own."""
+
+    def __init__(self, profile: Path, *flags: str) -> None:
+        command = [str(CHROMIUM), *_FLAGS, f"--user-data-dir={profile}", *flags, "about:blank"]
+        self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        self._told = profile / "DevToolsActivePort"
+
+    def close(self) -> None:
+        self._process.terminate()
+        self._process.wait(timeout=10)
+
+    @asynccontextmanager
+    async def page(self, url: str, size_px: tuple[int, int] = (390, 844), script: str = "") -> AsyncIterator[Page]:
+        """Yield a page; it has touch and the size of a phone. script: runs before the page's own."""
+        while not (self._told.exists() and len(told := self._told.read_text().split()) == 2):
+            assert self._process.poll() is None, f"Chromium ended with {self._process.returncode}"
             await asyncio.sleep(0.05)
-        port = port_file.read_text().split()[0]
-        async with aiohttp.ClientSession() as session:
-            async with session.get(f"http://127.0.0.1:{port}/json/list") as answer:
-                target = next(each for each in await answer.json() if each["type"] == "page")
-            async with session.ws_connect(target["webSocketDebuggerUrl"], max_msg_size=0) as devtools:
-                page = Page(devtools)
+        address = f"ws://127.0.0.1:{told[0]}"
+        async with aiohttp.ClientSession() as session, session.ws_connect(address + told[1], max_msg_size=0) as browser:
+            devtools = Page(browser)
+            own = (await devtools.send("Target.createBrowserContext"))["browserContextId"]
+            target = (await devtools.send("Target.createTarget", url="about:blank", browserContextId=own))["targetId"]
+            async with session.ws_connect(f"{address}/devtools/page/{target}", max_msg_size=0) as shown:
+                page = Page(shown)
                 for domain in ("Runtime", "Log", "Page"):
                     await page.send(f"{domain}.enable")
                 await page.send("Emulation.setTouchEmulationEnabled", enabled=True, maxTouchPoints=2)
@@ -127,9 +134,20 @@ async def chromium_page(
                 await page.send("Page.addScriptToEvaluateOnNewDocument", source=script)
                 await page.send("Page.navigate", url=url)
                 yield page
+            await devtools.send("Target.disposeBrowserContext", browserContextId=own)
+
+
+@asynccontextmanager
+async def chromium_page(
+    url: str, profile: Path, *flags: str, size_px: tuple[int, int] = (390, 844), script: str = ""
+) -> AsyncIterator[Page]:
+    """Yield a page of a browser that is started for it."""
+    browser = Chromium(profile, *flags)
+    try:
+        async with browser.page(url, size_px, script) as page:
+            yield page
     finally:
-        process.terminate()
-        process.wait(timeout=10)
+        browser.close()
 
 
 WIDEST_PX = 960

@@ -90,7 +90,7 @@ def _draw_samples(view: PackedView, samples: int, seed: int) -> _Samples:
     from scipy.stats import qmc
 
     covered = pupil_areas(view).max() / (2.0 * view.pupil_extent) ** 2
-    count = max(int(np.ceil(samples / covered)), _LEAST_DRAWN)
+    count = max(int(np.ceil(samples / covered)), _LEAST_DRAWN if covered < 1.0 else 1)
     sobol = qmc.Sobol(4, scramble=True, rng=np.random.default_rng(seed))
     points = sobol.random_base2(int(np.ceil(np.log2(count))))
     return _Samples(points[:count], points[: max(samples // 4, 16)])

@@ -1,6 +1,6 @@
 """Exact reference that the fast renderers are tested against: every pixel throws its light over its own exact PSF.
 
-Slow and obvious: no kernel is rounded, cached or shared; everything is summed in float64.
+Slow and obvious: no kernel is rounded, one is drawn again wherever the diameter is another; everything is summed in float64.
 """
 
 from collections.abc import Sequence

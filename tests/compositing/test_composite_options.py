@@ -187,7 +187,7 @@ def test_what_stands_on_the_ground_does_not_catch_its_shadow() -> None:
 )
 def test_a_size_that_nobody_means_is_told(files: Path, at: str, height: str, told: str) -> None:
     """The cake stands at 1.5 m, where a pixel is 7 mm wide: the frame of 144 x 96 px is about 1 m x 0.7 m there."""
-    words = (files / "photo.exr", "--lens", files / "lens.json", "--object", CAKE, "--at", at, "--height", height)
+    words = (files / "photo.exr", "--lens", files / "lens.json", "--object", CAKE, "--at", at, "--height", height, "--shadow", 0)
     done = mrbokeh("composite", *words, "--out", files / "out.exr")
     assert done.returncode == 0 and ("warning" in done.stderr) == bool(told) and told in done.stderr
 
@@ -430,7 +430,19 @@ def test_an_object_in_a_black_and_white_photograph_has_no_colours(tmp_path: Path
 def test_a_matte_that_cannot_be_meant_is_told(files: Path) -> None:
     """One that hides all is warned of, and one that the mode does not look at is refused before anything is read."""
     write_image(files / "white.png", np.ones((96, 144, 3), np.float32), "linear")
-    words = (files / "photo.exr", "--lens", files / "lens.json", "--object", CAKE, "--at", "0,0.15,1.5", "--matte", files / "white.png")
+    words = (
+        files / "photo.exr",
+        "--lens",
+        files / "lens.json",
+        "--object",
+        CAKE,
+        "--at",
+        "0,0.15,1.5",
+        "--matte",
+        files / "white.png",
+        "--shadow",
+        0,
+    )
     done = mrbokeh("composite", *words, "--out", files / "hidden.exr")
     assert done.returncode == 0 and "all of it lies behind what the matte shows" in done.stderr, done.stderr
     for mode in ("front", "matte"):

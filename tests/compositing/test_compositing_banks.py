@@ -86,7 +86,7 @@ def test_a_layer_behind_everything_changes_nothing(mode: str, by_bank: Renderer)
 
 
 @each_mode
-@pytest.mark.parametrize("depth_m", [0.85, 1.6], ids=["before the focus", "behind it"])
+@pytest.mark.parametrize("depth_m", [0.85, pytest.param(1.6, marks=pytest.mark.slow)], ids=["before the focus", "behind it"])
 def test_a_bank_of_an_opening_inserts_as_the_opening_does(mode: str, depth_m: float, by_bank: Renderer) -> None:
     """A heart stands on its head before the focus. The plain reference is exact scattering through its polygons; a disc is far off.
 
@@ -100,9 +100,9 @@ def test_a_bank_of_an_opening_inserts_as_the_opening_does(mode: str, depth_m: fl
 
 
 def test_a_bank_is_as_near_the_traced_truth_as_its_opening(bank: Path) -> None:
-    """Measured 37.6 to 42.8 dB, 0.25 dB below the opening at most."""
+    """Measured 37.6 to 42.8 dB, 0.25 dB below the opening at most, where the truth was made with twice as many places of the pupil."""
     by_bank, way = lens_and_renderer(bank, None)[1], insertion_of("between")
-    for case in card_cases(120, 96, ("heart",), positions=120, radius_px=4.5):
+    for case in card_cases(120, 96, ("heart",), positions=60, radius_px=4.5):
         said_round = replace(case.plate, lens=replace(case.plate.lens, aperture=Aperture.disc()))
         ours = psnr(way.insert(said_round, [case.virtual], by_bank).rgb, case.truth)
         assert ours > psnr(way.insert(case.plate, [case.virtual], PolygonDifferences()).rgb, case.truth) - 0.5, case.name

@@ -174,7 +174,7 @@ def test_a_wall_and_noise_are_no_ground() -> None:
     assert [ground_under(replace(plate, depth_m=each), (50.0, 60.0)) for each in (wall, rough, None)] == [None, None, None]
 
 
-@pytest.mark.parametrize("sun_degrees", [None, (40.0, 35.0)])
+@pytest.mark.parametrize("sun_degrees", [pytest.param(None, marks=pytest.mark.slow), (40.0, 35.0)])
 def test_light_in_few_pixels_is_that_of_all_pixels(sun_degrees: tuple[float, float] | None) -> None:
     """A cake of 0.3 m; where lights throw sharp shadows the truth has four rays a pixel. Under the cake, where nobody sees it, it is as
     light as beside it: the dark there would show as dashes through the rim."""

@@ -112,7 +112,7 @@ def table(far_m: float) -> Plate:
     return replace(photograph(), depth_m=depth_m, focus_known=True)
 
 
-@pytest.mark.parametrize(("far_m", "grounds"), [(1.0, 1), (1.03, 1), (0.6, 2)])
+@pytest.mark.parametrize(("far_m", "grounds"), [(1.0, 1), pytest.param(1.03, 1, marks=pytest.mark.slow), (0.6, 2)])
 def test_what_stands_on_another_level_has_its_own_ground(far_m: float, grounds: int) -> None:
     """Depth that is off by 3 % is the same table, one at 0.6 of it lies higher: each level has one shadow, and none has two.
 

@@ -34,7 +34,7 @@ def centroid_px(picture: np.ndarray) -> np.ndarray:
     return np.array([(picture * x).sum(), (picture * y).sum()]) / picture.sum()
 
 
-@pytest.mark.parametrize("z_m", [0.8, 1.0, 1.5])
+@pytest.mark.parametrize("z_m", [pytest.param(0.8, marks=pytest.mark.slow), 1.0, 1.5])
 def test_a_lamp_keeps_its_energy_however_blurred(z_m: float) -> None:
     """Sum over the picture = radiance x projected area, pi (r f_px / z)^2: the pupil average moves light but makes none."""
     radius_m = 0.0001

@@ -12,7 +12,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
+from mrbokeh.commands import lens as lens_command
 from mrbokeh.demo import stages
 from mrbokeh.demo.plan import VIEWS, demo_stages
 from mrbokeh.demo.report import (
@@ -28,6 +30,7 @@ from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.images.image_io import read_image, write_image, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
 from tests.support.command_line import mrbokeh
 from tests.support.refusals import refused
@@ -45,10 +48,17 @@ def lens_stage(path: Path, focus_m: float = 1.0) -> Stage:
     return Stage("lens", "Write a lens", arguments, (path,))
 
 
+@pytest.fixture
+def drawn_small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """`lens show` draws an empty figure: what it shows is not the subject."""
+    monkeypatch.setattr(lens_command, "_drawn_lens", lambda path, _width_px: read_lens(path) and Figure(figsize=(1.0, 1.0)))
+
+
 def draw_stage(lens: Path, picture: Path) -> Stage:
     return Stage("draw", "Draw it", ("lens", "show", str(lens), "--out", str(picture)), (picture,), when_stale=("--overwrite",))
 
 
+@pytest.mark.usefixtures("drawn_small")
 def test_finished_stages_are_skipped_and_stale_ones_are_not(tmp_path: Path) -> None:
     lens, picture = tmp_path / "lens.json", tmp_path / "lens.png"
     first, again = (run_stages([lens_stage(lens), draw_stage(lens, picture)], tmp_path) for _ in range(2))
@@ -89,6 +99,7 @@ def test_records_of_earlier_versions_hold_for_nothing(tmp_path: Path) -> None:
     assert record is not None and not record.still_holds(("lens",), {"plan": "run 1"})
 
 
+@pytest.mark.usefixtures("drawn_small")
 def test_the_demo_goes_on_without_an_optional_stage_and_finds_it_later(tmp_path: Path) -> None:
     lens = tmp_path / "found" / "lens.json"
     picture, sheet = tmp_path / "found" / "lens.png", tmp_path / "sheet.png"

@@ -8,6 +8,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from mrbokeh.commands import lens_fit
 from mrbokeh.commands.lens_fit import fit as fit_command
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.lens_measuring.fitting.blur_pairs import BLURRED, COC, SHARP, BlurPair, find_blur_pairs, read_blur_pair, write_blur_pair
@@ -111,7 +112,7 @@ def test_pairs_are_read_as_they_were_written(tmp_path: Path) -> None:
         read_blur_pair(given.folder)
 
 
-def test_the_command_takes_folders_of_pairs(tmp_path: Path) -> None:
+def test_the_command_takes_folders_of_pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_blur_pair(pair(tmp_path / "scenes" / "wall"))
     app = typer.Typer()
     app.command()(fit_command)
@@ -119,6 +120,7 @@ def test_the_command_takes_folders_of_pairs(tmp_path: Path) -> None:
     def run(*arguments: object) -> str:
         return CliRunner().invoke(app, [str(each) for each in arguments], catch_exceptions=False).output
 
+    monkeypatch.setattr(lens_fit, "_draw", lambda *_: None)  # a second, and looked at where a stack is fitted
     out = tmp_path / "lens"
     settings = ("--regions", "1x1", "--pixels", 1500, "--diameters", "12")
     assert "error on slices" in run(tmp_path / "scenes", "--out", out, *settings)

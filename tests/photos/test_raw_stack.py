@@ -271,7 +271,7 @@ def test_the_shipped_truth_is_what_the_tracer_sees(view: int, desk: Scene) -> No
     """Traced again with few rays: depth to the half float's 2^-11 except where the centre of a pixel grazes an edge."""
     document = shipped_truth()
     camera = camera_from_json(document["views"][view]["reference_camera"])
-    rgb, depth_m = trace_pinhole(desk, camera, 16, footprint_px=document["sensor"]["footprint_px"])
+    rgb, depth_m = trace_pinhole(desk, camera, 32, footprint_px=document["sensor"]["footprint_px"])
     folder = SHIPPED / "truth" / f"view_{view}"
     stored_m = read_exr(folder / "depth.exr")[0].stacked(["Z"])[..., 0]
     assert np.mean(np.abs(stored_m / depth_m - 1.0) < 2.0**-11 + 1e-6) > 0.999

@@ -5,14 +5,15 @@ import pytest
 
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
 from mrbokeh.renderers.layered_reconstruction._filter_numba import axes, morton, sheared_axes, sheared_filter, tile_order
-from mrbokeh.renderers.layered_reconstruction._partitions_numba import partitions_of_tile, rows_of_tile, seeded, xorshift
+from mrbokeh.renderers.layered_reconstruction._partitions_numba import partitions_of_tile, seeded, xorshift
 from mrbokeh.renderers.layered_reconstruction._samples import bucket_of, motion_cells
-from mrbokeh.renderers.layered_reconstruction._tile_data import Choice, Light
+from mrbokeh.renderers.layered_reconstruction._tile_data import Choice, Light, Partitions
 from tests.support.sampled_planes import LENS, Plane, even, sample_planes
 
 SIZE_PX = 64
 WINDOW = np.array([0.25, 0.0, 0.25, 1.0 / 12.0])
-FULL = Settings(merge=False, sparse_statistics=False)
+FULL = Settings(merge=False, sparse_statistics=False, faint=0.0)
+"""Every bucket is a partition of its own."""
 
 
 def one_tile(slopes: np.ndarray, bucket: np.ndarray | None = None, cells_x: int = 1, cells: int = 1, depths: int = 40) -> Light:
@@ -33,9 +34,12 @@ def no_places(light: Light) -> np.ndarray:
     return np.full(light.depths * light.cells, -1, np.int32)
 
 
+def buckets_of(light: Light, every: int) -> Partitions:
+    return partitions_of_tile(0, light, choice_of(FULL, every), no_places(light))[0]
+
+
 def sums_of(slopes: np.ndarray) -> np.ndarray:
-    light = one_tile(slopes)
-    return rows_of_tile(0, light, choice_of(FULL, 1), no_places(light))[1][0]
+    return buckets_of(one_tile(slopes), 1).sums[0]
 
 
 # The filter of a partition.
@@ -101,16 +105,15 @@ def test_morton_order_interleaves_bits_and_samples_are_sorted_by_tile_and_pixel(
 
 def test_sparse_statistics_take_one_of_every_so_many_and_sum_lonely_buckets_over_all() -> None:
     slopes = np.column_stack([np.arange(1000) // 100, np.zeros((1000, 2))]).astype(np.float32)
-    light = one_tile(slopes)
-    _, sums, _ = rows_of_tile(0, light, choice_of(FULL, 10), no_places(light))
+    sums = buckets_of(one_tile(slopes), 10).sums
     assert sums[0, 0] == 100 and sums[0, 1] == 10 * sum(range(10)), "stratified: ten from every hundred"
     # 3 of 1000 samples have a bucket of their own: it is there whatever is chosen, and weighs about as the chosen ones do.
     bucket = np.zeros(1000)
     bucket[[17, 500, 501]] = 7
     slopes = np.column_stack([bucket, np.zeros((1000, 2))])
-    light = one_tile(slopes, bucket)
-    buckets, sums, _ = rows_of_tile(0, light, choice_of(FULL, 100), no_places(light))
-    assert buckets.tolist() == [0, 7]
+    found = buckets_of(one_tile(slopes, bucket), 100)
+    sums = found.sums
+    assert found.first.tolist() == [0, 7]
     assert sums[1, 1] / sums[1, 0] == 7.0 and 0.03 <= sums[1, 0] <= 2
 
 

@@ -60,7 +60,7 @@ def over_time(renderer: Renderer, frames: list[list[Layer]]) -> np.ndarray:
     return sum(weight * renderer.render(layers, LENS).rgb for weight, layers in zip(weights, frames, strict=True))
 
 
-@pytest.mark.parametrize("coc_px", [0.0, 9.0, -13.0])
+@pytest.mark.parametrize("coc_px", [0.0, pytest.param(9.0, marks=pytest.mark.slow), -13.0])
 def test_a_moving_card_before_a_still_background(renderer: Renderer, coc_px: float) -> None:
     """12 px to the right: 13 frames a whole pixel apart. Nearer than its background, so that it hides it in every frame."""
     still = background(18.0)

@@ -192,7 +192,7 @@ def test_a_turned_spreadlet_keeps_light_and_centroid_and_shows_the_turned_kernel
 
 def test_darts_keep_their_distance_and_cells_keep_their_sums() -> None:
     rng = np.random.default_rng(7)
-    xy = np.argwhere(np.ones((30, 30), bool))
+    xy = np.ascontiguousarray(np.argwhere(np.ones((30, 30), bool)))  # as `sparsify` has them, for which the kernels are compiled
     importance, radius_px = rng.uniform(0.5, 1.0, 900), np.full(900, 4.0)
     points = xy[throw_darts(xy, importance, radius_px, 10_000, 3)].astype(np.float64)
     apart = np.hypot(*(points[:, None] - points).transpose(2, 0, 1)) + 1e9 * np.eye(len(points))
@@ -202,7 +202,7 @@ def test_darts_keep_their_distance_and_cells_keep_their_sums() -> None:
     np.testing.assert_array_equal(owner, np.argmin(((xy[:, None] - points) ** 2).sum(axis=2), axis=1))
     charges = rng.normal(size=(900, 2))
     expected = np.stack([np.bincount(owner, charges[:, c], len(points)) for c in range(2)], axis=1)
-    np.testing.assert_allclose(cell_sums(points, xy, charges), expected, atol=1e-12)
+    np.testing.assert_allclose(cell_sums(points.astype(np.int64), xy, charges), expected, atol=1e-12)
 
 
 def test_spreadlets_in_a_file(tmp_path: Path) -> None:

@@ -142,7 +142,7 @@ def agreement(filmed: FilmedScene, samples: int) -> tuple[float, float, bool]:
     return scores[0], scores[1], MOTION in layer.extra
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", [pytest.param(each, marks=pytest.mark.slow if each in ("object", "pan") else ()) for each in CASES])
 def test_one_picture_with_motion_is_as_many_pictures_averaged(name: str, alien: Scene) -> None:
     """Margins of about 3 dB below what was measured; what is left are light that moves over the surface, surfaces that come to
     be seen during the shutter, and the half pixel by which drawing out along a path softens."""

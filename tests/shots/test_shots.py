@@ -277,13 +277,13 @@ def test_worker_processes_make_the_same_file_and_a_killed_one_loses_nothing(tmp_
     assert len(list((tmp_path / "pids").iterdir())) == 2
     assert sum(told) == COUNT
     assert (tmp_path / "two.mp4").read_bytes() == (tmp_path / "one.mp4").read_bytes()
-    # A worker is killed (signal 9) in the middle of a segment; others take over.
+    # A worker is killed (signal 9) in the middle of a segment; another takes over.
     render_shot(shot_of(clip, VideoTarget(tmp_path / "one.mkv")), SerialExecutor())
     fatal = tmp_path / "fatal"
     fatal.touch()
     told: list[int] = []
     shot = shot_of(clip, VideoTarget(tmp_path / "two.mkv"), Brighter(killing=fatal))
-    render_shot(shot, ProcessExecutor(2), progress=told.append)
+    render_shot(shot, ProcessExecutor(1), progress=told.append)
     assert not fatal.exists()
     assert sum(told) == COUNT
     assert (tmp_path / "two.mkv").read_bytes() == (tmp_path / "one.mkv").read_bytes()
@@ -292,7 +292,7 @@ def test_worker_processes_make_the_same_file_and_a_killed_one_loses_nothing(tmp_
 
 def test_a_mistake_in_a_worker_is_told_once(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="pictures with alpha need"):
-        render_shot(shot_of(clip_of_blobs(tmp_path), VideoTarget(tmp_path / "out.mkv"), Brighter(as_layer=True)), ProcessExecutor(2))
+        render_shot(shot_of(clip_of_blobs(tmp_path), VideoTarget(tmp_path / "out.mkv"), Brighter(as_layer=True)), ProcessExecutor(1))
 
 
 def held_shot(folder: Path) -> Shot:

@@ -99,6 +99,7 @@ def test_a_worker_killed_while_it_works_loses_nothing(tmp_path: Path, address: s
     assert (tmp_path / "two.mkv").read_bytes() == (tmp_path / "one.mkv").read_bytes()
 
 
+@pytest.mark.slow  # in a process of this machine: test_shots
 def test_a_mistake_on_a_worker_is_the_users_sentence(tmp_path: Path, address: str) -> None:
     shot = shot_of(clip_of_blobs(tmp_path), VideoTarget(tmp_path / "out.mkv"), Brighter(as_layer=True))
     refused("pictures with alpha need", render_shot, shot, DaskExecutor(address))

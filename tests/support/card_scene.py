@@ -14,7 +14,7 @@ a shadow, so neither changes the light on the other.
 """
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 from jaxtyping import Float32, Float64
@@ -147,6 +147,7 @@ class MixedCards:
         return near, card, far
 
 
+@cache
 def mixed_cards(seed: int = 0, width_px: int = 640, height_px: int = 360, virtual: int = FOCUS_CARD) -> MixedCards:
     """Build the card scene of that seed; virtual: which of its cards, front first, is the object."""
     both = card_scene(seed, width_px, height_px)

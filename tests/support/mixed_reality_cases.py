@@ -106,4 +106,4 @@ def card_cases(width_px: int, height_px: int, shapes: tuple[str, ...], positions
 
 @cache
 def small_card_cases() -> tuple[MixedCase, ...]:
-    return tuple(card_cases(120, 96, ("disc",), positions=120, radius_px=4.5))
+    return tuple(card_cases(120, 96, ("disc",), positions=60, radius_px=4.5))

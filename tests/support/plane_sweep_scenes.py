@@ -51,7 +51,7 @@ def traced(quads: tuple[Quad, ...], places_m: tuple[tuple[float, float, float], 
         pose = np.eye(4)
         pose[:3, 3] = -np.asarray(place)
         camera = Camera(WIDTH_PX, HEIGHT_PX, (FOCAL_PX, FOCAL_PX), (0.5 * WIDTH_PX, 0.5 * HEIGHT_PX), pose)
-        rgb, depth_m = trace_pinhole(Scene(quads), camera, 6, number, 1.2)
+        rgb, depth_m = trace_pinhole(Scene(quads), camera, 16, number, 1.2)
         rgb = rgb + (noise * np.sqrt(rgb) * rng.normal(size=rgb.shape)).astype(np.float32)
         views.append(SweepView(structure_of(rgb), camera))
         pictures.append(rgb)

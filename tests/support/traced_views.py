@@ -91,7 +91,7 @@ class Traced:
 
 
 def traced() -> Traced:
-    pairs = [trace_pinhole(scene(), true_camera(view), 8, seed=view) for view in range(len(POSITIONS_M))]
+    pairs = [trace_pinhole(scene(), true_camera(view), 16, seed=view) for view in range(len(POSITIONS_M))]
     return Traced(tuple(rgb for rgb, _ in pairs), tuple(depth_m for _, depth_m in pairs))
 
 

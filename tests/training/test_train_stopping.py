@@ -16,6 +16,7 @@ import torch
 
 from mrbokeh.system.errors import InputError
 from tests.support.command_line import mrbokeh, printed_by
+from tests.support.drawn_curves import drawn_curves
 from tests.support.refusals import refused
 from tests.support.waiting import wait_until
 from tests.training.test_train import DEMO_LIKE, DEMO_WORDS, make_wall
@@ -211,7 +212,8 @@ def test_curve_and_sheets_tell_how_it_came_along_in_bounded_room(scene: Path, tm
     """12 steps are less than the 200 points of a curve, so each has one; a look after each adds its own, and the last look one more.
     The first picture of the sheets is of step 1, the last of step 12."""
     settings = dataclasses.replace(SHORT, validate_every_s=1e-9, sheets=True)
-    train.fit(training_data([scene]), tmp_path / "run", settings, ["view_2"])
+    with drawn_curves():
+        train.fit(training_data([scene]), tmp_path / "run", settings, ["view_2"])
     with (tmp_path / "run" / "curve.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert tuple(rows[0]) == CurvePoint._fields

@@ -16,6 +16,7 @@ from mrbokeh.images.image_metrics import psnr, ssim
 from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.system.channel import channel
 from tests.support.command_line import mrbokeh, printed_by
+from tests.support.drawn_curves import drawn_curves
 from tests.support.refusals import refused
 from tests.training.test_train import DEMO_LIKE, DEMO_WORDS, make_wall
 from training.cli import app
@@ -62,7 +63,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def run(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("trusted") / "run"
-    train.fit(training_data([scene]), folder, LEARNT, ["view_2"])
+    with drawn_curves():
+        train.fit(training_data([scene]), folder, LEARNT, ["view_2"])
     return folder
 
 

@@ -126,11 +126,16 @@ def test_frames_go_by_the_numbers_of_the_files(clip: Path, settings: list[str], 
             "--out", tmp_path / "no.mkv")  # fmt: skip
 
 
-def test_a_bank_is_a_lens(clip: Path, settings: list[str], tmp_path: Path) -> None:
+in_this_process_and_slowly_in_workers = pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
+
+
+@in_this_process_and_slowly_in_workers
+def test_a_bank_is_a_lens(clip: Path, settings: list[str], tmp_path: Path, workers: int) -> None:
     """The same film as by the lens file, in workers too, which read the bank themselves."""
     bank = bank_folder(tmp_path / "bank", LENS)
     run(clip, *settings, "--frames", "0-5", "--out", tmp_path / "by_file.mkv")
-    run(clip, *settings[:2], "--lens", bank, "--frames", "0-5", "--workers", "2", "--segment", "0.12", "--out", tmp_path / "by_bank.mkv")
+    words = ("--frames", "0-5", "--workers", workers, "--segment", "0.12", "--out", tmp_path / "by_bank.mkv")
+    run(clip, *settings[:2], "--lens", bank, *words)
     by_file, by_bank = (list(read_frames(tmp_path / f"by_{way}.mkv")) for way in ("file", "bank"))
     assert len(by_bank) == 6 and all(psnr(a.rgb, b.rgb) > 40.0 for a, b in zip(by_file, by_bank, strict=True))
 
@@ -292,10 +297,11 @@ def test_a_scene_is_rendered_per_frame(tmp_path: Path) -> None:
     refused("give --camera", run, clip, *options, "--overwrite")
 
 
-def test_the_virtual_layer_alone_and_pictures_out(clip: Path, settings: list[str], tmp_path: Path) -> None:
+@in_this_process_and_slowly_in_workers
+def test_the_virtual_layer_alone_and_pictures_out(clip: Path, settings: list[str], tmp_path: Path, workers: int) -> None:
     run(clip, *settings, "--virtual-only", "--out", tmp_path / "virtual.%03d.exr", "--frames", "2-4")
     run(clip, *settings, "--virtual-only", "--out", tmp_path / "virtual.mov", "--frames", "2-4")
-    options = ("--out", tmp_path / "whole.%03d.png", "--frames", "2-4", "--segment", 0.04, "--workers", 2)
+    options = ("--out", tmp_path / "whole.%03d.png", "--frames", "2-4", "--segment", 0.04, "--workers", workers)
     told = json.loads(mrbokeh("video", clip, *settings, *options, "--json").stdout)
     assert told["outputs"] == [str(tmp_path / f"whole.{i:03d}.png") for i in (2, 3, 4)]
     assert sorted(file.name for file in tmp_path.glob("virtual.*")) == [*(f"virtual.{i:03d}.exr" for i in (2, 3, 4)), "virtual.mov"]

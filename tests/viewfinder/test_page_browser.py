@@ -16,6 +16,7 @@ from datasets_scripts.gallery.pictures import CHROMIUM, Page, chromium_page
 from mrbokeh.compositing.overlay import Overlay
 from mrbokeh.video.color import code_from_linear
 from tests.support.made_viewfinder import LENS_RGB, VIEW_RGB, Made, made_viewfinder
+from tests.support.shared_chromium import shared_page
 from tests.support.streaming_viewers import BARS, Feed, bars, output, serving_routes, streaming
 from tests.support.waiting import comes_true
 from tests.viewfinder.test_server_gallery import TAKE, saved
@@ -48,9 +49,9 @@ def new_loop(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @asynccontextmanager
-async def opened(made: Made, profile: Path) -> AsyncIterator[Page]:
+async def opened(made: Made) -> AsyncIterator[Page]:
     """The page, once it shows pictures and nothing is wrong."""
-    async with chromium_page(made.url, profile, script=OFTEN) as page:
+    async with shared_page(made.url, script=OFTEN) as page:
         await page.comes_true(SHOWN)
         assert await page.value(MESSAGE) == ""
         yield page
@@ -89,8 +90,8 @@ async def assert_shown(page: Page, beside: tuple[int, int, int], middle: tuple[i
         np.testing.assert_allclose(await color_at(page, 0.5, 0.5), middle, atol=1.5 * atol)
 
 
-async def test_taps_pickers_and_buttons_control_the_viewfinder(tmp_path: Path) -> None:
-    async with made_viewfinder() as made, opened(made, tmp_path / "profile") as page:
+async def test_taps_pickers_and_buttons_control_the_viewfinder() -> None:
+    async with made_viewfinder() as made, opened(made) as page:
         await assert_shown(page, VIEW_RGB["final"], LENS_RGB["fifty"])
         await read_out(page)
         await level_against_the_phone(page)
@@ -230,7 +231,7 @@ async def tell_of_the_take(page: Page, made: Made) -> None:
     assert await page.value(frame) != "rgb(221, 51, 51)"
 
 
-async def test_marks_are_drawn_where_the_picture_has_edges_on_the_real_and_the_virtual_apart(tmp_path: Path) -> None:
+async def test_marks_are_drawn_where_the_picture_has_edges_on_the_real_and_the_virtual_apart() -> None:
     """The rim of 4 white pixels around the virtual square has an edge to the real picture outside and one to the square inside."""
 
     async def assert_share(rgb: tuple[int, int, int], least: float, most: float) -> None:
@@ -249,7 +250,7 @@ async def test_marks_are_drawn_where_the_picture_has_edges_on_the_real_and_the_v
         await new_pictures(page)
 
     green, magenta = (51, 255, 51), (255, 26, 230)
-    async with made_viewfinder() as made, opened(made, tmp_path / "profile") as page:
+    async with made_viewfinder() as made, opened(made) as page:
         await assert_share(green, 0, 0)
         await assert_share(magenta, 0, 0)
         await click(page, "aid_peakReal")
@@ -280,8 +281,8 @@ async def test_marks_are_drawn_where_the_picture_has_edges_on_the_real_and_the_v
         assert page.errors == []
 
 
-async def test_fingers_zoom_the_display_drag_the_object_and_never_send_too_much(tmp_path: Path) -> None:
-    async with made_viewfinder() as made, opened(made, tmp_path / "profile") as page:
+async def test_fingers_zoom_the_display_drag_the_object_and_never_send_too_much() -> None:
+    async with made_viewfinder() as made, opened(made) as page:
         left, top, width, height = await page.box("#stage")
         middle = (left + width / 2, top + height / 2)
         await page.touch(*([(middle[0] - d, middle[1]), (middle[0] + d, middle[1])] for d in (30, 40, 50, 60)))
@@ -322,11 +323,11 @@ async def test_fingers_zoom_the_display_drag_the_object_and_never_send_too_much(
         assert 5 < len(sent) < 33 * took_s and sent[-1] == ("focus", 1.0) and page.errors == []
 
 
-async def test_the_token_is_used_up_and_a_guest_may_only_watch(tmp_path: Path) -> None:
+async def test_the_token_is_used_up_and_a_guest_may_only_watch() -> None:
     sessions = Sessions()
     async with made_viewfinder(Access(sessions=sessions)) as made:
         url = f"{made.url}#token={sessions.invitation(Role.VIEW)}"
-        async with chromium_page(url, tmp_path / "profile") as page:
+        async with shared_page(url) as page:
             await page.comes_true(f"{SHOWN} && {MESSAGE} === ''")
             assert (await page.value("location.href"), await page.value("document.cookie")) == (made.url, "")
             await page.comes_true("document.getElementById('capture').disabled && document.getElementById('focus').disabled")
@@ -387,9 +388,9 @@ async def assert_nothing_covered(page: Page, what: str) -> None:
     assert await page.value("document.documentElement.scrollWidth <= innerWidth"), what
 
 
-async def test_portrait_landscape_and_the_left_hand_and_no_control_covers_another(tmp_path: Path) -> None:
+async def test_portrait_landscape_and_the_left_hand_and_no_control_covers_another() -> None:
     """Where the capture buttons floated, they lay over "smooth tracking" at 960x600. With all aids open, for both hands."""
-    async with made_viewfinder() as made, opened(made, tmp_path / "profile") as page:
+    async with made_viewfinder() as made, opened(made) as page:
         picture, capture = await page.box("#stage"), await page.box("#capture")
         assert picture[2] == 390 and picture[3] == pytest.approx(390 * 96 / 160, abs=1)
         # The button is in the right thumb's corner, a finger wide.
@@ -414,11 +415,11 @@ async def test_portrait_landscape_and_the_left_hand_and_no_control_covers_anothe
         assert page.errors == []
 
 
-async def test_what_stopped_is_told_and_forgotten_when_it_comes_back(tmp_path: Path) -> None:
+async def test_what_stopped_is_told_and_forgotten_when_it_comes_back() -> None:
     async with AsyncExitStack() as browser:
         async with made_viewfinder() as made:
             port = int(made.url.rsplit(":", 1)[1].strip("/"))
-            page = await browser.enter_async_context(opened(made, tmp_path / "profile"))
+            page = await browser.enter_async_context(opened(made))
             made.pictures.rest()
             made.jpeg.fail("the camera was unplugged")
             await page.comes_true(f"{MESSAGE} === 'the camera was unplugged'")
@@ -433,13 +434,13 @@ async def test_what_stopped_is_told_and_forgotten_when_it_comes_back(tmp_path: P
             await page.comes_true(f"viewfinder.counts.shown > {before} && {MESSAGE} === ''")
 
 
-async def test_video_comes_first_with_its_age_and_what_is_known_of_each_picture_and_is_opened_again(tmp_path: Path) -> None:
+async def test_video_comes_first_with_its_age_and_what_is_known_of_each_picture_and_is_opened_again() -> None:
     sessions = Sessions()
     with streaming() as stream:
         whep = Whep(stream)
         async with made_viewfinder(Access(sessions=sessions), sinks=[stream], whep=whep) as made:
             url = f"{made.url}#token={sessions.invitation(Role.CONTROL)}"
-            async with chromium_page(url, tmp_path / "profile") as page:
+            async with shared_page(url) as page:
                 await page.comes_true(f"{SHOWN} && viewfinder.age !== null && viewfinder.clock.known")
                 await page.comes_true("document.getElementById('way').textContent === 'video'")
                 assert whep.viewers == 1 and not made.jpeg.broadcaster.sockets
@@ -467,7 +468,7 @@ async def test_video_comes_first_with_its_age_and_what_is_known_of_each_picture_
                 await comes_true(lambda: whep.viewers == 0)
 
 
-async def test_pictures_come_where_video_is_refused(tmp_path: Path) -> None:
+async def test_pictures_come_where_video_is_refused() -> None:
     class Refusing:
         def routes(self) -> list[web.RouteDef]:
             return [web.post("/whep", self._refuse)]
@@ -477,7 +478,7 @@ async def test_pictures_come_where_video_is_refused(tmp_path: Path) -> None:
         async def _refuse(self, _request: web.Request) -> web.Response:
             return web.json_response({"error": "all places are taken"}, status=503)
 
-    async with made_viewfinder(whep=Refusing()) as made, opened(made, tmp_path / "profile") as page:
+    async with made_viewfinder(whep=Refusing()) as made, opened(made) as page:
         await page.comes_true("document.getElementById('way').textContent === 'pictures'")
         # A page may ask for one way by its address.
         await page.send("Page.navigate", url=made.url + "?transport=whep")
@@ -487,7 +488,7 @@ async def test_pictures_come_where_video_is_refused(tmp_path: Path) -> None:
 
 async def test_what_was_saved_is_played_and_deleted_at_the_second_press(tmp_path: Path) -> None:
     folder = saved(tmp_path / "captures")
-    async with made_viewfinder(gallery=Gallery(folder)) as made, opened(made, tmp_path / "profile") as page:
+    async with made_viewfinder(gallery=Gallery(folder)) as made, opened(made) as page:
         await page.comes_true("!document.getElementById('open_gallery').hidden")
         await click(page, "open_gallery")
         entry = "[...document.querySelectorAll('#saved li')].find((each) => each.textContent.includes('.mp4'))"
@@ -575,24 +576,24 @@ MIDDLES = """(() => { const shown = document.querySelector("ELEMENT"), copy = do
 
 
 @asynccontextmanager
-async def page_of(routes: list[web.RouteDef], whep: Whep, path: str, profile: Path) -> AsyncIterator[Page]:
+async def page_of(routes: list[web.RouteDef], whep: Whep, path: str) -> AsyncIterator[Page]:
     """A browser on a path of a server with these routes."""
     async with serving_routes(routes) as url:
         try:
-            async with chromium_page(url + path, profile, size_px=(800, 600)) as page:
+            async with shared_page(url + path, size_px=(800, 600)) as page:
                 yield page
         finally:
             await whep.close()
 
 
-async def test_colours_are_right_on_the_screen_and_pictures_have_their_names(tmp_path: Path) -> None:
+async def test_colours_are_right_on_the_screen_and_pictures_have_their_names() -> None:
     async def index(request: web.Request) -> web.Response:
         return web.Response(text=PLAIN_PAGE.replace("CODEC", request.query["codec"]), content_type="text/html")
 
     # As large as HD, where browsers would take what is untagged for BT.709.
     with streaming() as stream, Feed(stream, lambda _: bars(1280, 720), 20.0):
         whep = Whep(stream)
-        async with page_of([web.get("/", index), *whep.routes()], whep, "/?codec=H264", tmp_path) as page:
+        async with page_of([web.get("/", index), *whep.routes()], whep, "/?codec=H264") as page:
             for codec in ("H264", "VP8"):
                 await page.comes_true(f"location.search === '?codec={codec}' && window.shown && shown.length > 20 && messages.length > 20")
                 seen = np.array(await page.value(MIDDLES.replace("ELEMENT", "video").replace("WIDTH", "1280").replace("HEIGHT", "720")))
@@ -603,7 +604,7 @@ async def test_colours_are_right_on_the_screen_and_pictures_have_their_names(tmp
                 await page.value("location.search = '?codec=VP8', 0")
 
 
-async def test_obs_gets_colour_and_alpha(tmp_path: Path) -> None:
+async def test_obs_gets_colour_and_alpha() -> None:
     """Columns of the picture: nothing, an opaque surface of half the light, the same half covered, a glow without coverage."""
     width, height = 320, 180
     light = np.zeros((height, width, 3), np.float32)
@@ -627,7 +628,7 @@ async def test_obs_gets_colour_and_alpha(tmp_path: Path) -> None:
     with streaming() as stream:
         alpha, whep = AlphaStream(stream, "srgb"), Whep(stream)
         feeding = asyncio.ensure_future(feed(alpha))
-        async with page_of(obs_routes(whep), whep, "/obs", tmp_path) as page:
+        async with page_of(obs_routes(whep), whep, "/obs") as page:
             await page.comes_true("document.querySelector('canvas')?.height === 180")
             # Straight from the drawing buffer, which is premultiplied; the row in the middle, first column of each quarter's middle.
             expression = """(() => { const gl = document.querySelector("canvas").getContext("webgl"), all = [];

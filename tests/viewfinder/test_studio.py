@@ -60,14 +60,23 @@ def photo(tmp_path: Path) -> Path:
 
 
 def whole_state(photo: Path, **more: Any) -> StudioState:
-    first = {"photo": str(photo), "object": str(CAKE), "at_px": AT_PX, "height": "0.4", "camera_height_m": 1.2, "pitch_deg": 3.0}
-    return state_of(first | more)
+    """Without a shadow, half of a picture's time, unless one is asked for."""
+    first = {
+        "photo": str(photo),
+        "object": str(CAKE),
+        "at_px": AT_PX,
+        "height": "0.4",
+        "camera_height_m": 1.2,
+        "pitch_deg": 3.0,
+        "shadow": 0,
+    }
+    return state_of(first | {"pitch_deg": 3.0, "shadow": 0} | more)
 
 
 STATES: list[dict[str, Any]] = [
     {},
     {"turn_deg": -33.3, "sun_deg": [-60, 40], "shadow": 0.5, "exposure": 1.3, "warmth_k": 9000, "roll_deg": 4},
-    {"before": [{"object": str(ALIEN), "at_px": [60, 150], "height": "0.3", "turn_deg": 20}], "turn_deg": 5},
+    {"before": [{"object": str(ALIEN), "at_px": [60, 150], "height": "0.3", "turn_deg": 20}], "turn_deg": 5, "shadow": 1},
     {"height": "60px", "f_number": 2.8, "focus_m": 6.25, "focal_length_mm": 35, "sensor_width_mm": 23.5, "matched": False},
 ]
 
@@ -91,7 +100,7 @@ def test_the_command_line_of_a_state_says_its_options(photo: Path, changes: dict
     assert "--mode" not in words and command_line(options, Path("out.png")).startswith("mrbokeh composite '")
 
 
-@pytest.mark.parametrize("changes", STATES)
+@pytest.mark.parametrize("changes", [pytest.param(each, marks=() if each in STATES[::2] else pytest.mark.slow) for each in STATES])
 def test_the_preview_of_a_small_photograph_is_the_picture_of_its_command_line(photo: Path, tmp_path: Path, changes: dict[str, Any]) -> None:
     options = options_of(whole_state(photo, **changes))
     out = tmp_path / "out.png"
@@ -122,7 +131,7 @@ def test_a_smaller_preview_shows_the_same_place_and_size(photo: Path) -> None:
 def test_the_loupe_shows_the_finished_picture_pixel_by_pixel(tmp_path: Path) -> None:
     """Of a photograph larger than its preview, 1200 by 900 px; grain would differ. Beyond the frame it is black."""
     photo = write_floor(tmp_path / "large.png", 1200, 900)
-    options = options_of(whole_state(photo, at_px=(600, 700), f_number=1.4, focus_m=2.0, matched=False, warmth_k=9000.0))
+    options = options_of(whole_state(photo, at_px=(600, 700), f_number=1.4, focus_m=2.0, matched=False, warmth_k=9000.0, shadow=1.0))
     opened, _rgb = open_photograph(photo)
     kept = KeptParts()
     kept.small = True
@@ -393,25 +402,25 @@ async def test_previews_come_with_what_is_told_of_them(photo: Path, tmp_path: Pa
         assert made.desk.state.turn_deg == 0.0, "asked for, not kept"
 
 
-async def test_a_saved_picture_is_that_of_the_command_line_bit_for_bit(photo: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("kind", "suffix"), [("png", ".png"), pytest.param("exr", ".exr", marks=pytest.mark.slow)])
+async def test_a_saved_picture_is_that_of_the_command_line_bit_for_bit(photo: Path, tmp_path: Path, kind: str, suffix: str) -> None:
     """As a process of its own makes it, in each format; a second one gets another name; one is cancelled and leaves nothing."""
     async with made_studio(tmp_path, whole_state(photo)) as made, aiohttp.ClientSession() as one:
         await comes_true(lambda: made.desk.photograph is not None and made.desk.busy == "")
-        for kind, suffix in (("png", ".png"), ("exr", ".exr")):
-            _, told = await asked(one, made.url + "save", {"format": kind})
-            save = told["saves"][0]
-            await comes_true(lambda: made.desk.saves.told()[0]["state"] != "running", 60.0)
-            assert made.desk.saves.told()[0]["state"] == "done", made.desk.saves.told()
-            async with one.get(f"{made.url}saved/{save['number']}") as answer:
-                saved = await answer.read()
-            own = tmp_path / f"own{suffix}"
-            assert mrbokeh(*words_of(options_of(made.desk.state), own)).returncode == 0
-            assert saved == own.read_bytes() == Path(save["path"]).read_bytes() and f"_mrbokeh{suffix}" in save["command"]
-        await asked(one, made.url + "save", {"format": "png"})
-        _, told = await asked(one, made.url + "cancel", {"number": 3})
+        _, told = await asked(one, made.url + "save", {"format": kind})
+        save = told["saves"][0]
+        await comes_true(lambda: made.desk.saves.told()[0]["state"] != "running", 60.0)
+        assert made.desk.saves.told()[0]["state"] == "done", made.desk.saves.told()
+        async with one.get(f"{made.url}saved/{save['number']}") as answer:
+            saved = await answer.read()
+        own = tmp_path / f"own{suffix}"
+        assert mrbokeh(*words_of(options_of(made.desk.state), own)).returncode == 0
+        assert saved == own.read_bytes() == Path(save["path"]).read_bytes() and f"_mrbokeh{suffix}" in save["command"]
+        await asked(one, made.url + "save", {"format": kind})
+        _, told = await asked(one, made.url + "cancel", {"number": 2})
         await comes_true(lambda: not made.desk.saves._tasks)
-        assert told["saves"][0]["name"] == "a floor_mrbokeh_2.png" and made.desk.saves.told()[0]["state"] == "cancelled"
-        assert not (tmp_path / "a floor_mrbokeh_2.png").exists()
+        assert told["saves"][0]["name"] == f"a floor_mrbokeh_2{suffix}" and made.desk.saves.told()[0]["state"] == "cancelled"
+        assert not (tmp_path / f"a floor_mrbokeh_2{suffix}").exists()
 
 
 def test_a_studio_that_was_killed_goes_on_where_it_was(photo: Path, tmp_path: Path) -> None:

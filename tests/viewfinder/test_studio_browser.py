@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from datasets_scripts.gallery.pictures import CHROMIUM, Page, chromium_page
+from datasets_scripts.gallery.pictures import CHROMIUM, Page
 from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
@@ -18,6 +18,7 @@ from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
 from mrbokeh.video.picture_source import open_source
 from tests.support.live_clip import write_live_clip
 from tests.support.made_studio import ALIEN, CAKE, HEIGHT, WIDTH, MadeStudio, made_studio, write_floor
+from tests.support.shared_chromium import shared_page
 from tests.support.waiting import comes_true
 from viewfinder.studio.clip import clip_state
 from viewfinder.studio.state import StudioState
@@ -34,9 +35,9 @@ RESTS = "studio.shown && !studio.shown.draft && !studio.isChanging"
 
 @asynccontextmanager
 async def opened(folder: Path, size_px: tuple[int, int], state: StudioState | None = None) -> AsyncIterator[tuple[Page, MadeStudio]]:
-    """The page of a studio with a photograph, once that is opened and its camera looked for."""
-    first = state or StudioState(photo=write_floor(folder / "floor.png"), pitch_deg=0.0)
-    async with made_studio(folder, first) as made, chromium_page(made.url, folder / "profile", size_px=size_px) as page:
+    """The page of a studio with a photograph, once that is opened and its camera looked for; without shadows, half of a picture's time."""
+    first = state or StudioState(photo=write_floor(folder / "floor.png"), pitch_deg=0.0, shadow=0.0)
+    async with made_studio(folder, first) as made, shared_page(made.url, size_px) as page:
         await page.comes_true("window.studio?.told?.photo && studio.told.busy === ''", 40.0)
         yield page, made
 
@@ -83,7 +84,7 @@ on_desk_and_slowly_on_phones = pytest.mark.parametrize(
 )
 
 
-@pytest.mark.parametrize("size_px", [DESK, UPRIGHT, LEVEL], ids=["desk", "upright", "level"])
+@pytest.mark.parametrize("size_px", [DESK, UPRIGHT, pytest.param(LEVEL, marks=pytest.mark.slow)], ids=["desk", "upright", "level"])
 async def test_an_object_is_placed_dragged_turned_focused_on_undone_and_saved(tmp_path: Path, size_px: tuple[int, int]) -> None:
     async with opened(tmp_path, size_px) as (page, made):
         assert "Choose an object" in await page.value("document.getElementById('badge').textContent")
@@ -284,7 +285,9 @@ async def test_the_wheel_with_ctrl_and_drags_beside_the_object_zoom_and_move_the
         assert page.errors == []
 
 
-@pytest.mark.parametrize(("size_px", "at"), [(UPRIGHT, (0.25, 0.5)), (LEVEL, (0.5, 0.25))], ids=["upright", "level"])
+@pytest.mark.parametrize(
+    ("size_px", "at"), [(UPRIGHT, (0.25, 0.5)), pytest.param(LEVEL, (0.5, 0.25), marks=pytest.mark.slow)], ids=["upright", "level"]
+)
 async def test_two_fingers_beside_the_object_zoom_the_picture(tmp_path: Path, size_px: tuple[int, int], at: tuple[float, float]) -> None:
     """Along the side that fills the window what lies between the fingers stays there; along the other it is centred until it fills it."""
     async with opened(tmp_path, size_px) as (page, made):
@@ -380,7 +383,7 @@ async def held_before(page: Page) -> None:
     assert await page.value("document.getElementById('sharp_before').hidden && !document.getElementById('sharp').hidden")
 
 
-@pytest.mark.parametrize("size_px", [DESK, UPRIGHT], ids=["desk", "upright"])
+@pytest.mark.parametrize("size_px", [pytest.param(DESK, marks=pytest.mark.slow), UPRIGHT], ids=["desk", "upright"])
 async def test_what_is_in_front_is_painted(tmp_path: Path, size_px: tuple[int, int]) -> None:
     """A dark tile of the floor is painted over the cake; then a smaller brush says that it is behind, and both are undone."""
     async with opened(tmp_path, size_px) as (page, made):
@@ -411,7 +414,7 @@ async def test_what_is_in_front_is_painted(tmp_path: Path, size_px: tuple[int, i
         assert page.errors == []
 
 
-@pytest.mark.parametrize("size_px", [DESK, LEVEL], ids=["desk", "level"])
+@pytest.mark.parametrize("size_px", [pytest.param(DESK, marks=pytest.mark.slow), LEVEL], ids=["desk", "level"])
 async def test_lines_are_drawn_corrected_and_removed(tmp_path: Path, size_px: tuple[int, int]) -> None:
     """Two edges of tiles ahead and one across: the horizon lies in the middle of the picture, where the tilt had it elsewhere."""
     async with opened(tmp_path, size_px, StudioState(photo=write_floor(tmp_path / "floor.png"), pitch_deg=9.0)) as (page, made):
@@ -475,7 +478,7 @@ async def test_somebody_of_known_height_gives_the_ground_its_metres(tmp_path: Pa
         assert page.errors == []
 
 
-@pytest.mark.parametrize("size_px", [DESK, UPRIGHT], ids=["desk", "upright"])
+@pytest.mark.parametrize("size_px", [DESK, pytest.param(UPRIGHT, marks=pytest.mark.slow)], ids=["desk", "upright"])
 async def test_the_sun_is_found_by_a_shadow_that_is_pointed_at(tmp_path: Path, size_px: tuple[int, int]) -> None:
     """The shadow of a post lies to the right and is twice as long as that is high: the sun is at the left, atan(1 / 2) high."""
     async with opened(tmp_path, size_px) as (page, made):
@@ -551,7 +554,8 @@ async def test_the_objects_light_gets_warmer_at_once_and_the_ground_keeps_its_co
         return [0, 2].map((channel) => [...light(channel)].reduce((sum, code) => sum + ((code / 255 + 0.055) / 1.055) ** 2.4, 0));
     }})()"""
     on_cake, in_shadow = seen.format(low=0.4, high=0.8), seen.format(low=1.02, high=1.08)
-    async with opened(tmp_path, size_px) as (page, made):
+    shadowed = StudioState(photo=write_floor(tmp_path / "floor.png"), pitch_deg=0.0)
+    async with opened(tmp_path, size_px, shadowed) as (page, made):
         await placed(page, made)
         before, ground = np.array(await page.value(on_cake)), np.array(await page.value(in_shadow))
         await page.value("document.getElementById('warmth').scrollIntoView({block: 'center'})")
@@ -717,7 +721,7 @@ async def test_the_page_is_accessible(tmp_path: Path, size_px: tuple[int, int]) 
 
 async def test_without_a_photograph_the_page_asks_for_one_and_takes_it(tmp_path: Path) -> None:
     floor = write_floor(tmp_path / "floor.png")
-    async with made_studio(tmp_path) as made, chromium_page(made.url, tmp_path / "profile", size_px=UPRIGHT) as page:
+    async with made_studio(tmp_path) as made, shared_page(made.url, UPRIGHT) as page:
         await page.comes_true("window.studio?.told && document.getElementById('welcome').innerText.includes('Drop a photograph')")
         document = await page.send("DOM.getDocument")
         for selector, file in (("#open_photo", floor), ("#open_object", ALIEN)):

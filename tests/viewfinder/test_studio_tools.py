@@ -235,15 +235,15 @@ def test_strokes_that_cannot_be_meant_are_refused(message: dict[str, object], wh
 
 async def test_a_shadow_tells_the_sun_in_pixels_of_the_whole_photograph(tmp_path: Path) -> None:
     """A level camera, a post of 30 px and its shadow of 60 px straight to the left, in a photograph that is larger than its preview."""
-    photo = write_floor(tmp_path / "floor.png", 8 * WIDTH, 8 * HEIGHT)
+    photo = write_floor(tmp_path / "floor.png", 5 * WIDTH, 5 * HEIGHT)
     async with made_studio(tmp_path, StudioState(photo=photo, object=CAKE, pitch_deg=0.0, plain=True)) as made:
         desk = made.desk
         while desk.photograph is None or desk.busy:
             await desk.news_after(desk.number, 1.0)
-        said = await desk.sun_by(shadow_of({"points": [[8 * 120, 8 * 120], [8 * 120, 8 * 150], [8 * 60, 8 * 150]]}))
+        said = await desk.sun_by(shadow_of({"points": [[5 * 120, 5 * 120], [5 * 120, 5 * 150], [5 * 60, 5 * 150]]}))
         assert said.startswith("by the shadow the sun is 90 degrees to the right of the view and 27 above")
         assert desk.state.sun_deg == pytest.approx((90.0, np.degrees(np.arctan(0.5))), abs=0.05) and not desk.state.plain
-        for points, why in (([[1, 2], [3, 4]], "three points"), ([[960, 900], [960, 600], [500, 1200]], "foot lies above the horizon")):
+        for points, why in (([[1, 2], [3, 4]], "three points"), ([[600, 560], [600, 375], [310, 750]], "foot lies above the horizon")):
             with pytest.raises(InputError, match=why):
                 await desk.sun_by(shadow_of({"points": points}))
 
@@ -308,8 +308,8 @@ async def test_a_known_height_tells_how_high_the_camera_stands(tmp_path: Path) -
 
 
 def test_drawn_lines_count_in_pixels_of_the_whole_photograph(tmp_path: Path) -> None:
-    """A photograph of 3 MP, whose preview is smaller: the camera of its lines is that of the whole."""
-    scale = 8.5
+    """A photograph of 1.6 MP, whose preview is smaller: the camera of its lines is that of the whole."""
+    scale = 6.0
     opened, _rgb = open_photograph(write_floor(tmp_path / "large.png", round(scale * WIDTH), round(scale * HEIGHT)))
     lines = [(*(scale * each for each in line[:4]), line[4]) for line in FLOOR_LINES]  # type: ignore[operator]
     solved = solved_by_hand(opened, lines)  # type: ignore[arg-type]

@@ -334,6 +334,7 @@ def test_the_guide_names_every_option() -> None:
     assert not missing, missing
 
 
+@pytest.mark.usefixtures("in_folder")
 def test_the_demo_is_shown_before_anybody_watches_and_ends_with_ctrl_c() -> None:
     """The shipped clip, board, lens and cake; the terminal says when the scene lies over a frame, which happens without a viewer."""
     command = [sys.executable, "-m", "mrbokeh.cli", "viewfinder", "--demo", "--port", "0"]
@@ -345,5 +346,5 @@ def test_the_demo_is_shown_before_anybody_watches_and_ends_with_ctrl_c() -> None
             if line.startswith(SHOWN):
                 process.send_signal(signal.SIGINT)
     assert process.returncode == 0 and SHOWN in told and told[-1] == "viewfinder stopped", told
-    done = subprocess.run([*command, "--source", "test"], capture_output=True, text=True)
+    done = mrbokeh(*command[3:], "--source", "test")
     assert done.returncode == 2 and "give one of them" in done.stderr

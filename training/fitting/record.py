@@ -191,6 +191,7 @@ class Record:
         """
         if not self._learner.is_finite():
             raise diverged(self._task, self._progress.step)
+        self._drawn_s = math.inf  # all of it is drawn below
         if not self._progress.stopped_early:
             self.look()
         self._progress.kept_step = self._progress.step

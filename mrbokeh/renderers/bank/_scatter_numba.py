@@ -7,6 +7,9 @@ import numpy as np
 from mrbokeh.optics._aperture_numba import fill_psf
 from mrbokeh.system.compiled import njit
 
+KEPT = 1 << 21
+"""Weights of kernels that are kept at most."""
+
 
 @njit(cache=True, nogil=True)
 def scatter_rows(
@@ -19,8 +22,14 @@ def scatter_rows(
     starts: np.ndarray,
     weights: np.ndarray,
 ) -> None:
-    """Add values (H, W, C), each blurred by its pixel's PSF, to padded, which has a margin of the largest kernel's radius."""
+    """Add values (H, W, C), each blurred by its pixel's PSF, to padded, which has a margin of the largest kernel's radius.
+
+    A column keeps its last kernel, which the pixel below often takes too.
+    """
     height, width, channels = values.shape
+    largest = (2 * margin_px + 1) ** 2
+    kept = max(1, min(width, KEPT // largest))
+    kernels, drawn_px, scratch = np.empty((kept, largest)), np.full(kept, np.nan), np.empty(largest)
     for y in range(height):
         for x in range(width):
             lit = False
@@ -28,11 +37,13 @@ def scatter_rows(
                 lit = lit or values[y, x, c] != 0.0
             if not lit:
                 continue
-            diameter_px = coc_px[y, x]
+            diameter_px = float(coc_px[y, x])
             radius_px = max(0, int(math.ceil(abs(diameter_px) * 0.5 * unit_radius - 0.5)))
             size = 2 * radius_px + 1
-            kernel, steps = np.zeros((size, size)), np.zeros((size, size))
-            fill_psf(kernel, steps, vertices, starts, weights, float(diameter_px))
+            kernel = kernels[x % kept, : size * size].reshape(size, size)
+            if drawn_px[x % kept] != diameter_px:
+                drawn_px[x % kept] = diameter_px
+                fill_psf(kernel, scratch[: size * size].reshape(size, size), vertices, starts, weights, diameter_px)
             top, left = y + margin_px - radius_px, x + margin_px - radius_px
             for j in range(size):
                 for i in range(size):
