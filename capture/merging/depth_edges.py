@@ -25,33 +25,43 @@ _RANGE = (0.5, 99.5)
 _JUMP, _LEAST_JUMP = 0.1, 0.7
 """Two surfaces are this share of all slices that are sharp somewhere apart, and so many slices at least."""
 _SOFT_PX, _SPECK_PX, _RAMP_PX = 1.3, 3, 3
+"""How soft edges of depth from focus are (standard deviation), what is a speck, and how far a ramp reaches beside an edge."""
 _TRUSTED = 0.02
-_SMALL_PX = 0.3e6
-_REACHES_PX = (8, 8), (4,)
-"""How far edges are moved in each pass: first in a picture of some SMALL_PX pixels, for windows are wider in larger ones, then in it."""
+"""Least confidence of a place that stands for its surface."""
+_SMALL_PX = 0.6e6
+_COARSE_REACHES_PX, _FINE_REACHES_PX = (8, 8), (4,)
+"""How far edges are moved, in passes: in a picture of SMALL_PX pixels at most, and in each that is twice as large, for what is left."""
 _SMOOTHING, _COLOUR, _LEAST_TRUST, _WHITE = 5000.0, 2.0, np.float32(1e-4), 99.5
-_SAME_SURFACE = 1.5
-"""Depth is evened out by so many jumps at most: what differs by more is something of its own."""
+_SAME_SURFACE, _LARGEST_SHARE = 1.5, 0.5
+"""Depth is evened out by so many jumps at most, and this share of its range: what differs by more is something of its own."""
 
 
 def with_edges_of_light(focus: FocusMap, sharp_rgb: Rgb, near_first: bool) -> FocusMap:
     """Return depth from focus whose near things are no wider than in the picture. near_first: the first slice is focused nearest."""
     sign = np.float32(-1.0 if near_first else 1.0)
-    nearness, trusted = sign * focus.focus_index, focus.confidence > _TRUSTED
+    nearness = sign * focus.focus_index
     low, high = np.percentile(nearness[::4, ::4], _RANGE)
     jump = max(_JUMP * float(high - low), _LEAST_JUMP)
-    shrink = max(1, round((nearness.size / _SMALL_PX) ** 0.5))
-    size, small_size = nearness.shape[::-1], tuple(-(-each // shrink) for each in nearness.shape[::-1])
-    small, sure = (cv2.resize(each, small_size, interpolation=cv2.INTER_NEAREST) for each in (nearness, trusted.astype(np.uint8)))
-    moved = _moved(small, cv2.resize(sharp_rgb, small_size, interpolation=cv2.INTER_AREA), sure > 0, jump, _REACHES_PX[0])
-    changed, moved = (cv2.resize(each, size, interpolation=cv2.INTER_NEAREST) for each in ((moved != small).astype(np.uint8), moved))
-    index = sign * _moved(np.where(changed > 0, moved, nearness), sharp_rgb, trusted, jump, _REACHES_PX[1])
-    return replace(focus, focus_index=_evened(index, focus.confidence, sharp_rgb, _SAME_SURFACE * jump))
+    index = sign * _from_coarse_to_fine(nearness, sharp_rgb, focus.confidence > _TRUSTED, jump)
+    most = min(_SAME_SURFACE * jump, _LARGEST_SHARE * float(high - low))
+    return replace(focus, focus_index=_evened(index, focus.confidence, sharp_rgb, most))
+
+
+def _from_coarse_to_fine(nearness: Plane, rgb: Rgb, trusted: Mask, jump: float) -> Plane:
+    """Return nearness in slices with its edges moved, first in half as many rows and columns where the picture is large."""
+    if nearness.size <= _SMALL_PX:
+        return _moved(nearness, rgb, trusted, jump, _COARSE_REACHES_PX)
+    height, width = nearness.shape
+    small_rgb = cv2.resize(rgb, (-(-width // 2), -(-height // 2)), interpolation=cv2.INTER_AREA)
+    coarse = _from_coarse_to_fine(nearness[::2, ::2], small_rgb, trusted[::2, ::2], jump)
+    # A coarse pixel too wide, so that what is left can only be too wide.
+    grown_px = cv2.dilate(coarse, np.ones((3, 3), np.uint8)).repeat(2, axis=0).repeat(2, axis=1)[:height, :width]
+    return _moved(np.where(nearness - grown_px > jump, grown_px, nearness), rgb, trusted, jump, _FINE_REACHES_PX)
 
 
 def _moved(nearness: Plane, rgb: Rgb, trusted: Mask, jump: float, reaches_px: Sequence[int]) -> Plane:
-    """Return nearness in slices with its edges moved, all else as it was."""
-    hard = now = steepened(cv2.medianBlur(nearness, _SPECK_PX), jump, _SOFT_PX)
+    """Return nearness with its edges moved, all else as it was."""
+    hard = now = steepened(cv2.medianBlur(np.ascontiguousarray(nearness), _SPECK_PX), jump, _SOFT_PX)
     guide = Guide.of(rgb)
     for reach_px in reaches_px:
         now = narrowed(now, guide, jump, trusted, reach_px)
@@ -64,7 +74,7 @@ def _evened(index: Plane, confidence: Plane, rgb: Rgb, most: float) -> Plane:
     root = np.sqrt(np.maximum(rgb, np.float32(0.0)))
     white = max(float(np.percentile(root[::4, ::4], _WHITE)), 1e-6)
     guide = np.minimum(root * np.float32(255.0 / white), np.float32(255.0)).astype(np.uint8)
-    trust = np.maximum(confidence.astype(np.float32), _LEAST_TRUST)
+    trust = np.maximum(confidence, _LEAST_TRUST)
     smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, _SMOOTHING, _COLOUR)
     even = np.clip(smoother.filter(trust * index) / smoother.filter(trust), index.min(), index.max())
     return np.where(np.abs(even - index) <= most, even, index)

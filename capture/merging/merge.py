@@ -32,6 +32,7 @@ from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks, write_focal_stack, write_merged
+from mrbokeh.stacks.guessed_metres import is_near_first
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 
@@ -82,7 +83,7 @@ def _merged(stack: FocalStack, overwrite: bool, registration: Path | None, prefe
         sharp, focus = with_restored_lights(sharp, restored), focus_map(volume, lights, slices.saturated)
     merged = _with_highlights(merged, restored)
     if stack.is_metric:
-        placed = with_edges_of_light(focus, sharp, near_first=_is_nearest_first(stack))
+        placed = with_edges_of_light(focus, sharp, near_first=is_near_first(stack))
         depth_m = depth_m_of(merged, placed.focus_index)
         write_merged(stack.folder, sharp, placed.focus_index, placed.confidence, depth_m, stack.rec709_from_camera)
     else:
@@ -97,11 +98,6 @@ def _merged(stack: FocalStack, overwrite: bool, registration: Path | None, prefe
     write_focal_stack(merged)
     write_merge_sheet(merged, sharp, codes)
     return merged
-
-
-def _is_nearest_first(stack: FocalStack) -> bool:
-    first_m, last_m = stack.focus_distances_m[0], stack.focus_distances_m[-1]
-    return first_m is not None and last_m is not None and first_m < last_m
 
 
 def _with_highlights(stack: FocalStack, restored: Sequence[RestoredLight]) -> FocalStack:

@@ -195,7 +195,7 @@ PLACES = Rule(
 SPACING = Rule(
     "no slice missing",
     "even steps in dioptres, each once and in order",
-    "What lies in focus between two distant slices is sharp in neither: the all-in-focus picture keeps blur there.",
+    "What lies in focus between two distant slices is sharp in neither, and may keep some blur in the all-in-focus picture.",
     "Photograph the missing distances again, or correct focus_distances_m in lens.toml if the photographs are there.",
 )
 

@@ -17,12 +17,12 @@ from mrbokeh.commands._composite_options import (
     typed_place_m,
     typed_sun,
 )
-from mrbokeh.commands._level_ground import HIGH_SHARE, held_as_told
+from mrbokeh.commands._level_ground import HIGH_SHARE, held_as_told, usual_tilt_rad
 from mrbokeh.compositing.ground import ended_shadow, ground_under
 from mrbokeh.compositing.plate import Plate
 from mrbokeh.images.layer import Layer, flatten
 from mrbokeh.optics.camera import Camera
-from mrbokeh.scene.staging.scene_description import SceneDescription
+from mrbokeh.scene.staging.scene_description import SceneDescription, looking_down
 from mrbokeh.stacks.capture_bundle import CaptureBundle
 from mrbokeh.system.channel import guess, warn
 from mrbokeh.system.errors import InputError
@@ -205,10 +205,12 @@ def held_upright(plate: Plate, options: ObjectOptions) -> Plate:
         return held_as_told(plate, options)
     foot_px = options.first_px
     plate.require_pixel(*foot_px)
-    found = ground_under(plate, foot_px)
+    found = ground_under(plate, foot_px) if plate.slopes_known else None
     if found is None:
-        guess("the depth around the foot is no ground with a slope: a level camera is taken (--pitch DEGREES says how far it looks down)")
-        return held_as_told(plate, options)
+        down_rad = usual_tilt_rad(plate, plate.camera.unproject(np.array(foot_px), np.array(1.0)))
+        why = "the depth around the foot is no ground with a slope" if plate.slopes_known else "guessed metres tell no slope of the ground"
+        guess(f"{why}: the camera is taken to look down by {math.degrees(down_rad):.0f} degrees, as is usual (--pitch DEGREES)")
+        return held_as_told(replace(plate, world_from_camera=looking_down(down_rad)), options)
     down_deg = math.degrees(math.asin(float(np.clip(found[1, 2], -1.0, 1.0))))
     guess(f"by the depth around the foot the camera looks down by {down_deg:.0f} degrees (else --pitch DEGREES)")
     return held_as_told(replace(plate, world_from_camera=found), options)

@@ -276,7 +276,7 @@ def _require_object(path: Path) -> None:
     """Raise InputError where a file is surely no 3D object."""
     require_file(path, "a 3D object (.glb, .gltf)")
     with path.open("rb") as file:
-        begins = file.read(64).lstrip()
+        begins = file.read(64).lstrip(b"\xef\xbb\xbf \t\r\n")
     if not begins.startswith((b"glTF", b"{")):
         raise InputError(f"--object {path} is no 3D object: expected a .glb or .gltf file; a rendered picture goes in as --layer")
 

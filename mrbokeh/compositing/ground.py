@@ -14,7 +14,7 @@ Pixel = tuple[float, float]
 
 _SAME_SURFACE, _SURELY_SAME = 0.02, 0.01
 """Largest shares by which depth changes from pixel to pixel of one surface: along a table, and where no edge may be missed."""
-_FARTHER, _STANDS_BEFORE, _JUST_BEFORE = 0.05, 0.25, np.float32(0.999)
+_FARTHER, _STANDS_BEFORE, _JUST_BEFORE = 0.05, 0.1, np.float32(0.999)
 _NEARER = (0.05, 0.12)
 """Shares by which what stands on the ground is nearer than its plane: the first still catches the shadow whole, the second none of it."""
 _FOUND = 2
@@ -74,11 +74,10 @@ def with_ground_behind(plate: Plate, feet_px: Sequence[Pixel], layers: Sequence[
     if plate.depth_m is None:
         return plate
     covered_m = np.minimum.reduce([np.where(layer.alpha > 0.0, layer.depth_m, np.inf) for layer in layers])
-    ground = np.zeros(covered_m.shape, bool)
+    ground, calm_m = np.zeros(covered_m.shape, bool), _calm(plate.depth_m)
     for foot_px in feet_px:
         above = np.broadcast_to(np.arange(len(covered_m))[:, None] <= int(foot_px[1]), covered_m.shape)
-        foot_m = plate.depth_m[int(foot_px[1]), int(foot_px[0])]
-        above = above & (plate.depth_m > np.float32(1.0 - _STANDS_BEFORE) * foot_m)
+        above = above & (calm_m > np.float32(1.0 - _STANDS_BEFORE) * calm_m[int(foot_px[1]), int(foot_px[0])])
         ground |= _same_surface(plate.depth_m, foot_px, above, _SAME_SURFACE) & np.isfinite(covered_m)
     return replace(plate, depth_m=np.where(ground, np.maximum(plate.depth_m, covered_m), plate.depth_m))
 
@@ -100,8 +99,8 @@ def ended_shadow(plate: Plate, feet_px: Sequence[Pixel], objects: Layer, shadow:
     beyond = beside & ~same & (plate.depth_m > shadow.depth_m * np.float32(1.0 + _FARTHER))
     lies = same & (shadow.alpha > 0.0)
     caught = np.where(beyond, np.float32(0.0), np.float32(1.0))
-    nearer = plate.depth_m[lies] / shadow.depth_m[lies]
-    caught[lies] = np.clip((nearer - np.float32(1.0 - _NEARER[1])) / np.float32(_NEARER[1] - _NEARER[0]), 0.0, 1.0)
+    share = np.nan_to_num(_calm(plate.depth_m)[lies] / shadow.depth_m[lies], nan=1.0)
+    caught[lies] = np.clip((share - np.float32(1.0 - _NEARER[1])) / np.float32(_NEARER[1] - _NEARER[0]), 0.0, 1.0)
     moved = lies & (objects.alpha == 0.0)
     return replace(
         shadow,
@@ -109,6 +108,13 @@ def ended_shadow(plate: Plate, feet_px: Sequence[Pixel], objects: Layer, shadow:
         rgb=shadow.rgb * caught[..., None],
         depth_m=np.where(moved, np.minimum(shadow.depth_m, plate.depth_m * _JUST_BEFORE), shadow.depth_m),
     )
+
+
+def _calm(depth_m: Float32[np.ndarray, "height width"]) -> Float32[np.ndarray, "height width"]:
+    """Return the median of 5x5 pixels: noise of single ones is no surface."""
+    import cv2
+
+    return np.asarray(cv2.medianBlur(depth_m, 5))
 
 
 def _same_surface(
@@ -123,6 +129,6 @@ def _same_surface(
     x_px, y_px = (int(each) for each in start_px)
     found = cv2.copyMakeBorder((~within).astype(np.uint8), 1, 1, 1, 1, cv2.BORDER_CONSTANT, value=1)
     found[y_px + 1, x_px + 1] = 0
-    logs = cv2.medianBlur(np.log(np.minimum(depth_m, np.float32(1e6))), 5)
+    logs = _calm(np.log(np.minimum(depth_m, np.float32(1e6))))
     cv2.floodFill(logs, found, (x_px, y_px), 0.0, step, step, 4 | (_FOUND << 8) | cv2.FLOODFILL_MASK_ONLY)
     return found[1:-1, 1:-1] == _FOUND

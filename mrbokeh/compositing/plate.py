@@ -61,6 +61,7 @@ class Plate:
     alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
     depth_note: what is known and what is guessed of a phone's own depth and focus, in words.
     metres_guessed: of a stack that knows no focus distance, and of a phone's depth without a unit; blur is right in pixels all the same.
+    slopes_known: False where near and far are guessed apart, so that a level surface may seem steep.
     blur_from: where the lens has its blur from, in words, if its focal length and f-number are made up.
     focus_known, view_known: False where nothing tells the focus, and where the field of view is guessed.
     rough_focus_m: nearest and farthest distance that the focus in the photograph's file may mean, where that is a wide range.
@@ -78,6 +79,7 @@ class Plate:
     near_alpha: Float32[np.ndarray, "height width"] | None = None
     alpha: Float32[np.ndarray, "height width"] | None = None
     metres_guessed: bool = False
+    slopes_known: bool = True
     blur_from: str = ""
     focus_known: bool = True
     view_known: bool = True
@@ -177,7 +179,8 @@ def photograph_plate(photo: Path, photograph: Photograph, phone: PhonePhoto | No
     guessed = [] if phone.focus is None else [phone.focus.note * (not stated), phone.focus.blur_note * bool(held.blur_from)]
     note = "; ".join(each for each in (f"{photo}: {phone.depth.note}", *guessed) if each)
     deep = with_depth(plate, photo, DepthSettings(exact=wishes.exact_depth))
-    return replace(deep, sharp_rgb=original, blur_from=held.blur_from, depth_note=note, metres_guessed=not phone.has_unit)
+    deep = replace(deep, metres_guessed=not phone.has_unit, slopes_known=phone.has_unit)
+    return replace(deep, sharp_rgb=original, blur_from=held.blur_from, depth_note=note)
 
 
 @dataclass(frozen=True)
@@ -391,7 +394,7 @@ def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus
     # A stack of a scene knows where its camera stood; objects are placed in camera axes.
     upright = replace(camera, camera_from_world=np.eye(4))
     plate = Plate(rgb=rgb, depth_m=stack.depth_m(), lens=focused, camera=upright, sharp_rgb=stack.all_in_focus())
-    return replace(plate, metres_guessed=not stack.metres_known, blur_from=blur_from)
+    return replace(plate, metres_guessed=not stack.metres_known, slopes_known=stack.metres_known, blur_from=blur_from)
 
 
 def slice_lens(stack: FocalStack, slice_index: int, lens: Lens | None, focus_m: float | None) -> tuple[Lens, str]:

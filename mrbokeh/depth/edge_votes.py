@@ -147,14 +147,14 @@ def narrowed(values: Plane, guide: Guide, jump: float, trusted: Mask, reach_px: 
     near, inside, like = values > other, np.empty(values.shape, bool), np.empty_like(values)
     by_rows(values.size, len(values), partial(mark_sure, inside, values, away_px, jump, reach_px))
     sure = np.where(near, inside, away_px > _SETTLED_PX) & trusted & ~guide.lit
-    asked = near & (away_px <= reach_px)
-    seen_px = np.where(asked & ~guide.lit, away_px, _OUT_OF_REACH)
+    asked = near & (away_px <= reach_px) & ~guide.lit
+    seen_px = np.where(asked, away_px, _OUT_OF_REACH)
     by_rows(
         values.size,
         len(values),
         partial(likeness, like, guide.root, values, other, seen_px, sure, reach_px + _WIDER_BY, _NO_MATTER),
     )
-    may = asked & (like != 0.0) & ~guide.lamps
+    may = asked & (like != 0.0)
     return voted(values, Sides(other, away_px, like), guide, may, _NARROWED_STAYS)
 
 

@@ -172,7 +172,7 @@ def _shown_in_order(layers: Sequence[Pixels], slicing: Slicing) -> _Shown:
 
     def cover_band(first: int, end: int) -> None:
         for each, across, layer in zip(shown, crossing, layers, strict=True):
-            start, stop = np.searchsorted(layer.places, (first, end))
+            start, stop = layer.places.searchsorted(np.array((first, end), layer.places.dtype))
             cover(each, across, free, nearest_px, layer.places, layer.values, layer.coc_px, SHARP_PX, start, stop)
 
     in_bands(slicing.pool, pixels, _BAND_PIXELS, cover_band)

@@ -45,7 +45,7 @@ def require_file(path: Path | str, expected: str, advice: str = "") -> None:
         raise InputError(f"expected {expected} at {path}, but it is a folder{advice}")
     if not path.exists():
         link = f"it is a link to {os.readlink(path)}, which leads nowhere" if path.is_symlink() else "there is no such file"
-        if re.search(r"%0?\d*d|##", path.name):
+        if re.search(r"%(0\d)?d|#+\.|\$F\d", path.name):
             link = "that stands for many numbered ones: name one of them"
         raise InputError(f"expected {expected} at {path}, but {link}{advice}")
 

@@ -198,7 +198,7 @@ def test_all_slices_hold_it_and_its_position_in_blur(guessed: FocalStack, tmp_pa
 @pytest.mark.parametrize(("height", "rows_px"), [(("--height", "24px"), 24), ((), SIZE[0] / 4)])
 def test_objects_are_sized_in_pixels(guessed: FocalStack, tmp_path: Path, run: Run, height: tuple[str, ...], rows_px: float) -> None:
     """Seen level, so that its height in the picture is its own; without a size it takes a quarter of the picture."""
-    arguments = ("--slice", 2, "--object", CAKE, "--at-pixel", "50,40", *height, "--renderer", "scatter", "--mode", "front")
+    arguments = ("--slice", 2, "--object", CAKE, "--at-pixel", "50,40", "--pitch", 0, *height, "--renderer", "scatter", "--mode", "front")
     run("composite", guessed.folder, *arguments, "--out", tmp_path / "made.exr", "--save-deep", tmp_path / "sharp.exr")
     alpha = read_exr(tmp_path / "made.exr")[0].channels["sharp.A"].astype(np.float32)
     rows = np.flatnonzero((alpha > 0.5).any(axis=1))

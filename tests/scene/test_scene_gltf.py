@@ -1,6 +1,7 @@
 """glTF loading: small files written here with known content, and the real objects of the shared test data."""
 
 import base64
+import functools
 import json
 import struct
 from pathlib import Path
@@ -260,12 +261,15 @@ def test_any_wrong_value_is_refused_in_words(tmp_path: Path, shared_data: Path) 
             except InputError as reason:
                 refusals.append(str(reason))
     assert len(refusals) > 10  # every other exception fails
-    whole = json.loads(text)
-    whole["meshes"][0]["primitives"][0]["attributes"]["POSITION"] = -1
-    wrong = json.dumps(whole).encode()
-    path.write_bytes(stored[:12] + struct.pack("<I4s", len(wrong), b"JSON") + wrong + rest)
-    with pytest.raises(InputError, match="no number -1"):
-        load_glb(path)
+    primitive, channel = ("meshes", 0, "primitives", 0), ("animations", 0, "channels", 0)
+    numbers = ((*primitive, "attributes", "POSITION"), (*primitive, "material"), (*channel, "sampler"), (*channel, "target", "node"))
+    for place in (*numbers, ("bufferViews", 0, "buffer")):
+        whole = json.loads(text)
+        functools.reduce(lambda part, key: part[key], place[:-1], whole)[place[-1]] = -1
+        wrong = json.dumps(whole).encode()
+        path.write_bytes(stored[:12] + struct.pack("<I4s", len(wrong), b"JSON") + wrong + rest)
+        with pytest.raises(InputError, match="no number -1"):
+            load_glb(path, 0.1)
 
 
 @pytest.fixture(scope="module")

@@ -65,8 +65,8 @@ class RelativeFocus:
 
     def with_index(self, before: Plane, now: Plane) -> "RelativeFocus":
         """Return the same with surfaces moved from one fractional index of slices to another."""
-        steps = [np.interp(index, np.arange(len(self.positions_px)), self.positions_px) for index in (now, before)]
-        return replace(self, focus_px=(self.focus_px + (steps[0] - steps[1])).astype(np.float32))
+        now_px, before_px = (np.interp(index, np.arange(len(self.positions_px)), self.positions_px) for index in (now, before))
+        return replace(self, focus_px=(self.focus_px + (now_px - before_px)).astype(np.float32))
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.scene.gltf.surfaces import GltfFile, materials_of, open_gltf, read_primitive
+from mrbokeh.scene.gltf.surfaces import GltfFile, Numbered, materials_of, open_gltf, read_primitive
 from mrbokeh.scene.light import Light
 from mrbokeh.scene.material import Material
 from mrbokeh.scene.mesh import Mesh, unit
@@ -91,8 +91,8 @@ class GltfAsset:
         return Scene(tuple(meshes), tuple(lights)).transformed(WORLD_FROM_GLTF)
 
     @cached_property
-    def _materials(self) -> tuple[Material, ...]:
-        return materials_of(self._file)
+    def _materials(self) -> Numbered:
+        return Numbered(materials_of(self._file))
 
     def _meshes(self, number: int, poses: list[NodePose], world_from_node: dict[int, Float[np.ndarray, "4 4"]]) -> Iterator[Mesh]:
         node = self._file.gltf.nodes[number]
@@ -180,7 +180,7 @@ def animation_durations_s(file: GltfFile) -> dict[str, float]:
 
 def poses_at(file: GltfFile, time_s: float, animation: str | int | None) -> list[NodePose]:
     """The pose of every node at a time, which is clamped to the animation's ends. None is the file's first animation."""
-    poses = [_rest_pose(file, node) for node in file.gltf.nodes]
+    poses = Numbered(_rest_pose(file, node) for node in file.gltf.nodes)
     chosen = _chosen_animation(file, animation)
     if chosen is None:
         return poses

@@ -48,11 +48,11 @@ class _Part(dict[str, Any]):
         return self.get(name)
 
 
-class _Numbered(list[_Part]):
+class Numbered(list[Any]):
     """A list of the file. Its numbers begin with 0: -1 is a mistake, not the last."""
 
     def __getitem__(self, number: Any) -> Any:
-        if number < 0:
+        if isinstance(number, int) and number < 0:
             raise IndexError(f"there is no number {number}")
         return super().__getitem__(number)
 
@@ -63,7 +63,7 @@ class GltfFile:
 
     path: Path
     gltf: Any
-    buffers: tuple[bytes, ...]
+    buffers: Numbered
 
     def accessor(self, index: int) -> Shaped[np.ndarray, "count width"]:
         """The accessor's numbers as stored, (count, components)."""
@@ -117,6 +117,10 @@ class GltfFile:
         return values
 
 
+def _numbered(part: dict[str, Any]) -> _Part:
+    return _Part({name: Numbered(value) if isinstance(value, list) else value for name, value in part.items()})
+
+
 def open_gltf(path: str | Path) -> GltfFile:
     """Read a .glb or .gltf and its buffers; refuses what needs an extension that is not read here."""
     path = Path(path)
@@ -125,14 +129,13 @@ def open_gltf(path: str | Path) -> GltfFile:
     try:
         text, blob = _chunks(path.read_bytes())
         try:
-            gltf = json.loads(text, object_hook=_Part)
+            gltf = json.loads(text, object_hook=_numbered)
         except UnicodeDecodeError:
             raise ValueError("neither .glb nor the JSON of a .gltf") from None
         for name in _LISTS:
-            if not all(isinstance(each, _Part) for each in gltf.setdefault(name, [])):
+            if not all(isinstance(each, _Part) for each in gltf.setdefault(name, Numbered())):
                 raise ValueError(f"its {name} are no list of objects")
-            gltf[name] = _Numbered(gltf[name])
-        buffers = tuple(blob if buffer.uri is None else _read_uri(buffer.uri, path) for buffer in gltf.buffers)
+        buffers = Numbered(blob if buffer.uri is None else _read_uri(buffer.uri, path) for buffer in gltf.buffers)
         missing = sorted(set(gltf.extensionsRequired or ()) - _READABLE_EXTENSIONS)
     except InputError:
         raise

@@ -1,0 +1,44 @@
+"""Edges of depth from focus where the all-in-focus picture has them, in pictures small and large."""
+
+import cv2
+import numpy as np
+import pytest
+
+from capture.merging.depth_edges import with_edges_of_light
+from capture.merging.depth_from_focus import FocusMap
+
+RED, GREEN = (0.5, 0.15, 0.1), (0.1, 0.5, 0.2)
+NOISE = 0.02
+
+
+def disc(size: tuple[int, int], wider_px: int = 0) -> np.ndarray:
+    rows, columns = np.mgrid[: size[0], : size[1]]
+    return np.hypot(rows - size[0] / 2, columns - size[1] / 2) < size[0] / 4 + wider_px
+
+
+def picture(near: np.ndarray) -> np.ndarray:
+    noise = np.random.default_rng(0).normal(0.0, NOISE, (*near.shape, 3))
+    return np.clip(np.where(near[..., None], RED, GREEN) + noise, 0.0, 1.0).astype(np.float32)
+
+
+@pytest.mark.parametrize(("size", "near_index", "far_index"), [((240, 320), 1, 7), ((240, 320), 7, 1), ((1200, 1600), 1, 7)])
+@pytest.mark.parametrize("wider_px", [0, 6])
+def test_a_near_disc_is_as_wide_as_its_colour(size: tuple[int, int], near_index: int, far_index: int, wider_px: int) -> None:
+    """Of 2 million pixels edges are moved in two pictures after one another: what the small one leaves must not stay in the large one."""
+    near, wide = disc(size), disc(size, wider_px)
+    index = np.where(wide, np.float32(near_index), np.float32(far_index))
+    focus = FocusMap(index, np.full(size, 0.5, np.float32))
+    found = with_edges_of_light(focus, picture(near), near_first=near_index < far_index).focus_index
+    wrong = (np.abs(found - near_index) < np.abs(found - far_index)) != near
+    beside = cv2.dilate(near.astype(np.uint8), np.ones((5, 5))) != cv2.erode(near.astype(np.uint8), np.ones((5, 5)))
+    assert not wrong[~beside].any(), "nothing is left or taken away more than two pixels from the edge"
+    assert wrong.sum() < 0.5 * np.pi * size[0] / 2, "half a pixel all around at most"
+
+
+def test_two_slices_are_not_evened_out_into_one() -> None:
+    """A far surface that is sure would draw an unsure near one of nearly its colour over to itself."""
+    near = disc((120, 160))
+    rgb = np.where(near[..., None], (0.30, 0.31, 0.30), (0.31, 0.30, 0.30)).astype(np.float32)
+    focus = FocusMap((~near).astype(np.float32), np.where(near, np.float32(0.02), np.float32(1.0)))
+    found = with_edges_of_light(focus, rgb, near_first=True).focus_index
+    assert found[near].max() < 0.5
