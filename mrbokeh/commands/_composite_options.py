@@ -211,12 +211,12 @@ class ObjectOptions:
         if self.at and self.at_pixel:
             raise InputError("--at and --at-pixel both say where the object stands: give one of them")
         self.require_places()
-        for path in self.object_ or ():
-            _require_object(path)
         of_place = ((self.at, typed_place_m), (self.at_pixel, typed_pixel), (self.height, typed_height))
         for given, typed in of_place:
             for text in given or ():
                 typed(text)
+        for path in self.object_ or ():
+            _require_object(path)
         for light, typed_light in ((self.sun, typed_sun), (self.sun_by, typed_shadow)):
             if light is not None:
                 typed_light(light)

@@ -135,7 +135,9 @@ def _far_light(
     before, after = bright.one.reshape(-1, 3)[places], bright.both.reshape(-1, 3)[places]
     stays = np.clip((1.0 - share / free)[:, None] * _colour_change(means), 0.0, 1.0)
     far = surfaces + before
-    return _explained(photo_rgb, near_rgb, far), np.clip((surfaces * stays + after) / np.maximum(far, _ROUND), 0.0, 1.0)
+    # Where hardly anything gets past the near, its share is rounding: a faint shadow would take all that the near does not explain.
+    least = 1.0 - np.minimum(rays.most_covering.reshape(-1)[places], 1.0)[:, None]
+    return _explained(photo_rgb, near_rgb, far), np.clip((surfaces * stays + after) / np.maximum(far, _ROUND), least, 1.0)
 
 
 def _least_around(alpha: Plane) -> Plane:

@@ -92,14 +92,23 @@ class Rays:
     @cached_property
     def near_in_reach(self) -> Bool[np.ndarray, "height width"]:
         """Pixels whose rays may meet something near: within its blur and a pixel."""
+        return self._most_in_reach((self.scene.near.alpha > 0).astype(np.float32), self.coc_px[0]) > 0
+
+    @cached_property
+    def most_covering(self) -> Float32[np.ndarray, "height width"]:
+        """The greatest alpha of virtual things that a pixel's rays may meet."""
+        return self._most_in_reach(self.virtual.alpha, self.coc_px[1])
+
+    def _most_in_reach(self, alpha: Plane, coc_px: Plane) -> Plane:
+        """Return the greatest alpha within the blur of all that covers anything, and a pixel."""
         from cv2 import MORPH_RECT, dilate, getStructuringElement
 
-        there = self.scene.near.alpha > 0
+        there = alpha > 0
         if not there.any():
-            return there
-        half_px = 0.5 * float(np.abs(self.coc_px[0][there]).max()) * self.lens.aperture.unit_radius
+            return alpha
+        half_px = 0.5 * float(np.abs(coc_px[there]).max()) * self.lens.aperture.unit_radius
         size = 2 * int(np.ceil(half_px + 2.0)) + 1
-        return np.asarray(dilate(there.astype(np.uint8), getStructuringElement(MORPH_RECT, (size, size))) > 0)
+        return np.asarray(dilate(alpha, getStructuringElement(MORPH_RECT, (size, size))))
 
     def cells(self, places: Places) -> Iterator[tuple[Places, Aperture]]:
         """Indices of the places that see one opening, and that opening."""
