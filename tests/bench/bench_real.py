@@ -105,6 +105,8 @@ def _words(figures: Figures) -> str:
 def _ranking(data: Path, measuring: Measuring, results: list[StackResult]) -> Ranking | None:
     """Of the pairs that this run measured."""
     names = {result.name for result in results if result.name.startswith(PAIR_SET + "/") and result.figures}
+    if not names:
+        return None
     fused = {path.stem: path for path in (measuring.cache / "fused").glob("*.png") if f"{PAIR_SET}/{path.stem}" in names}
     try:
         return rank_fused(data, measuring.cache, fused)
