@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.merging.depth_from_focus import FocusMap
+from mrbokeh.depth.depth_filters import interpolate
 from mrbokeh.depth.edge_votes import Guide, Mask, grown, narrowed
 from mrbokeh.depth.soft_edges import steepened
 
@@ -31,7 +32,7 @@ _TRUSTED = 0.02
 _SMALL_PX = 0.6e6
 _COARSE_REACHES_PX, _FINE_REACHES_PX = (8, 8), (4,)
 """How far edges are moved, in passes: in a picture of SMALL_PX pixels at most, and in each that is twice as large, for what is left."""
-_SMOOTHING, _COLOUR, _LEAST_TRUST, _WHITE = 5000.0, 2.0, np.float32(1e-4), 99.5
+_SMOOTHNESS, _CONTRAST, _LEAST_TRUST, _WHITE = 13_000.0, 2.0 / 255.0, np.float32(1e-4), 99.5
 _SAME_SURFACE, _LARGEST_SHARE = 1.5, 0.5
 """Depth is evened out by so many jumps at most, and this share of its range: what differs by more is something of its own."""
 
@@ -72,9 +73,7 @@ def _moved(nearness: Plane, rgb: Rgb, trusted: Mask, jump: float, reaches_px: Se
 def _evened(index: Plane, confidence: Plane, rgb: Rgb, most: float) -> Plane:
     """Return the index as its confident places say, up to edges of the picture, and changed by so much at most."""
     root = np.sqrt(np.maximum(rgb, np.float32(0.0)))
-    white = max(float(np.percentile(root[::4, ::4], _WHITE)), 1e-6)
-    guide = np.minimum(root * np.float32(255.0 / white), np.float32(255.0)).astype(np.uint8)
-    trust = np.maximum(confidence, _LEAST_TRUST)
-    smoother = cv2.ximgproc.createFastGlobalSmootherFilter(guide, _SMOOTHING, _COLOUR)
-    even = np.clip(smoother.filter(trust * index) / smoother.filter(trust), index.min(), index.max())
+    guide = np.minimum(root / np.float32(max(np.percentile(root[::4, ::4], _WHITE), 1e-6)), np.float32(1.0))
+    even = interpolate(index, np.maximum(confidence, _LEAST_TRUST), guide, _SMOOTHNESS, _CONTRAST)
+    even = np.clip(even, index.min(), index.max())
     return np.where(np.abs(even - index) <= most, even, index)

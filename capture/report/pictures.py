@@ -127,7 +127,7 @@ def crops_shown(crops: Sequence[tuple[str, Rgb]], block: tuple[int, int, int], *
 
 
 def worst_places(look: PictureLook, focus_index: Plane, pairs: Sequence[NeighbourDisplacement]) -> list[Place]:
-    """Return up to three places for a gate that fails, one where none does. focus_index: which slice each pixel was taken from."""
+    """Return up to three places for a gate that fails, one where none does. focus_index: in which slice each pixel is sharp."""
     return [*_lost(look), *_seams(look, focus_index), *_brightest(look), *_farthest_apart(pairs)]
 
 
@@ -190,7 +190,7 @@ def _seams(look: PictureLook, focus_index: Plane) -> list[Place]:
     places = []
     for row, column in _spread_out(added, sharpness.flat > LARGEST_FLAT):
         at_px, index = look.corner_px(row, column), int(sharpest.index[row, column])
-        slices = tuple((side, f"slice {side}, merged here") for side in _merged_from(focus_index, at_px))
+        slices = tuple((side, f"slice {side}, sharp here") for side in _sharp_in(focus_index, at_px))
         text = f"{float(sharpness.kept[row, column]):.2f} times the detail of slice {index}, the sharpest here"
         places.append(Place(SEAMS.name, at_px, text, slices))
     return places
@@ -232,8 +232,8 @@ def _spread_out(badness: Float32[np.ndarray, "rows columns"], failing: bool) -> 
     return found
 
 
-def _merged_from(focus_index: Plane, at_px: tuple[int, int]) -> list[int]:
-    """Return the two slices that most of a block and what lies around it were taken from, or the one."""
+def _sharp_in(focus_index: Plane, at_px: tuple[int, int]) -> list[int]:
+    """Return the two slices in which most of a block and what lies around it is sharp, or the one."""
     x, y = at_px
     around = focus_index[max(y - BLOCK_PX // 2, 0) : y + 3 * BLOCK_PX // 2, max(x - BLOCK_PX // 2, 0) : x + 3 * BLOCK_PX // 2]
     indices, counts = np.unique(np.round(around).astype(int), return_counts=True)

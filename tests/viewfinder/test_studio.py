@@ -41,13 +41,13 @@ from tests.support.renderer_banks import bank_folder
 from tests.support.waiting import comes_true, wait_until
 from viewfinder.studio import desk as desks
 from viewfinder.studio import photograph
-from viewfinder.studio.bokeh import bokeh_svg
 from viewfinder.studio.command_line import command_line, options_of, words_of
 from viewfinder.studio.loupe import Region, WholePhotograph, region_of
 from viewfinder.studio.photograph import MOST_PX, OpenedPhotograph, open_photograph, placed, shrunk
 from viewfinder.studio.preview import Previewer, Wish, preview_of
 from viewfinder.studio.project import Project, read_project
 from viewfinder.studio.running import StudioOptions, project_of
+from viewfinder.studio.site import bokeh_svg
 from viewfinder.studio.state import StudioState, state_of
 
 AT_PX = (120.0, 140.0)

@@ -187,7 +187,7 @@ def test_crops_are_at_100_percent_beside_the_slices_on_both_sides_of_a_seam(tmp_
     assert crops[0][inside].std() < 0.6 * crops[1][inside].std()
     # A jigsaw on the border between slices 1 and 2, at column 300.
     captions = [each.caption for each in places(report_of(tmp_path, jigsaw()), SEAMS.name)[0].pictures]
-    assert [each.split(", contrast")[0] for each in captions] == ["all in focus", "slice 1, merged here", "slice 2, merged here"]
+    assert [each.split(", contrast")[0] for each in captions] == ["all in focus", "slice 1, sharp here", "slice 2, sharp here"]
     assert len({each.split(", contrast")[1] for each in captions}) == 1, "seen with one contrast"
 
 
