@@ -22,7 +22,7 @@ SHARP_STEP_COC_PX = 2.0
 # A block that keeps less of the detail of its sharpest slice is blended again; the gate of the report is at 0.6. Blur conserves light: a
 # choice of slices that moves the brightness of a block by more than this, in square roots of light, puts a blurred slice in place.
 KEPT_DETAIL = 0.66
-LARGEST_MOVE = 0.04
+LARGEST_MOVE = 0.02
 # A mended block changes slices as far around it as fine bands reach; closer where that spoils the blocks beside it.
 _AROUND_PX = 8
 _CLOSE_PX = 3

@@ -32,10 +32,11 @@ WIDER_NOISE_FLOORS = 10.0
 WIDER_FROM_PX = 0.7e6
 # Of two slices a place's own weak detail tells more: mean rank 2.5 of 36 methods on 20 pairs without windows, 4.6 with them.
 FEWEST_SLICES_FOR_WIDER = 3
-# In plain places, detail is the rim of a blur where the light of its slice differs by RIM_LIGHT or more (square roots, 255 at white) from
-# that of the slice in which the surroundings are sharp. It has half its say where it is RIM_STRENGTH times the detail around it.
-RIM_LIGHT = 5.0
-RIM_STRENGTH = 3.0
+# At focus light stands still from slice to slice; the rim of a blurred edge comes with as much change of light as it has curvature (heat
+# equation): energy may be that of a rim up to so many times the square of the change, in square roots of light per slice.
+RIM_ENERGY = 1.0
+# In fewer slices light changes with leaves in the wind or the exposure: it tells of rims in plain places only.
+FEWEST_SLICES_FOR_RIMS = 5
 # Light is compared over a few pixels of the volume.
 _LIGHT_SIGMA_PX = 3.0
 # Pixels this near to one that is full see its clipped rim, not detail.
@@ -50,6 +51,7 @@ SURFACE_STEP = 1.5
 Costs = Float32[np.ndarray, "labels height width"]
 Plane = Float32[np.ndarray, "height width"]
 Labels = Int[np.ndarray, "height width"]
+Lights8 = UInt8[np.ndarray, "slices height width"]
 
 
 @dataclass(frozen=True)
@@ -75,8 +77,9 @@ def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "
     energies = volume.calmed()
     strongest = energies.max(axis=0)
     plain = _plainness(volume)
-    sharp = _sharp_light(volume)
-    costs = _costs(_without_rims(energies, volume.lights, plain, sharp), plain, sharp)
+    detail = _without_rims(volume, energies, plain)
+    sharp = _sharp_light(detail, volume.lights)
+    costs = _costs(detail, plain, sharp)
     _let_lights_decide(costs, volume.reduced(by_light), volume.reduced(lights.core))
     labels = aggregate_costs(costs, SMALL_STEP_COST, LARGE_STEP_COST).argmin(axis=0)
     offset, _ = peak_parabola(np.log1p(energies, out=energies), labels)
@@ -130,29 +133,28 @@ def _plainness(volume: FocusVolume) -> Plane:
     return cv2.resize(plain, volume.size[::-1], interpolation=cv2.INTER_LINEAR)
 
 
-def _sharp_light(volume: FocusVolume) -> Plane:
+def _without_rims(volume: FocusVolume, energies: Volume, plain: Plane) -> Volume:
+    """Return energies without those of the rims of blurred edges nearby."""
+    calm = [cv2.GaussianBlur(each.astype(np.float32), (0, 0), _LIGHT_SIGMA_PX) for each in volume.lights]
+    share = np.float32(RIM_ENERGY / 255.0**2) / volume.noise
+    if len(calm) < FEWEST_SLICES_FOR_RIMS:
+        share *= plain
+    result, last = np.empty_like(energies), len(calm) - 1
+    for index, energy in enumerate(energies):
+        before, after = max(index - 1, 0), min(index + 1, last)
+        change = (calm[after] - calm[before]) / np.float32(after - before)
+        result[index] = energy * energy / (energy + share * change * change + np.float32(1e-9))
+    return result
+
+
+def _sharp_light(energies: Volume, lights: Lights8) -> Plane:
     """Return the mean light of all slices, each as far as its detail says that it is sharp."""
-    total, light = (np.zeros(volume.size, np.float32) for _ in range(2))
-    for energy, each in zip(volume.energies, volume.lights, strict=True):
+    total, light = (np.zeros(energies.shape[1:], np.float32) for _ in range(2))
+    for energy, each in zip(energies, lights, strict=True):
         say = energy * energy
         total += say
         light += say * each
     return light / np.maximum(total, np.float32(1e-9))
-
-
-def _without_rims(energies: Volume, lights: UInt8[np.ndarray, "slices height width"], plain: Plane, sharp_light: Plane) -> Volume:
-    """Return energies without the rims of blurred edges nearby."""
-    wide = _wider(energies, WIDER[-1], sharp_light)
-    around, size = wide.max(axis=0), energies.shape[2:0:-1]
-    sharp = cv2.resize(wide.argmax(axis=0).astype(np.float32), size, interpolation=cv2.INTER_NEAREST).astype(int)
-    around = np.float32(RIM_STRENGTH) * cv2.resize(around, size, interpolation=cv2.INTER_LINEAR)
-    calm = np.stack([cv2.GaussianBlur(each, (0, 0), _LIGHT_SIGMA_PX) for each in lights])
-    wanted = np.take_along_axis(calm, sharp[None], axis=0)[0].astype(np.float32)
-    result = np.empty_like(energies)
-    for kept, energy, light in zip(result, energies, calm, strict=True):
-        off = cv2.subtract(light.astype(np.float32), wanted) / np.float32(RIM_LIGHT)
-        kept[:] = energy * (1.0 - plain * (1.0 - cv2.exp(-off * off)) * around / (around + energy + np.float32(1e-9)))
-    return result
 
 
 def _costs(energies: Volume, plain: Plane, sharp_light: Plane) -> Volume:

@@ -38,11 +38,12 @@ class FocusVolume:
     """Focus energies of a stack.
 
     energies (slices, h, w): local energy of fine detail in every slice, with the noise of the noisiest of the place, over that noise.
-    lights (slices, h, w): mean over the channels of the square root of light, 255 at display white. shape: (H, W) of the pictures,
-    h = ceil(H / shrink). details: of every slice, by blocks (`block_detail`).
+    noise (h, w): that noise, as `focus_energy`. lights (slices, h, w): mean over the channels of the square root of light, 255 at display
+    white. shape: (H, W) of the pictures, h = ceil(H / shrink). details: of every slice, by blocks (`block_detail`).
     """
 
     energies: Volume
+    noise: Plane
     lights: UInt8[np.ndarray, "slices height width"]
     shape: tuple[int, int]
     details: tuple[Blocks, ...]
@@ -112,8 +113,8 @@ def focus_volume(registered: Iterable[Rgb], valid: Callable[[int], Mask] | None 
         lights.append(np.minimum(cv2.transform(small, np.full((1, 3), _WHITE / 3.0)), _WHITE).astype(np.uint8))
         levels.append(np.minimum(cv2.transform(small, np.full((1, 3), _LEVELS / 3.0)), _LEVELS - 1).astype(np.uint8))
     volume = np.stack(energies)
-    _as_noisy_as_the_noisiest(volume, levels, noise_floors(volume, levels))
-    return FocusVolume(volume, np.stack(lights), (rgb.shape[0], rgb.shape[1]), tuple(details))
+    noise = _as_noisy_as_the_noisiest(volume, levels, noise_floors(volume, levels))
+    return FocusVolume(volume, noise, np.stack(lights), (rgb.shape[0], rgb.shape[1]), tuple(details))
 
 
 def focus_energy(rgb: Rgb, window_px: float = 2.5) -> Plane:
@@ -143,8 +144,8 @@ def noise_floors(energies: Volume, levels: list[Light]) -> Float32[np.ndarray, "
     return np.maximum(floors, max(_LEAST_OF_MEDIAN * np.median(list(lows.values())), 1e-9)).astype(np.float32)
 
 
-def _as_noisy_as_the_noisiest(energies: Volume, levels: list[Light], floors: Float32[np.ndarray, " levels"]) -> None:
-    """Give each slice the noise that it lacks beside the noisiest one of a place, then divide all by that; 0 stays 0.
+def _as_noisy_as_the_noisiest(energies: Volume, levels: list[Light], floors: Float32[np.ndarray, " levels"]) -> Plane:
+    """Give each slice the noise that it lacks beside the noisiest one of a place, then divide all by that; 0 stays 0. Return that noise.
 
     One divisor for all: beside a strong edge noise is nothing, but there a blurred slice may be nearly white, where it has a fifth of the
     noise of the sharp slice, and would win by that.
@@ -153,6 +154,7 @@ def _as_noisy_as_the_noisiest(energies: Volume, levels: list[Light], floors: Flo
     for energy, level in zip(energies, levels, strict=True):
         energy += (energy > 0) * (largest - floors[level])
         energy /= largest
+    return largest
 
 
 def share_above(energy: Plane, half_at: float) -> Plane:
