@@ -114,7 +114,8 @@ def focus_volume(registered: Iterable[Rgb], valid: Callable[[int], Mask] | None 
         levels.append(np.minimum(cv2.transform(small, np.full((1, 3), _LEVELS / 3.0)), _LEVELS - 1).astype(np.uint8))
     volume = np.stack(energies)
     noise = _as_noisy_as_the_noisiest(volume, levels, noise_floors(volume, levels))
-    return FocusVolume(volume, noise, np.stack(lights), (rgb.shape[0], rgb.shape[1]), tuple(details))
+    shape = (rgb.shape[0], rgb.shape[1])
+    return FocusVolume(energies=volume, noise=noise, lights=np.stack(lights), shape=shape, details=tuple(details))
 
 
 def focus_energy(rgb: Rgb, window_px: float = 2.5) -> Plane:
