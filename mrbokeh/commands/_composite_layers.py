@@ -153,7 +153,7 @@ def objects_of(options: ObjectOptions, plate: Plate, shadow: float = 0.0) -> "li
 
     placed: list[OneObject] = []
     for each in options.each:
-        stands_at_m = typed_place_m(each.at) if each.at else plate.point_under_pixel_m(*typed_pixel(each.at_pixel or ""))
+        stands_at_m = typed_place_m(each.at) if each.at else _under_pixel_m(plate, each.at_pixel or "")
         one = OneObject(
             glb=each.glb,
             stands_at_m=stands_at_m,
@@ -167,6 +167,17 @@ def objects_of(options: ObjectOptions, plate: Plate, shadow: float = 0.0) -> "li
         moved_m = stands_at_m if nearer == 1.0 else (nearer * x_m, nearer * y_m, nearer * z_m)
         placed.append(replace(one, stands_at_m=moved_m, height_m=_height_m(each.height, plate, moved_m[2])))
     return placed
+
+
+def _under_pixel_m(plate: Plate, typed: str) -> tuple[float, float, float]:
+    """Return the place that a pixel shows, and say where its depth is that of its surroundings."""
+    x_px, y_px = typed_pixel(typed)
+    place_m = plate.point_under_pixel_m(x_px, y_px)
+    if plate.is_depth_from_around(x_px, y_px):
+        guess(
+            f"nothing near pixel {x_px:g},{y_px:g} told its depth, {place_m[2]:.3g} m is that of its surroundings: choose one with detail"
+        )
+    return place_m
 
 
 def _grounds(objects: "Sequence[OneObject]") -> list[list[int]]:

@@ -49,6 +49,8 @@ _DEVELOPED, _SHADOW_CONTRAST = (".jpg", ".jpeg", *HEIF_SUFFIXES), 1.3
 """Files that cameras write, and the slope of their tones over those of the light, both as logarithms: 1.14 to 1.36 in JPEGs of four cameras
 beside their RAW (from 1 to 50 % of white), and 1.4 by the light that was left in seven cast shadows of sunny days."""
 
+_NEAR_PX, _LEAST_CONFIDENCE = 15, 0.05
+
 
 @dataclass(frozen=True)
 class Plate:
@@ -56,6 +58,7 @@ class Plate:
 
     rgb: (H, W, 3) linear, blurred by the real lens. depth_m: (H, W) of the sharp scene or None. lens: as focused for this photograph.
     sharp_rgb: (H, W, 3) the same view all in focus (of a focal stack), in the colours of rgb, or None.
+    depth_confidence: (H, W) in [0, 1], of a focal stack: 0 where nothing there told the depth, which is then that of its surroundings.
     near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects: sharp where its distance is known
     (by depth or told), else as the photograph shows it; NaN where depth is to tell; or None.
     alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
@@ -76,6 +79,7 @@ class Plate:
     lens: Lens
     camera: Camera
     sharp_rgb: Float32[np.ndarray, "height width 3"] | None = None
+    depth_confidence: Float32[np.ndarray, "height width"] | None = None
     near_alpha: Float32[np.ndarray, "height width"] | None = None
     alpha: Float32[np.ndarray, "height width"] | None = None
     metres_guessed: bool = False
@@ -123,6 +127,14 @@ class Plate:
         assert self.depth_m is not None
         self.require_pixel(x_px, y_px)
         return float(self.depth_m[int(y_px), int(x_px)])
+
+    def is_depth_from_around(self, x_px: float, y_px: float) -> bool:
+        """Return whether nothing within _NEAR_PX of a pixel told its depth from focus."""
+        if self.depth_confidence is None:
+            return False
+        top, left = max(int(y_px) - _NEAR_PX, 0), max(int(x_px) - _NEAR_PX, 0)
+        near = self.depth_confidence[top : int(y_px) + _NEAR_PX + 1, left : int(x_px) + _NEAR_PX + 1]
+        return bool(near.max() < _LEAST_CONFIDENCE)
 
     def length_m(self, pixels: float, depth_m: float) -> float:
         """Return the length of what covers so many pixels upright at a depth, facing the camera."""
@@ -307,6 +319,7 @@ def shrunk(plate: Plate, width_px: int, height_px: int) -> Plate:
         depth_m=picked(plate.depth_m),
         camera=plate.camera.resized(*size_px),
         sharp_rgb=mean(plate.sharp_rgb),
+        depth_confidence=mean(plate.depth_confidence),
         near_alpha=None if plate.near_alpha is None else shrunk_matte(plate.near_alpha, size_px),
         alpha=mean(plate.alpha),
     )
@@ -393,7 +406,8 @@ def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus
     camera = stack.camera or camera_of_lens(stack.lens_of(stack.reference), rgb.shape[1], rgb.shape[0])
     # A stack of a scene knows where its camera stood; objects are placed in camera axes.
     upright = replace(camera, camera_from_world=np.eye(4))
-    plate = Plate(rgb=rgb, depth_m=stack.depth_m(), lens=focused, camera=upright, sharp_rgb=stack.all_in_focus())
+    depth_m, confidence = stack.depth_planes("Z", "confidence")
+    plate = Plate(rgb=rgb, depth_m=depth_m, lens=focused, camera=upright, sharp_rgb=stack.all_in_focus(), depth_confidence=confidence)
     return replace(plate, metres_guessed=not stack.metres_known, slopes_known=stack.metres_known, blur_from=blur_from)
 
 
