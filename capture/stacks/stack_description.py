@@ -184,6 +184,8 @@ def lens_text(lens: Lens | None) -> str:
 def stack_remarks(work: StackWork, reference: Photo, lens: Lens | None, missing: str | None) -> list[str]:
     """Say in sentences what a reader should know. missing: why there is no lens."""
     photos = [each.photo for each in work.finished]
+    if len(photos) < FEWEST_TO_MERGE:
+        return [*work.remarks, f"a stack of 1 slice: merging needs at least {FEWEST_TO_MERGE}"]
     counted = Counter(remark for each in work.finished for remark in each.record["remarks"])
     remarks = [remark if count == 1 or count == len(photos) else f"{remark} ({count} slices)" for remark, count in counted.items()]
     remarks = [*work.remarks, *remarks, *_session_remarks(work)]
@@ -231,8 +233,6 @@ def sentinel_remarks(photos: Sequence[Photo]) -> list[str]:
 def _order_remarks(photos: Sequence[Photo]) -> list[str]:
     """Say what a reader should check before merging."""
     remarks = []
-    if len(photos) < FEWEST_TO_MERGE:
-        remarks.append(f"a stack of {len(photos)} slice{'s' if len(photos) > 1 else ''}: merging needs at least {FEWEST_TO_MERGE}")
     times = [photo.metadata.taken_at for photo in photos]
     known = [time for time in times if time is not None]
     if len(known) == len(times) and known != sorted(known) and any(photo.focus_distance_m is None for photo in photos):

@@ -96,7 +96,7 @@ def composite(
     from mrbokeh.images.image_io import read_layer
 
     known_lens, spreads = _optics(lens, renderer)
-    focus_m = None if focus is None or isinstance(focus, tuple) else focus_in_metres(focus)
+    focus_m = None if focus is None or isinstance(focus, tuple) else focus_in_numbers(focus)[0]
     if isinstance(photo, (str, Path)):
         plate = open_plate(Path(photo), slice_index, known_lens, focus_m, exact_depth=exact_depth)
     elif known_lens is None:
@@ -172,14 +172,18 @@ def _optics(lens: Lens | File | None, renderer: str | Renderer | None) -> tuple[
 
 
 def _focused(lens: Lens, focus: float | tuple[float, float] | None, depth_m: Plane) -> Lens:
-    if isinstance(focus, tuple):
-        return lens.focused_on(depth_m, focus[0] + 0.5, focus[1] + 0.5)
-    return lens if focus is None else lens.focused_at(focus_in_metres(focus))
+    if focus is None:
+        return lens
+    numbers = focus_in_numbers(focus)
+    return lens.focused_at(*numbers) if len(numbers) == 1 else lens.focused_on(depth_m, numbers[0] + 0.5, numbers[1] + 0.5)
 
 
-def focus_in_metres(focus: object) -> float:
-    """Return a distance as a number; InputError for what is none."""
+def focus_in_numbers(focus: object) -> list[float]:
+    """Return a distance as one number, a pixel as two; InputError for what is neither."""
     try:
-        return float(focus)  # type: ignore[arg-type]
+        numbers = [float(each) for each in (focus if isinstance(focus, tuple) else (focus,))]  # type: ignore[arg-type]
     except (TypeError, ValueError):
-        raise InputError(f"focus: expected metres, or the pixel (x, y) to focus on, got {focus!r}") from None
+        numbers = []
+    if len(numbers) != (2 if isinstance(focus, tuple) else 1):
+        raise InputError(f"focus: expected metres, or the pixel (x, y) to focus on, got {focus!r}")
+    return numbers

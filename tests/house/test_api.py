@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mrbokeh as mb
-from mrbokeh.commands.on_arrays import focus_in_metres
+from mrbokeh.commands.on_arrays import focus_in_numbers
 from mrbokeh.images.image_io import write_layer
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
@@ -44,8 +44,9 @@ def test_render_is_the_renderer_of_that_name_with_the_focus_asked_for() -> None:
     on_the_post = ScatterReference().render([layer], LENS.focused_at(0.8)).rgb
     np.testing.assert_array_equal(mb.render(picture, depth_m, LENS, focus=(50, 20), renderer="scatter"), on_the_post)
     np.testing.assert_array_equal(mb.render(picture, depth_m, LENS, focus=0.8, renderer=ScatterReference()), on_the_post)
-    with pytest.raises(InputError, match="expected metres, or the pixel"):
-        focus_in_metres("near")
+    for wrong in ("near", ("a", "b"), (1.0, 2.0, 3.0)):
+        with pytest.raises(InputError, match="expected metres, or the pixel"):
+            focus_in_numbers(wrong)
     np.testing.assert_array_equal(mb.render(picture, depth_m, LENS, renderer="scatter"), ScatterReference().render([layer], LENS).rgb)
 
 
