@@ -49,7 +49,6 @@ class BlurOptions:
         """Return lens and renderer of --lens and these options. Raises InputError for an option that the renderer does not have."""
         from mrbokeh.layering.layering import Layering
         from mrbokeh.renderers.choose import lens_and_renderer
-        from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
 
         layering = Layering() if self.slices is None else Layering(slices=self.slices)
         held, renderer = lens_and_renderer(lens, self.method, threads=self.threads, layering=layering, device=self.device)
@@ -57,6 +56,8 @@ class BlurOptions:
             raise InputError("--slices is for renderers that cut depth into slices, and this one does not: leave it out")
         if self.rank is None and not self.two_passes:
             return held, renderer
+        from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter
+
         if not isinstance(renderer, LowRankFilter):
             raise InputError("--rank and --two-passes are of --renderer low-rank: give that too, or leave them out")
         if renderer.bank is not None and self.rank is not None:

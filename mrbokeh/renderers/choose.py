@@ -16,7 +16,6 @@ from mrbokeh.optics.lens_file import read_lens as read_description
 from mrbokeh.optics.lens_library import shipped
 from mrbokeh.optics.psf_bank import PsfBank
 from mrbokeh.optics.psf_bank_file import HEAD, read_bank
-from mrbokeh.renderers.bank.bank_lens import lens_of, opening_of, polygons_suit
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.system.errors import InputError
 
@@ -91,6 +90,8 @@ def lens_and_renderer(
     """
     if is_bank(lens):
         assert lens is not None
+        from mrbokeh.renderers.bank.bank_lens import lens_of
+
         bank = _read_bank(lens)
         settings = {"threads": threads, "layering": layering or Layering()}
         return _spread_by(lens_of(bank), lens), _of_bank(lens, bank, renderer, settings, device)
@@ -119,6 +120,8 @@ def read_lens(path: Path | str) -> Lens:
     """
     path = Path(path)
     if is_bank(path):
+        from mrbokeh.renderers.bank.bank_lens import lens_of, opening_of
+
         bank = _read_bank(path)
         return replace(lens_of(bank) or replace(Lens.default(), aperture=opening_of(bank)), spread_by=path)
     if path.suffix.lower() == ".onnx":
@@ -165,6 +168,8 @@ def _on(device: str, name: str) -> dict[str, str]:
 
 def _of_bank(folder: Path, bank: PsfBank, method: str | None, settings: dict[str, Any], device: str) -> Renderer:
     """Return a renderer by a bank of kernels. method: None takes polygons where they can stand for the kernels, else laplacian."""
+    from mrbokeh.renderers.bank.bank_lens import polygons_suit
+
     name = method or (DEFAULT if polygons_suit(bank) else "laplacian")
     if name not in WITH_BANKS:
         raise InputError(f"the bank {folder} is for --renderer {', '.join(WITH_BANKS)}, got {name}: it takes the opening of a lens file")
