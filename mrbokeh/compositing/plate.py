@@ -343,7 +343,7 @@ def bundle_plate(bundle: CaptureBundle, lens: Lens | None = None, focus_m: float
 def with_depth(plate: Plate, source: Path, settings: DepthSettings) -> Plate:
     """The plate with depth from a file, or from a network that looks at its sharpest picture."""
     depth = open_depth(source, plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb, settings)
-    return replace(plate, depth_m=depth.depth_m)
+    return replace(plate, depth_m=depth.depth_m, depth_confidence=None)
 
 
 def with_stereo(
@@ -362,7 +362,7 @@ def with_stereo(
         else ""
     )
     depth_m = depth.depth_m if exact else mended_aloud(depth.depth_m, seen_rgb)
-    return replace(plate, depth_m=depth_m, depth_note="", metres_guessed=baseline_m is None)
+    return replace(plate, depth_m=depth_m, depth_confidence=None, depth_note="", metres_guessed=baseline_m is None)
 
 
 _HANDS_BREADTH_M = 0.1

@@ -137,6 +137,17 @@ def test_heights_in_pixels_hold_for_an_object_that_is_moved_to_the_level_of_the_
     assert second.height_m == pytest.approx(first.height_m)
 
 
+def test_a_foot_on_what_has_no_detail_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    """The right half has detail; 25 px to the left of it none of a foot's surroundings told its depth."""
+    confidence = np.zeros((HEIGHT, WIDTH), np.float32)
+    confidence[:, WIDTH // 2 :] = 0.5
+    plate = replace(table(1.0), depth_confidence=confidence)
+    for at_px, told in ((f"{WIDTH // 2 - 25},200", True), (f"{WIDTH // 2 - 10},200", False), ("280,200", False)):
+        standing = replace(LEVEL, object_=[CAKE], at_pixel=[at_px], camera_height=None)
+        objects_of(standing, plate)
+        assert (f"nothing near pixel {at_px} told its depth" in capsys.readouterr().out) == told
+
+
 PLACES = {"object_": [CAKE, ALIEN], "at_pixel": ["1,2", "3,4"]}
 
 
