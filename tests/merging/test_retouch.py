@@ -89,6 +89,8 @@ def test_grey_blends_and_later_calls_add_up(stack: FocalStack, tmp_path: Path) -
     masks = [painted_upright(tmp_path / f"{name}.png", white(np.uint8, where)) for name, where in (("a", MIDDLE), ("b", BEYOND))]
     both = retouch_scene(stack.folder.parent, [FAR, 0], masks)
     assert [each["slice"] for each in both.metadata[RETOUCHES]] == [NEAR, FAR, 0]
+    again = retouch_scene(stack.folder, [FAR, 0], masks)
+    assert again.metadata[RETOUCHES] == both.metadata[RETOUCHES], "the same again is listed once"
     assert (both.focus_index()[MIDDLE] == FAR).all() and (both.focus_index()[BEYOND] == 0).all()
 
 
