@@ -1,7 +1,7 @@
 """Depth that Google's phones keep in a JPEG: GDepth with the sharp original (GImage) and where it was focused (GFocus), all in its XMP.
 
 developers.google.com/depthmap-metadata. RangeInverse: d = far near / (far - n (far - near)), linear in dioptres; RangeLinear: d = near +
-n (far - near); n is the number of the map in [0, 1]. Lens Blur has depth to an unknown scale.
+n (far - near); n is the number of the map in [0, 1]. Lens Blur has depth to an unknown scale: its nearest is put at _NEAREST_M.
 """
 
 import base64
@@ -22,6 +22,7 @@ from mrbokeh.system.errors import InputError
 _DEPTH = "{http://ns.google.com/photos/1.0/depthmap/}"
 _IMAGE = "{http://ns.google.com/photos/1.0/image/}"
 _FOCUS = "{http://ns.google.com/photos/1.0/focus/}"
+_NEAREST_M = 0.5
 
 
 def google_photo(xmp: Mapping[str, str], path: Path, near_far_m: tuple[float, float] | None) -> PhonePhoto | None:
@@ -29,37 +30,45 @@ def google_photo(xmp: Mapping[str, str], path: Path, near_far_m: tuple[float, fl
     if _DEPTH + "Data" not in xmp:
         return None
     orientation, original = stored_orientation(path), xmp.get(_IMAGE + "Data")
-    stored, has_unit = _depth(xmp, path, near_far_m), near_far_m is not None or bool(xmp.get(_DEPTH + "Units"))
+    has_unit = near_far_m is not None or bool(xmp.get(_DEPTH + "Units"))
+    near, far = near_far_m or _near_and_far(xmp, path)
+    scale = 1.0 if has_unit or near <= 0.0 else _NEAREST_M / near
+    units = (
+        "metres as stated"
+        if near_far_m
+        else xmp.get(_DEPTH + "Units") or "no unit, the nearest is guessed; --disparity NEAR:FAR says better"
+    )
+    stored = _depth(xmp, path, (scale * near, scale * far), units)
     depth = replace(stored, depth_m=upright(stored.depth_m, orientation), valid=upright(stored.valid, orientation))
     sharp_rgb = None if original is None else srgb_to_linear(upright(_decoded(original, path)[..., :3], orientation))
-    return PhonePhoto(depth, sharp_rgb, _focus(xmp), has_unit)
+    return PhonePhoto(depth, sharp_rgb, _focus(xmp, scale), has_unit)
 
 
-def _depth(xmp: Mapping[str, str], path: Path, near_far_m: tuple[float, float] | None) -> DepthMap:
-    kind = xmp.get(_DEPTH + "Format", "")
-    if kind not in ("RangeInverse", "RangeLinear"):
-        raise InputError(f"{path}: expected GDepth:Format RangeInverse or RangeLinear, got {kind!r}")
+def _near_and_far(xmp: Mapping[str, str], path: Path) -> tuple[float, float]:
     try:
-        near, far = near_far_m or (float(xmp[_DEPTH + "Near"]), float(xmp[_DEPTH + "Far"]))
+        return float(xmp[_DEPTH + "Near"]), float(xmp[_DEPTH + "Far"])
     except (KeyError, ValueError):
         raise InputError(f"{path}: GDepth:Near and Far are missing: state them with --disparity NEAR:FAR in metres") from None
+
+
+def _depth(xmp: Mapping[str, str], path: Path, near_far_m: tuple[float, float], units: str) -> DepthMap:
+    (near, far), kind = near_far_m, xmp.get(_DEPTH + "Format", "")
+    if kind not in ("RangeInverse", "RangeLinear"):
+        raise InputError(f"{path}: expected GDepth:Format RangeInverse or RangeLinear, got {kind!r}")
     if kind == "RangeLinear" and not np.isfinite(far):
         raise InputError(f"{path}: its depth is linear in metres, so that FAR cannot be infinite: give a distance")
     level = without_steps(_decoded(xmp[_DEPTH + "Data"], path)[..., 0], 256)
-    units = xmp.get(_DEPTH + "Units", "") or (
-        "metres as stated" if near_far_m else "no unit, taken as metres; --disparity NEAR:FAR says better"
-    )
-    note = f"GDepth of the phone, {near:g} to {far:g} ({units})"
+    note = f"GDepth of the phone, {near:.4g} to {far:.4g} ({units})"
     everywhere = np.ones(level.shape, bool)
     if kind == "RangeInverse":
         return DepthMap.of_dioptres((1.0 - level) / near + level / far, everywhere, note)
     return DepthMap((near + level * (far - near)).astype(np.float32), everywhere, note)
 
 
-def _focus(xmp: Mapping[str, str]) -> PhoneFocus | None:
+def _focus(xmp: Mapping[str, str], scale: float) -> PhoneFocus | None:
     if _FOCUS + "FocalDistance" not in xmp or _FOCUS + "BlurAtInfinity" not in xmp:
         return None
-    return PhoneFocus(float(xmp[_FOCUS + "FocalDistance"]), float(xmp[_FOCUS + "BlurAtInfinity"]))
+    return PhoneFocus(scale * float(xmp[_FOCUS + "FocalDistance"]), float(xmp[_FOCUS + "BlurAtInfinity"]))
 
 
 def _decoded(text: str, path: Path) -> Float32[np.ndarray, "height width channels"]:
