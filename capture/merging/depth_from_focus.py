@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Int, UInt8
+from jaxtyping import Bool, Float32, Int
 
 from capture.merging.focus_volume import FocusVolume, Volume, share_above
 from capture.merging.lights import Lights
@@ -51,7 +51,6 @@ SURFACE_STEP = 1.5
 Costs = Float32[np.ndarray, "labels height width"]
 Plane = Float32[np.ndarray, "height width"]
 Labels = Int[np.ndarray, "height width"]
-Lights8 = UInt8[np.ndarray, "slices height width"]
 
 
 @dataclass(frozen=True)
@@ -78,7 +77,7 @@ def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "
     strongest = energies.max(axis=0)
     plain = _plainness(volume)
     detail = _without_rims(volume, energies, plain)
-    sharp = _sharp_light(detail, volume.lights)
+    sharp = _sharp_light(volume, detail)
     costs = _costs(detail, plain, sharp)
     _let_lights_decide(costs, volume.reduced(by_light), volume.reduced(lights.core))
     labels = aggregate_costs(costs, SMALL_STEP_COST, LARGE_STEP_COST).argmin(axis=0)
@@ -135,22 +134,27 @@ def _plainness(volume: FocusVolume) -> Plane:
 
 def _without_rims(volume: FocusVolume, energies: Volume, plain: Plane) -> Volume:
     """Return energies without those of the rims of blurred edges nearby."""
-    calm = [cv2.GaussianBlur(each.astype(np.float32), (0, 0), _LIGHT_SIGMA_PX) for each in volume.lights]
     share = np.float32(RIM_ENERGY / 255.0**2) / volume.noise
-    if len(calm) < FEWEST_SLICES_FOR_RIMS:
+    if len(energies) < FEWEST_SLICES_FOR_RIMS:
         share *= plain
-    result, last = np.empty_like(energies), len(calm) - 1
+
+    def calm(index: int) -> Plane:
+        return cv2.GaussianBlur(volume.lights[index].astype(np.float32), (0, 0), _LIGHT_SIGMA_PX)
+
+    result, last = np.empty_like(energies), len(energies) - 1
+    before = here = calm(0)
     for index, energy in enumerate(energies):
-        before, after = max(index - 1, 0), min(index + 1, last)
-        change = (calm[after] - calm[before]) / np.float32(after - before)
+        after = here if index == last else calm(index + 1)
+        change = (after - before) / np.float32(min(index + 1, last) - max(index - 1, 0))
         result[index] = energy * energy / (energy + share * change * change + np.float32(1e-9))
+        before, here = here, after
     return result
 
 
-def _sharp_light(energies: Volume, lights: Lights8) -> Plane:
+def _sharp_light(volume: FocusVolume, energies: Volume) -> Plane:
     """Return the mean light of all slices, each as far as its detail says that it is sharp."""
-    total, light = (np.zeros(energies.shape[1:], np.float32) for _ in range(2))
-    for energy, each in zip(energies, lights, strict=True):
+    total, light = (np.zeros(volume.size, np.float32) for _ in range(2))
+    for energy, each in zip(energies, volume.lights, strict=True):
         say = energy * energy
         total += say
         light += say * each
