@@ -101,7 +101,8 @@ def aggregate_costs(costs: Costs, small: float, large: float) -> Costs:
 def peak_parabola(log_energies: Volume, labels: np.ndarray) -> tuple[Plane, Plane]:
     """Return (offset in [-0.5, 0.5], curvature >= 0) of the parabola through each label and its two neighbours.
 
-    The first and last slice have a neighbour on one side only: their offset is 0 and their curvature half the drop to it.
+    The first and last slice have a neighbour on one side only: their offset is 0 and their curvature half the drop to it. Where the label
+    is in a hollow its offset is 0.
     """
     last = log_energies.shape[0] - 1
 
@@ -111,7 +112,7 @@ def peak_parabola(log_energies: Volume, labels: np.ndarray) -> tuple[Plane, Plan
     before, centre, after = at(labels - 1), at(labels), at(labels + 1)
     curvature = np.maximum(2 * centre - before - after, 0)
     interior = (labels > 0) & (labels < last)
-    offset = np.where(interior, 0.5 * (after - before) / np.maximum(curvature, 1e-3), 0.0)
+    offset = np.where(interior & (curvature > 0), 0.5 * (after - before) / np.maximum(curvature, 1e-3), 0.0)
     return np.clip(offset, -0.5, 0.5).astype(np.float32), np.where(interior, curvature, 0.5 * curvature).astype(np.float32)
 
 
@@ -138,16 +139,13 @@ def _without_rims(volume: FocusVolume, energies: Volume, plain: Plane) -> Volume
     if len(energies) < FEWEST_SLICES_FOR_RIMS:
         share *= plain
 
-    def calm(index: int) -> Plane:
-        return cv2.GaussianBlur(volume.lights[index].astype(np.float32), (0, 0), _LIGHT_SIGMA_PX)
-
     result, last = np.empty_like(energies), len(energies) - 1
-    before = here = calm(0)
     for index, energy in enumerate(energies):
-        after = here if index == last else calm(index + 1)
-        change = (after - before) / np.float32(min(index + 1, last) - max(index - 1, 0))
+        before, after = max(index - 1, 0), min(index + 1, last)
+        # A slice without data in a place tells of no change there.
+        lights = (np.where(volume.energies[each] > 0, volume.lights[each], volume.lights[index]) for each in (before, after))
+        change = cv2.GaussianBlur(np.subtract(*lights, dtype=np.float32), (0, 0), _LIGHT_SIGMA_PX) / np.float32(after - before)
         result[index] = energy * energy / (energy + share * change * change + np.float32(1e-9))
-        before, here = here, after
     return result
 
 

@@ -65,9 +65,10 @@ def retouch_scene(scene: Path, slices: Sequence[int], masks: Sequence[Path]) -> 
         white = each.share >= _HALF
         index, confidence = (np.full(white.shape, value, np.float32) for value in (each.index, PAINTED_CONFIDENCE))
         channels = replaced_depth(stack, channels, index, confidence, white)
-    records = [_record(stack, each) for each in wanted]
-    before = [each for each in retouches_of(stack) if each not in records]
-    changed = replace(stack, metadata=stack.metadata | {RETOUCHES: [*before, *records]})
+    listed = retouches_of(stack)
+    for record in (_record(stack, each) for each in wanted):
+        listed = [*(each for each in listed if each != record), record]
+    changed = replace(stack, metadata=stack.metadata | {RETOUCHES: listed})
     write_camera_rgb(stack.all_in_focus_path, picture, stack.rec709_from_camera, half=False)
     write_exr(stack.depth_path, replace(part, channels=channels), compress=False)
     write_readable_pictures(changed, picture)

@@ -74,7 +74,7 @@ def standing_on_pixel(layers: Sequence[Layer], plate: Plate, x_px: float, y_px: 
     The part of them that is at the pixel, or nearest to it, then lies as far as the photograph there. Raises InputError if none of them
     has a depth.
     """
-    surface_m = plate.point_under_pixel_m(x_px, y_px)[2]
+    surface_m = _under_pixel_m(plate, x_px, y_px)[2]
     whole = flatten(layers)
     rows, columns = np.nonzero((whole.alpha > _COVERED) & np.isfinite(whole.depth_m) & (whole.depth_m > 0))
     if not len(rows):
@@ -153,7 +153,7 @@ def objects_of(options: ObjectOptions, plate: Plate, shadow: float = 0.0) -> "li
 
     placed: list[OneObject] = []
     for each in options.each:
-        stands_at_m = typed_place_m(each.at) if each.at else _under_pixel_m(plate, each.at_pixel or "")
+        stands_at_m = typed_place_m(each.at) if each.at else _under_pixel_m(plate, *typed_pixel(each.at_pixel or ""))
         one = OneObject(
             glb=each.glb,
             stands_at_m=stands_at_m,
@@ -169,14 +169,11 @@ def objects_of(options: ObjectOptions, plate: Plate, shadow: float = 0.0) -> "li
     return placed
 
 
-def _under_pixel_m(plate: Plate, typed: str) -> tuple[float, float, float]:
+def _under_pixel_m(plate: Plate, x_px: float, y_px: float) -> tuple[float, float, float]:
     """Return the place that a pixel shows, and say where its depth is that of its surroundings."""
-    x_px, y_px = typed_pixel(typed)
     place_m = plate.point_under_pixel_m(x_px, y_px)
     if plate.is_depth_from_around(x_px, y_px):
-        guess(
-            f"nothing near pixel {x_px:g},{y_px:g} told its depth, {place_m[2]:.3g} m is that of its surroundings: choose one with detail"
-        )
+        guess(f"nothing near --at-pixel told its depth, so that {place_m[2]:.3g} m is that of its surroundings: choose a pixel with detail")
     return place_m
 
 

@@ -180,10 +180,11 @@ def _focused(lens: Lens, focus: float | tuple[float, float] | None, depth_m: Pla
 
 def focus_in_numbers(focus: object) -> list[float]:
     """Return a distance as one number, a pixel as two; InputError for what is neither."""
+    given = focus if isinstance(focus, tuple) else (focus,)
     try:
-        numbers = [float(each) for each in (focus if isinstance(focus, tuple) else (focus,))]  # type: ignore[arg-type]
+        numbers = [float(each) for each in given]  # type: ignore[arg-type]
     except (TypeError, ValueError):
         numbers = []
-    if len(numbers) != (2 if isinstance(focus, tuple) else 1):
-        raise InputError(f"focus: expected metres, or the pixel (x, y) to focus on, got {focus!r}")
+    if len(numbers) != 1 + isinstance(focus, tuple):
+        raise InputError(f"focus: expected metres, or the pixel to focus on as a tuple (x, y), got {focus!r}")
     return numbers

@@ -50,6 +50,7 @@ _DEVELOPED, _SHADOW_CONTRAST = (".jpg", ".jpeg", *HEIF_SUFFIXES), 1.3
 beside their RAW (from 1 to 50 % of white), and 1.4 by the light that was left in seven cast shadows of sunny days."""
 
 _NEAR_PX, _LEAST_CONFIDENCE = 15, 0.05
+"""Depth is taken from around where nothing so near has so much confidence: 4 to 10 % of three real stacks, all plain."""
 
 
 @dataclass(frozen=True)

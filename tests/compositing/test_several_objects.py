@@ -145,7 +145,7 @@ def test_a_foot_on_what_has_no_detail_is_told(capsys: pytest.CaptureFixture[str]
     for at_px, told in ((f"{WIDTH // 2 - 25},200", True), (f"{WIDTH // 2 - 10},200", False), ("280,200", False)):
         standing = replace(LEVEL, object_=[CAKE], at_pixel=[at_px], camera_height=None)
         objects_of(standing, plate)
-        assert (f"nothing near pixel {at_px} told its depth" in capsys.readouterr().out) == told
+        assert ("nothing near --at-pixel told its depth" in capsys.readouterr().out) == told
 
 
 PLACES = {"object_": [CAKE, ALIEN], "at_pixel": ["1,2", "3,4"]}

@@ -45,7 +45,7 @@ def test_render_is_the_renderer_of_that_name_with_the_focus_asked_for() -> None:
     np.testing.assert_array_equal(mb.render(picture, depth_m, LENS, focus=(50, 20), renderer="scatter"), on_the_post)
     np.testing.assert_array_equal(mb.render(picture, depth_m, LENS, focus=0.8, renderer=ScatterReference()), on_the_post)
     for wrong in ("near", ("a", "b"), (1.0, 2.0, 3.0)):
-        with pytest.raises(InputError, match="expected metres, or the pixel"):
+        with pytest.raises(InputError, match="expected metres, or the pixel to focus on"):
             focus_in_numbers(wrong)
     np.testing.assert_array_equal(mb.render(picture, depth_m, LENS, renderer="scatter"), ScatterReference().render([layer], LENS).rgb)
 

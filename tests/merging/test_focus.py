@@ -55,7 +55,7 @@ def test_energies_far_above_the_noise_are_kept() -> None:
     rng = np.random.default_rng(0)
     energies = rng.uniform(0.5, 1.5, (5, 20, 20)).astype(np.float32)
     energies[2, :, 10:] *= 1e6
-    even = np.ones((40, 40), np.float32)
+    even = np.ones((20, 20), np.float32)
     volume = FocusVolume(energies=energies, noise=even, lights=np.zeros(energies.shape, np.uint8), shape=(40, 40), details=())
     calmed = volume.calmed()
     np.testing.assert_allclose(calmed[2, :, 10:], energies[2, :, 10:], rtol=1e-3)
