@@ -22,7 +22,7 @@ from mrbokeh.system.errors import InputError
 _DEPTH = "{http://ns.google.com/photos/1.0/depthmap/}"
 _IMAGE = "{http://ns.google.com/photos/1.0/image/}"
 _FOCUS = "{http://ns.google.com/photos/1.0/focus/}"
-_NEAREST_M = 0.5
+_NEAREST_M = 1.0
 
 
 def google_photo(xmp: Mapping[str, str], path: Path, near_far_m: tuple[float, float] | None) -> PhonePhoto | None:

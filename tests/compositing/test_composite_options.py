@@ -110,7 +110,7 @@ def test_a_phones_photograph_brings_its_depth_and_its_sharp_original(shared_data
     # The lens is one with the blur that the phone put on: as GFocus states it, whatever the field of view.
     assert plate.lens.coc_px(np.inf, 768) == pytest.approx(2.0 * phone.focus.blur_at_infinity * 1024, rel=1e-6)
     assert plate.lens.focus_distance_m == phone.focus.focus_distance_m
-    assert 0.5 <= plate.depth_m.min() < plate.depth_m.max() <= 390.6 * 0.5 / 12.42, "within Near and Far of the file, Near at half a metre"
+    assert 1.0 <= plate.depth_m.min() < plate.depth_m.max() <= 390.6 / 12.42, "within Near and Far of the file, Near at a metre"
 
 
 def test_the_ground_never_hides_what_stands_on_it_and_a_post_before_it_does() -> None:

@@ -280,7 +280,7 @@ def test_a_real_phone_photograph_blurred_as_the_phone_says_is_what_the_phone_mad
     path = shared_data / "rgbd" / "phone_lens_blur_gdepth.jpg"
     phone, shown = read_phone_photo(path), linear_to_srgb(half_size(read_image(path)))
     assert phone is not None and phone.focus is not None and phone.original_rgb is not None
-    assert phone.depth.depth_m.min() == pytest.approx(14.915 * 0.5 / 12.4228, rel=5e-3), "a step of its 8 bits is 0.46 % there"
+    assert phone.depth.depth_m.min() == pytest.approx(14.915 / 12.4236, rel=5e-3), "a step of its 8 bits is 0.46 % there"
     height, width = shown.shape[:2]
     wanted = phone.focus.coc_px_per_dioptre(width, height)
     wide_open = Lens(50.0, 1.0, phone.focus.focus_distance_m, 36.0)
