@@ -14,7 +14,7 @@ from mrbokeh.commands._level_ground import focused_on_foot, held_as_told, held_t
 from mrbokeh.compositing.choose import best_mode, insertion_of, without_what_touches_the_lens
 from mrbokeh.compositing.ground import with_ground_behind
 from mrbokeh.compositing.near_and_far import nearer_than
-from mrbokeh.compositing.plate import Inserted, Insertion, Plate
+from mrbokeh.compositing.plate import LEAST_CONFIDENCE, Inserted, Insertion, Plate
 from mrbokeh.compositing.plate_look.finishing import Finishing, finished
 from mrbokeh.images.color import luminance
 from mrbokeh.images.layer import Layer
@@ -27,7 +27,7 @@ from mrbokeh.system.errors import InputError
 if TYPE_CHECKING:
     from mrbokeh.commands._composite_kept import KeptParts
 
-_NEARER, _MUCH_HIDDEN, _ALL_HIDDEN = 0.03, 0.4, 0.99
+_NEARER, _MUCH_HIDDEN, _ALL_HIDDEN, _GUESSED_HIDES = 0.03, 0.4, 0.99, 0.01
 _RASTER, _COLOURLESS = 200, 0.004
 
 
@@ -153,7 +153,10 @@ def placing_warning(sharp: Sequence[Layer], height: str) -> str | None:
 
 
 def hidden_warning(sharp: Sequence[Layer], plate: Plate, mode: str, much: float) -> str | None:
-    """Return a warning if more than a share of what is put in lies behind what the depth has before it, or all behind the matte."""
+    """Return a warning if more than a share of what is put in lies behind what the depth has before it, or all behind the matte.
+
+    Also where depth hides it that nothing told: such holes look torn.
+    """
     alpha = np.maximum.reduce([layer.alpha for layer in sharp])
     if not alpha.any():
         return None
@@ -162,7 +165,12 @@ def hidden_warning(sharp: Sequence[Layer], plate: Plate, mode: str, much: float)
     if plate.depth_m is None or mode == "front":
         return None
     depth_m = np.minimum.reduce([np.where(layer.alpha > 0.5, layer.depth_m, np.inf) for layer in sharp])
-    hidden = float(nearer_than(plate.depth_m, depth_m, _NEARER).sum() / max(1, np.isfinite(depth_m).sum()))
-    if hidden < much:
+    hides, whole = nearer_than(plate.depth_m, depth_m, _NEARER), max(1, int(np.isfinite(depth_m).sum()))
+    if (hidden := float(hides.sum() / whole)) >= much:
+        return f"{hidden:.0%} of it lies behind what the depth says is nearer; --mode front ignores depth"
+    if plate.depth_confidence is None:
         return None
-    return f"{hidden:.0%} of it lies behind what the depth says is nearer; --mode front ignores depth"
+    guessed = float((hides & (plate.depth_confidence < LEAST_CONFIDENCE)).sum() / whole)
+    if guessed < _GUESSED_HIDES:
+        return None
+    return f"{guessed:.0%} of it is hidden by depth that is a guess (grey in depth.png): --mode front ignores depth, --matte says better"

@@ -49,7 +49,7 @@ _DEVELOPED, _SHADOW_CONTRAST = (".jpg", ".jpeg", *HEIF_SUFFIXES), 1.3
 """Files that cameras write, and the slope of their tones over those of the light, both as logarithms: 1.14 to 1.36 in JPEGs of four cameras
 beside their RAW (from 1 to 50 % of white), and 1.4 by the light that was left in seven cast shadows of sunny days."""
 
-_NEAR_PX, _LEAST_CONFIDENCE = 15, 0.05
+_NEAR_PX, LEAST_CONFIDENCE = 15, 0.05
 """Depth is taken from around where nothing so near has so much confidence: 4 to 10 % of three real stacks, all plain."""
 
 
@@ -135,7 +135,7 @@ class Plate:
             return False
         top, left = max(int(y_px) - _NEAR_PX, 0), max(int(x_px) - _NEAR_PX, 0)
         near = self.depth_confidence[top : int(y_px) + _NEAR_PX + 1, left : int(x_px) + _NEAR_PX + 1]
-        return bool(near.max() < _LEAST_CONFIDENCE)
+        return bool(near.max() < LEAST_CONFIDENCE)
 
     def length_m(self, pixels: float, depth_m: float) -> float:
         """Return the length of what covers so many pixels upright at a depth, facing the camera."""

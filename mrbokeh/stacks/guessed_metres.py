@@ -87,7 +87,9 @@ def metres_line(stack: FocalStack) -> str:
     more = f"more in {stack.folder / FILE_NAME}"
     if stack.metres_known:
         return f"{stack.folder}: still guessed: {guesses(stack)} ({more})"
-    return f"{stack.folder}: metres are guessed; `mrbokeh capture scale --ruler` makes them known ({more})"
+    end = _guessed_end(stack)
+    nearest, turn = (f", the {end} slice nearest", ", --nearest turns them") if end else ("", "")
+    return f"{stack.folder}: metres are guessed{nearest}; `mrbokeh capture scale --ruler` makes them known{turn} ({more})"
 
 
 def guess_metres(stack: FocalStack) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from mrbokeh.commands._composite_layers import layers_by, objects_apart, objects_of
 from mrbokeh.commands._composite_options import CompositeOptions, ObjectOptions
-from mrbokeh.commands._composited import placed
+from mrbokeh.commands._composited import hidden_warning, placed
 from mrbokeh.commands._level_ground import on_level_ground
 from mrbokeh.compositing.plate import Plate, plate_of
 from mrbokeh.demo.plan import DATA
@@ -146,6 +146,19 @@ def test_a_foot_on_what_has_no_detail_is_told(capsys: pytest.CaptureFixture[str]
         standing = replace(LEVEL, object_=[CAKE], at_pixel=[at_px], camera_height=None)
         objects_of(standing, plate)
         assert ("nothing near --at-pixel told its depth" in capsys.readouterr().out) == told
+
+
+def test_holes_of_guessed_depth_are_told() -> None:
+    """A near block that nothing tells hides a quarter of what is put in; told by focus, it is no matter."""
+    alpha = np.zeros((HEIGHT, WIDTH), np.float32)
+    alpha[100:140, 100:140] = 1.0
+    card = Layer(np.zeros((HEIGHT, WIDTH, 3), np.float32), alpha, np.where(alpha > 0, np.float32(2.0), np.float32(np.inf)))
+    depth_m = np.full((HEIGHT, WIDTH), 3.0, np.float32)
+    depth_m[100:120, 100:120] = 1.0
+    plate = replace(plate_of(photograph().rgb, LENS, depth_m), depth_confidence=np.zeros((HEIGHT, WIDTH), np.float32))
+    assert "25% of it is hidden by depth that is a guess" in str(hidden_warning([card], plate, "between", 0.4))
+    assert hidden_warning([card], replace(plate, depth_confidence=np.full_like(alpha, 0.5)), "between", 0.4) is None
+    assert hidden_warning([card], plate, "front", 0.4) is None
 
 
 PLACES = {"object_": [CAKE, ALIEN], "at_pixel": ["1,2", "3,4"]}
