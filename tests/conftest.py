@@ -1,6 +1,7 @@
 """Shapes and types of array annotations are checked while tests run (jaxtyping + beartype); shared places of test data."""
 
 import contextlib
+import dataclasses
 import functools
 import gc
 import importlib
@@ -25,6 +26,7 @@ import tests
 PACKAGES = ("mrbokeh", "capture", "training", "viewfinder", "datasets_scripts")
 ROOT = Path(__file__).resolve().parent.parent
 SHARED_DATA = ROOT.parent / "shared" / "data"
+_AWAITS_OR_YIELDS = inspect.CO_GENERATOR | inspect.CO_COROUTINE | inspect.CO_ASYNC_GENERATOR
 
 
 def _modules() -> list[str]:
@@ -51,10 +53,10 @@ class _ChecksOfFirstCalls:
         def checked(decorated: Any) -> Any:
             if inspect.isfunction(decorated):
                 return self._checked_at_first(decorated, check)
-            plain = decorated.__dict__.get("__init__") if inspect.isclass(decorated) else None
-            decorated = check(decorated)
-            if plain is not None and decorated.__init__ is not plain:  # of a dataclass
-                decorated.__init__ = self._checked_at_first(plain, lambda _, always=decorated.__init__: always)
+            plain = decorated.__dict__.get("__init__") if dataclasses.is_dataclass(decorated) and inspect.isclass(decorated) else None
+            if plain is None:
+                return check(decorated)
+            decorated.__init__ = self._checked_at_first(plain, check)  # as jaxtyping does, but not before one is made
             return decorated
 
         return checked
@@ -68,12 +70,35 @@ class _ChecksOfFirstCalls:
             calls[0] += 1
             if calls[0] & (calls[0] - 1):
                 return plain(*args, **kwargs)
-            checked = checked or check(plain)
+            checked = checked or _checked(plain, check)
             return checked(*args, **kwargs)
 
         return either
 
 
+def _checked(plain: Callable[..., Any], check: Callable[..., Any]) -> Callable[..., Any]:
+    """Check a plain function once; jaxtyping prepares two of each, for its words: 7400 in three folders of tests, 4 s.
+
+    What fails is called again with those, which tell the shapes. Annotations in quotes and what awaits or yields are left to it.
+    """
+    if any(isinstance(each, str) for each in plain.__annotations__.values()) or plain.__code__.co_flags & _AWAITS_OR_YIELDS:
+        return check(plain)
+    from beartype.roar import BeartypeCallHintViolation
+
+    once = tests.checked(plain)  # type: ignore[misc]
+
+    def either(*args: Any, **kwargs: Any) -> Any:
+        try:
+            with _always_jaxtyped("context"):
+                return once(*args, **kwargs)
+        except BeartypeCallHintViolation:
+            check(plain)(*args, **kwargs)
+            raise
+
+    return either
+
+
+_always_jaxtyped = jaxtyping.jaxtyped
 if tests.checked is not None:
     jaxtyping.jaxtyped = _ChecksOfFirstCalls()
     jaxtyping.install_import_hook(_modules(), "tests.checked")

@@ -27,6 +27,7 @@ from mrbokeh.images.image_io import LINEAR_SUFFIXES, read_image
 from mrbokeh.system.errors import InputError
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+_LOOK_S = 0.02
 _FLAGS = ("--headless=new", "--no-sandbox", "--disable-gpu", "--enable-unsafe-swiftshader", "--remote-debugging-port=0", "--no-first-run")
 
 
@@ -64,11 +65,11 @@ class Page:
         return answer["result"].get("value")
 
     async def comes_true(self, expression: str, limit_s: float = 15.0) -> None:
-        for _ in range(int(limit_s / 0.05)):
+        for _ in range(int(limit_s / _LOOK_S)):
             with contextlib.suppress(NavigatedError):
                 if await self.value(expression):
                     return
-            await asyncio.sleep(0.05)
+            await asyncio.sleep(_LOOK_S)
         raise AssertionError(f"never true: {expression}; message: {await self.value('document.body.innerText')!r}; {self.errors}")
 
     async def size(self, width_px: int, height_px: int) -> None:
@@ -119,7 +120,7 @@ class Chromium:
         """Yield a page; it has touch and the size of a phone. script: runs before the page's own."""
         while not (self._told.exists() and len(told := self._told.read_text().split()) == 2):
             assert self._process.poll() is None, f"Chromium ended with {self._process.returncode}"
-            await asyncio.sleep(0.05)
+            await asyncio.sleep(_LOOK_S)
         address = f"ws://127.0.0.1:{told[0]}"
         async with aiohttp.ClientSession() as session, session.ws_connect(address + told[1], max_msg_size=0) as browser:
             devtools = Page(browser)

@@ -99,10 +99,11 @@ def test_pictures_that_show_no_depth_are_refused(place_m: tuple[float, float, fl
 
 
 def test_other_scenes_and_sizes_are_refused() -> None:
-    rgb, other = first()[0], np.random.default_rng(1).uniform(0.0, 1.0, (420, 600, 3)).astype(np.float32)
-    refused("too little in common", stereo_depth, rgb, cv2.GaussianBlur(other, (0, 0), 2.0), camera(), 0.1, PHOTOS)
-    refused("too little in common", stereo_depth, rgb, np.full_like(rgb, 0.2), camera(), 0.1, PHOTOS)
-    refused("expected two photographs of one camera", stereo_depth, rgb, other[:, :500], camera(), 0.1, PHOTOS)
+    rgb, other = halved(first()[0]), np.random.default_rng(1).uniform(0.0, 1.0, (210, 300, 3)).astype(np.float32)
+    seen_by = camera().resized(300, 210)
+    refused("too little in common", stereo_depth, rgb, cv2.GaussianBlur(other, (0, 0), 2.0), seen_by, 0.1, PHOTOS)
+    refused("too little in common", stereo_depth, rgb, np.full_like(rgb, 0.2), seen_by, 0.1, PHOTOS)
+    refused("expected two photographs of one camera", stereo_depth, rgb, other[:, :250], seen_by, 0.1, PHOTOS)
 
 
 def test_a_real_pair_has_the_depth_that_was_measured(shared_data: Path) -> None:

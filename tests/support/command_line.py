@@ -6,12 +6,19 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from functools import cache
 
 import pytest
 import typer
+import typer.testing
 from typer.testing import CliRunner
 
+from mrbokeh import cli
 from mrbokeh.cli import main
+
+# Commands are made once for all calls of a test run: their hundred options take as long as many a small picture.
+_made = cache(typer.main.get_command)
+_command_of = cache(cli.command_of)
 
 
 def mrbokeh(*arguments: object, **environment: str) -> subprocess.CompletedProcess[str]:
@@ -20,6 +27,7 @@ def mrbokeh(*arguments: object, **environment: str) -> subprocess.CompletedProce
     interrupt, code = signal.getsignal(signal.SIGINT), 0
     with pytest.MonkeyPatch.context() as patch, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         patch.setattr(sys, "argv", ["mrbokeh", *words])
+        patch.setattr(cli, "command_of", _command_of)
         for name, value in ({"COLUMNS": "200", "NO_COLOR": "1"} | environment).items():
             patch.setenv(name, value)
         try:
@@ -33,10 +41,16 @@ def mrbokeh(*arguments: object, **environment: str) -> subprocess.CompletedProce
 
 def printed_by(command: typer.Typer | Callable[..., None], *words: object, exit_code: int = 0, answer: str = "") -> str:
     """What a command prints on a wide terminal, which must end with this exit code; what it raises is raised here."""
-    app = command
-    if not isinstance(app, typer.Typer):
-        app = typer.Typer()
-        app.command()(command)
-    result = CliRunner().invoke(app, [str(each) for each in words], input=answer, env={"COLUMNS": "400"}, catch_exceptions=False)
+    app = command if isinstance(command, typer.Typer) else _app_of(command)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(typer.testing, "_get_command", _made)
+        result = CliRunner().invoke(app, [str(each) for each in words], input=answer, env={"COLUMNS": "400"}, catch_exceptions=False)
     assert result.exit_code == exit_code, result.output
     return result.output
+
+
+@cache
+def _app_of(command: Callable[..., None]) -> typer.Typer:
+    app = typer.Typer()
+    app.command()(command)
+    return app

@@ -84,7 +84,7 @@ on_desk_and_slowly_on_phones = pytest.mark.parametrize(
 )
 
 
-@pytest.mark.parametrize("size_px", [DESK, UPRIGHT, pytest.param(LEVEL, marks=pytest.mark.slow)], ids=["desk", "upright", "level"])
+@on_desk_and_slowly_on_phones
 async def test_an_object_is_placed_dragged_turned_focused_on_undone_and_saved(tmp_path: Path, size_px: tuple[int, int]) -> None:
     async with opened(tmp_path, size_px) as (page, made):
         assert "Choose an object" in await page.value("document.getElementById('badge').textContent")
@@ -414,7 +414,7 @@ async def test_what_is_in_front_is_painted(tmp_path: Path, size_px: tuple[int, i
         assert page.errors == []
 
 
-@pytest.mark.parametrize("size_px", [pytest.param(DESK, marks=pytest.mark.slow), LEVEL], ids=["desk", "level"])
+@pytest.mark.parametrize("size_px", [DESK, pytest.param(LEVEL, marks=pytest.mark.slow)], ids=["desk", "level"])
 async def test_lines_are_drawn_corrected_and_removed(tmp_path: Path, size_px: tuple[int, int]) -> None:
     """Two edges of tiles ahead and one across: the horizon lies in the middle of the picture, where the tilt had it elsewhere."""
     async with opened(tmp_path, size_px, StudioState(photo=write_floor(tmp_path / "floor.png"), pitch_deg=9.0)) as (page, made):
