@@ -1,7 +1,8 @@
 """Depth that Google's phones keep in a JPEG: GDepth with the sharp original (GImage) and where it was focused (GFocus), all in its XMP.
 
 developers.google.com/depthmap-metadata. RangeInverse: d = far near / (far - n (far - near)), linear in dioptres; RangeLinear: d = near +
-n (far - near); n is the number of the map in [0, 1]. Lens Blur has depth to an unknown scale: its nearest is put at _NEAREST_M.
+n (far - near); n is the number of the map in [0, 1]. Lens Blur has depth to an unknown scale: where
+its nearest would be farther than _FARTHEST_NEAR_M it is put at a metre.
 """
 
 import base64
@@ -22,7 +23,7 @@ from mrbokeh.system.errors import InputError
 _DEPTH = "{http://ns.google.com/photos/1.0/depthmap/}"
 _IMAGE = "{http://ns.google.com/photos/1.0/image/}"
 _FOCUS = "{http://ns.google.com/photos/1.0/focus/}"
-_NEAREST_M = 1.0
+_FARTHEST_NEAR_M = 3.0
 
 
 def google_photo(xmp: Mapping[str, str], path: Path, near_far_m: tuple[float, float] | None) -> PhonePhoto | None:
@@ -32,7 +33,7 @@ def google_photo(xmp: Mapping[str, str], path: Path, near_far_m: tuple[float, fl
     orientation, original = stored_orientation(path), xmp.get(_IMAGE + "Data")
     has_unit = near_far_m is not None or bool(xmp.get(_DEPTH + "Units"))
     near, far = near_far_m or _near_and_far(xmp, path)
-    scale = 1.0 if has_unit or near <= 0.0 else _NEAREST_M / near
+    scale = 1.0 if has_unit or near <= _FARTHEST_NEAR_M else 1.0 / near
     units = (
         "metres as stated"
         if near_far_m
