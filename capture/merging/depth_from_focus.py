@@ -39,6 +39,17 @@ RIM_ENERGY = 1.0
 FEWEST_SLICES_FOR_RIMS = 5
 # Light is compared over a few pixels of the volume.
 _LIGHT_SIGMA_PX = 3.0
+# Fine texture that is seen through the blurred rim of a thing has more fine detail than the thing's outline. So within so many pixels of
+# the volume of a jump by so many slices, detail of such sigmas has this share of the say: there the outline is sharp in its own slice.
+# Things narrower than _THIN_PX, as threads and hairs, have no rim of their own: with them, the wall beside threads was blurred.
+OUTLINE_REACH_PX = 10
+OUTLINE_JUMP = 2.0
+OUTLINE_SIGMAS_PX = (1.0, 2.0)
+OUTLINE_SAY = 0.3
+_THIN_PX = 11
+# Clipped lights have outlines in all slices: none are asked so near to this light, of 255.
+_LIT = 250
+_LIT_REACH_PX = 4
 # Pixels this near to one that is full see its clipped rim, not detail.
 SATURATION_REACH_PX = 5
 # Where the log energy bends by this much at its peak it tells depth as well as it can.
@@ -81,6 +92,8 @@ def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "
     costs = _costs(detail, plain, sharp)
     _let_lights_decide(costs, volume.reduced(by_light), volume.reduced(lights.core))
     labels = aggregate_costs(costs, SMALL_STEP_COST, LARGE_STEP_COST).argmin(axis=0)
+    if len(costs) >= FEWEST_SLICES_FOR_RIMS:
+        labels = aggregate_costs(_with_outlines(costs, volume, labels), SMALL_STEP_COST, LARGE_STEP_COST).argmin(axis=0)
     offset, _ = peak_parabola(np.log1p(energies, out=energies), labels)
     # In plain places the label is not the peak of the pixel's own energies.
     offset += plain * (peak_parabola(np.negative(costs, out=costs), labels)[0] - offset)
@@ -172,6 +185,28 @@ def _costs(energies: Volume, plain: Plane, sharp_light: Plane) -> Volume:
             cost += say * cv2.resize(each, size, interpolation=cv2.INTER_LINEAR)
         left -= say
     return costs
+
+
+def _with_outlines(costs: Volume, volume: FocusVolume, labels: Labels) -> Volume:
+    """Return costs in which coarser detail has its say beside jumps of the labels."""
+    calm = cv2.medianBlur(np.minimum(labels, 255).astype(np.uint8), _THIN_PX).astype(np.float32)
+    reach, lit_reach = (cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * px + 1,) * 2) for px in (OUTLINE_REACH_PX, _LIT_REACH_PX))
+    asked = cv2.dilate(calm, reach) - cv2.erode(calm, reach) > OUTLINE_JUMP
+    asked &= cv2.dilate(volume.lights.max(axis=0), lit_reach) < _LIT
+    mixed = np.stack([_coarse_detail(each.astype(np.float32)) for each in volume.lights])
+    noise = float(np.percentile(mixed[:, ::3, ::3], 5.0)) + 1e-3
+    say = np.float32(OUTLINE_SAY) * asked * share_above(mixed.max(axis=0), LABELLING_NOISE_FLOORS * noise)
+    mixed /= np.float32(CONFIDENCE_NOISE_FLOORS * noise)
+    mixed = _below_strongest(np.log1p(mixed, out=mixed))
+    mixed -= costs
+    mixed *= say
+    mixed += costs
+    return mixed
+
+
+def _coarse_detail(light: Plane) -> Plane:
+    fine, coarse = (cv2.GaussianBlur(light, (0, 0), sigma) for sigma in OUTLINE_SIGMAS_PX)
+    return cv2.GaussianBlur(np.square(fine - coarse), (0, 0), OUTLINE_SIGMAS_PX[0])
 
 
 def _wider(energies: Volume, shrink: int, sharp_light: Plane) -> Float32[np.ndarray, "slices rows columns"]:

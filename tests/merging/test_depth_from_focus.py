@@ -187,7 +187,7 @@ def test_the_tip_of_a_plain_leaf_is_not_overruled_by_the_ground_behind_it() -> N
     for index in range(8):
         disc = disc_kernel(4.0 * abs(index - 1) + 0.5)
         alpha = cv2.filter2D(leaf, -1, disc)[..., None]
-        behind = cv2.filter2D(ground, -1, disc_kernel(4.0 * abs(index - 6) + 0.5))
+        behind = cv2.filter2D(ground, -1, disc_kernel(8.0 * abs(index - 6) + 0.5))
         blurred = alpha * cv2.filter2D(colour, -1, disc) + (1.0 - alpha) * behind
         slices.append(np.maximum(blurred + rng.normal(0.0, 0.003, blurred.shape), 0.0).astype(np.float32))
     focus_index = focus_map(focus_volume(slices), no_lights((240, 320))).focus_index
@@ -195,3 +195,25 @@ def test_the_tip_of_a_plain_leaf_is_not_overruled_by_the_ground_behind_it() -> N
     tip[:120] = False
     # Measured 1.0; with Gaussian windows that see past the rim of the leaf 0.25.
     assert (np.abs(focus_index[tip] - 1.0) < 1.0).mean() > 0.95
+
+
+def test_a_dull_thing_before_fine_texture_keeps_its_outline() -> None:
+    """A dark board that is sharp in slice 6, in front of bright grains that are sharp in slice 2 and show through its blurred rim."""
+    rng = np.random.default_rng(6)
+    board = np.zeros((200, 320), np.float32)
+    board[:, :150] = 1.0
+    grains = np.clip(0.2 + 0.12 * rng.normal(0.0, 1.0, (200, 320, 1)), 0.02, 1.0).astype(np.float32).repeat(3, axis=2)
+    grains = cv2.GaussianBlur(grains, (0, 0), 0.7)
+    dull = np.full((200, 320, 3), 0.04, np.float32)
+    slices = []
+    for index in range(9):
+        rim = disc_kernel(8.0 * abs(index - 6) + 0.5)
+        alpha = cv2.filter2D(board, -1, rim)[..., None]
+        behind = cv2.filter2D(grains, -1, disc_kernel(5.0 * abs(index - 2) + 0.5))
+        root = np.sqrt(alpha * dull + (1.0 - alpha) * behind) + rng.normal(0.0, 0.012, grains.shape)
+        slices.append(np.square(np.maximum(root, 0.0)).astype(np.float32))
+    volume = focus_volume(slices)
+    picture = sharp_all_in_focus(lambda: slices, focus_map(volume, no_lights((200, 320))).focus_index, volume)
+    step, own = (each[154] - each[146] for each in (np.sqrt(rgb).mean(axis=(0, 2)) for rgb in (picture, slices[6])))
+    # Measured 0.93 of the step over 8 px that the board's own slice has; without the say of coarser detail 0.82.
+    assert step > 0.9 * own
