@@ -35,7 +35,7 @@ FEWEST_SLICES_FOR_WIDER = 3
 # At focus light stands still from slice to slice; the rim of a blurred edge comes with as much change of light as it has curvature (heat
 # equation): energy may be that of a rim up to so many times the square of the change, in square roots of light per slice.
 RIM_ENERGY = 1.0
-# In fewer slices light changes with leaves in the wind or the exposure: it tells of rims in plain places only.
+# In fewer slices light changes with leaves in the wind or the exposure: it tells of rims in plain places only, and outlines are not asked.
 FEWEST_SLICES_FOR_RIMS = 5
 # Light is compared over a few pixels of the volume.
 _LIGHT_SIGMA_PX = 3.0

@@ -1,8 +1,8 @@
 """Depth that Google's phones keep in a JPEG: GDepth with the sharp original (GImage) and where it was focused (GFocus), all in its XMP.
 
 developers.google.com/depthmap-metadata. RangeInverse: d = far near / (far - n (far - near)), linear in dioptres; RangeLinear: d = near +
-n (far - near); n is the number of the map in [0, 1]. Lens Blur has depth to an unknown scale: where
-its nearest would be farther than _FARTHEST_NEAR_M it is put at a metre.
+n (far - near); n is the number of the map in [0, 1]. Lens Blur has depth to an unknown scale: where its nearest would be farther than
+_FARTHEST_NEAR_M it is put at a metre.
 """
 
 import base64
@@ -37,7 +37,7 @@ def google_photo(xmp: Mapping[str, str], path: Path, near_far_m: tuple[float, fl
     units = (
         "metres as stated"
         if near_far_m
-        else xmp.get(_DEPTH + "Units") or "no unit, the nearest is guessed; --disparity NEAR:FAR says better"
+        else xmp.get(_DEPTH + "Units") or "no unit, its metres are guessed; --disparity NEAR:FAR says better"
     )
     stored = _depth(xmp, path, (scale * near, scale * far), units)
     depth = replace(stored, depth_m=upright(stored.depth_m, orientation), valid=upright(stored.valid, orientation))
