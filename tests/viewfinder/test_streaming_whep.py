@@ -117,8 +117,10 @@ async def test_what_is_no_offer_and_what_cannot_be_served_is_refused_with_a_sent
     await viewer.peer.close()
 
 
-async def test_names_that_only_multicast_resolves_are_not_waited_for() -> None:
+async def test_names_that_only_multicast_resolves_are_not_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     """Chromium's .local names cost a second each way; none of these resolves. The connection stands nevertheless, on loopback."""
+    asked: list[str] = []
+    monkeypatch.setattr("aioice.mdns.MDnsProtocol.resolve", lambda _self, name, *_rest: asked.append(name))
     with streaming() as stream, Feed(stream):
         async with whep_of(stream) as (whep, url), aiohttp.ClientSession() as session:
             viewer = Viewer()
@@ -127,14 +129,13 @@ async def test_names_that_only_multicast_resolves_are_not_waited_for() -> None:
             named = re.sub(r"(a=candidate:(?:\S+ ){4})\S+", r"\1nobody-has-this-name.local", sdp)
             assert named.count(".local ") == sdp.count("a=candidate:") > 0
             one_of_them = re.findall(r"a=candidate:.*\r\n", named)[0]
-            started_s = time.perf_counter()
             async with session.post(f"{url}/whep", data=named, headers=SDP) as answer:
                 await viewer.peer.setRemoteDescription(RTCSessionDescription(await answer.text(), "answer"))
                 place = url + answer.headers["Location"]
             headers = {"Content-Type": "application/trickle-ice-sdpfrag"}
             async with session.patch(place, data="a=mid:0\r\n" + one_of_them, headers=headers) as later:
                 assert later.status == 204
-            assert time.perf_counter() - started_s < 0.9, "less than aioice waits for one name"
+            assert not asked
             (connection,) = whep._viewers.values()
             known = connection.track.sender.transport.transport.getRemoteCandidates()
             assert {each.ip for each in known if each.type == "host"} == {"127.0.0.1"}
