@@ -35,6 +35,10 @@ _COARSE_REACHES_PX, _FINE_REACHES_PX = (8, 8), (4,)
 _SMOOTHNESS, _CONTRAST, _LEAST_TRUST, _WHITE = 13_000.0, 2.0 / 255.0, np.float32(1e-4), 99.5
 _SAME_SURFACE, _LARGEST_SHARE = 1.5, 0.5
 """Depth is evened out by so many jumps at most, and this share of its range: what differs by more is something of its own."""
+_GUESSED, _GUESSED_AROUND, _AROUND_PX = 0.05, 0.1, 21
+"""A place is a guess below this confidence, or where that around it is below this in the mean: it may be evened out by any amount, and what
+confidence there is among guesses counts less. Plain walls beside near things had the depth of these and cut holes into objects before
+them. Traced: mean error 11 % less in one stack, 1 % more in the other; off by 0.3 dioptres are 2.3 and 0.1 % of it, were 3.2 and 0.2."""
 
 
 def with_edges_of_light(focus: FocusMap, sharp_rgb: Rgb, near_first: bool) -> FocusMap:
@@ -71,9 +75,10 @@ def _moved(nearness: Plane, rgb: Rgb, trusted: Mask, jump: float, reaches_px: Se
 
 
 def _evened(index: Plane, confidence: Plane, rgb: Rgb, most: float) -> Plane:
-    """Return the index as its confident places say, up to edges of the picture, and changed by so much at most."""
+    """Return the index as its confident places say, up to edges of the picture; what is no guess is changed by so much at most."""
     root = np.sqrt(np.maximum(rgb, np.float32(0.0)))
     guide = np.minimum(root / np.float32(max(np.percentile(root[::4, ::4], _WHITE), 1e-6)), np.float32(1.0))
-    even = interpolate(index, np.maximum(confidence, _LEAST_TRUST), guide, _SMOOTHNESS, _CONTRAST)
+    around = np.minimum(cv2.blur(confidence, (_AROUND_PX, _AROUND_PX)) / np.float32(_GUESSED_AROUND), np.float32(1.0))
+    even = interpolate(index, np.maximum(confidence * around * around, _LEAST_TRUST), guide, _SMOOTHNESS, _CONTRAST)
     even = np.clip(even, index.min(), index.max())
-    return np.where(np.abs(even - index) <= most, even, index)
+    return np.where((confidence < _GUESSED) | (around < 1.0) | (np.abs(even - index) <= most), even, index)

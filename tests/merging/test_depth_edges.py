@@ -39,6 +39,18 @@ def test_two_slices_are_not_evened_out_into_one() -> None:
     """A far surface that is sure would draw an unsure near one of nearly its colour over to itself."""
     near = disc((120, 160))
     rgb = np.where(near[..., None], (0.30, 0.31, 0.30), (0.31, 0.30, 0.30)).astype(np.float32)
-    focus = FocusMap((~near).astype(np.float32), np.where(near, np.float32(0.02), np.float32(1.0)))
+    focus = FocusMap((~near).astype(np.float32), np.where(near, np.float32(0.12), np.float32(1.0)))
     found = with_edges_of_light(focus, rgb, near_first=True).focus_index
     assert found[near].max() < 0.5
+
+
+def test_a_plain_wall_beside_a_near_thing_has_the_depth_of_its_detail_farther_off() -> None:
+    """What the wall beside the thing was taken for is a guess; crumbs of confidence in the middle of it change nothing."""
+    near = disc((240, 320))
+    guess = disc((240, 320), 40) & ~near
+    crumb = disc((240, 320), 25) & ~disc((240, 320), 15) & (np.indices(near.shape) % 11 == 0).all(axis=0)
+    index = np.where(near | guess, np.float32(1.0), np.float32(7.0))
+    confidence = np.where(guess & ~crumb, 0.0, np.where(crumb, 0.2, 0.8)).astype(np.float32)
+    rgb = np.where(near[..., None], RED, GREEN).astype(np.float32)
+    found = with_edges_of_light(FocusMap(index, confidence), rgb, near_first=True).focus_index
+    assert found[guess].min() > 6.0 and (found[near] > 2.0).mean() < 0.001
