@@ -36,9 +36,12 @@ _SMOOTHNESS, _CONTRAST, _LEAST_TRUST, _WHITE = 13_000.0, 2.0 / 255.0, np.float32
 _SAME_SURFACE, _LARGEST_SHARE = 1.5, 0.5
 """Depth is evened out by so many jumps at most, and this share of its range: what differs by more is something of its own."""
 _GUESSED, _GUESSED_AROUND, _AROUND_PX = 0.05, 0.1, 21
-"""A place is a guess below this confidence, or where that around it is below this in the mean: it may be evened out by any amount, and what
-confidence there is among guesses counts less. Plain walls beside near things had the depth of these and cut holes into objects before
-them. Traced: mean error 11 % less in one stack, 1 % more in the other; off by 0.3 dioptres are 2.3 and 0.1 % of it, were 3.2 and 0.2."""
+"""A place is a guess below this confidence, or where that around it is below this in the mean: it may be evened out by any amount. Plain
+walls beside near things had the depth of these, and cut holes into objects before them."""
+_OUTLINE_PX, _OUTLINE_SHARE = 15, 0.02
+"""What is left of the rims of near things lies on the farther surface. So of the confidence of near places beside farther ones only this
+share counts for all places but these themselves. Traced (a desk of RAW, two rooms, checkers and a fence before walls), with both of
+these the mean error is 7, 5, 18, 7 and 6 % less, and no more pixels are on the wrong side beside edges."""
 
 
 def with_edges_of_light(focus: FocusMap, sharp_rgb: Rgb, near_first: bool) -> FocusMap:
@@ -47,9 +50,9 @@ def with_edges_of_light(focus: FocusMap, sharp_rgb: Rgb, near_first: bool) -> Fo
     nearness = sign * focus.focus_index
     low, high = np.percentile(nearness[::4, ::4], _RANGE)
     jump = max(_JUMP * float(high - low), _LEAST_JUMP)
-    index = sign * _from_coarse_to_fine(nearness, sharp_rgb, focus.confidence > _TRUSTED, jump)
+    nearness = _from_coarse_to_fine(nearness, sharp_rgb, focus.confidence > _TRUSTED, jump)
     most = min(_SAME_SURFACE * jump, _LARGEST_SHARE * float(high - low))
-    return replace(focus, focus_index=_evened(index, focus.confidence, sharp_rgb, most))
+    return replace(focus, focus_index=sign * _evened(nearness, focus.confidence, sharp_rgb, jump, most))
 
 
 def _from_coarse_to_fine(nearness: Plane, rgb: Rgb, trusted: Mask, jump: float) -> Plane:
@@ -74,11 +77,16 @@ def _moved(nearness: Plane, rgb: Rgb, trusted: Mask, jump: float, reaches_px: Se
     return np.where(grown(now != hard, _RAMP_PX), now, nearness)
 
 
-def _evened(index: Plane, confidence: Plane, rgb: Rgb, most: float) -> Plane:
-    """Return the index as its confident places say, up to edges of the picture; what is no guess is changed by so much at most."""
+def _evened(nearness: Plane, confidence: Plane, rgb: Rgb, jump: float, most: float) -> Plane:
+    """Return nearness as its confident places say, up to edges of the picture; what is no guess is changed by so much at most."""
     root = np.sqrt(np.maximum(rgb, np.float32(0.0)))
     guide = np.minimum(root / np.float32(max(np.percentile(root[::4, ::4], _WHITE), 1e-6)), np.float32(1.0))
     around = np.minimum(cv2.blur(confidence, (_AROUND_PX, _AROUND_PX)) / np.float32(_GUESSED_AROUND), np.float32(1.0))
-    even = interpolate(index, np.maximum(confidence * around * around, _LEAST_TRUST), guide, _SMOOTHNESS, _CONTRAST)
-    even = np.clip(even, index.min(), index.max())
-    return np.where((confidence < _GUESSED) | (around < 1.0) | (np.abs(even - index) <= most), even, index)
+    rim, outline = (nearness - cv2.erode(nearness, np.ones((px, px), np.uint8)) > jump for px in (_AROUND_PX, _OUTLINE_PX))
+    say = confidence * around * around
+    even, far = (
+        interpolate(nearness, np.maximum(each, _LEAST_TRUST), guide, _SMOOTHNESS, _CONTRAST)
+        for each in (say, np.where(rim, np.float32(_OUTLINE_SHARE) * say, say))
+    )
+    even = np.clip(np.where(outline, even, far), nearness.min(), nearness.max())
+    return np.where((confidence < _GUESSED) | (around < 1.0) | (np.abs(even - nearness) <= most), even, nearness)
