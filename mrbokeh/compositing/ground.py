@@ -68,17 +68,21 @@ def with_ground_behind(plate: Plate, feet_px: Sequence[Pixel], layers: Sequence[
     """Return the plate with the ground on which things stand no nearer than those, where it is seen above their feet.
 
     A floor or a table is the farther the higher it is in the picture, so that it never hides what stands on it; depth that says otherwise
-    is wrong. The ground is what goes on from a foot without a jump of depth, but not below the foot, where near things stand, nor what is
-    clearly nearer than the foot although it is higher: that stands before the object.
+    is wrong. The ground is what goes on from a foot without a jump of depth, but not what is clearly nearer than the foot although it is
+    higher (in a stack by more than lies between two slices): that stands before the object. Below the foot, where near things stand, it is
+    only what is nearer than the object by no more than the depth may be off.
     """
     if plate.depth_m is None:
         return plate
     covered_m = np.minimum.reduce([np.where(layer.alpha > 0.0, layer.depth_m, np.inf) for layer in layers])
-    ground, calm_m = np.zeros(covered_m.shape, bool), _calm(plate.depth_m)
-    for foot_px in feet_px:
-        above = np.broadcast_to(np.arange(len(covered_m))[:, None] <= int(foot_px[1]), covered_m.shape)
-        above = above & (calm_m > np.float32(1.0 - _STANDS_BEFORE) * calm_m[int(foot_px[1]), int(foot_px[0])])
-        ground |= _same_surface(plate.depth_m, foot_px, above, _SAME_SURFACE) & np.isfinite(covered_m)
+    ground, calm_m, error = np.zeros(covered_m.shape, bool), _calm(plate.depth_m), plate.depth_error_dioptres
+    as_near = 1.0 / calm_m - 1.0 / covered_m < np.float32(error)
+    for x_px, y_px in feet_px:
+        foot_m = float(calm_m[int(y_px), int(x_px)])
+        before = min(_STANDS_BEFORE, 1.0 - 1.0 / (1.0 + 2.0 * error * foot_m)) if error else _STANDS_BEFORE
+        is_above = np.arange(len(covered_m))[:, None] <= int(y_px)
+        within = np.where(is_above, calm_m > np.float32((1.0 - before) * foot_m), as_near)
+        ground |= _same_surface(plate.depth_m, (x_px, y_px), within, _SAME_SURFACE) & np.isfinite(covered_m)
     return replace(plate, depth_m=np.where(ground, np.maximum(plate.depth_m, covered_m), plate.depth_m))
 
 

@@ -60,6 +60,7 @@ class Plate:
     rgb: (H, W, 3) linear, blurred by the real lens. depth_m: (H, W) of the sharp scene or None. lens: as focused for this photograph.
     sharp_rgb: (H, W, 3) the same view all in focus (of a focal stack), in the colours of rgb, or None.
     depth_confidence: (H, W) in [0, 1], of a focal stack: 0 where nothing there told the depth, which is then that of its surroundings.
+    depth_error_dioptres: how far the depth of a focal stack may be off: half of what lies between two of its slices.
     near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects: sharp where its distance is known
     (by depth or told), else as the photograph shows it; NaN where depth is to tell; or None.
     alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
@@ -81,6 +82,7 @@ class Plate:
     camera: Camera
     sharp_rgb: Float32[np.ndarray, "height width 3"] | None = None
     depth_confidence: Float32[np.ndarray, "height width"] | None = None
+    depth_error_dioptres: float = 0.0
     near_alpha: Float32[np.ndarray, "height width"] | None = None
     alpha: Float32[np.ndarray, "height width"] | None = None
     metres_guessed: bool = False
@@ -344,7 +346,7 @@ def bundle_plate(bundle: CaptureBundle, lens: Lens | None = None, focus_m: float
 def with_depth(plate: Plate, source: Path, settings: DepthSettings) -> Plate:
     """The plate with depth from a file, or from a network that looks at its sharpest picture."""
     depth = open_depth(source, plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb, settings)
-    return replace(plate, depth_m=depth.depth_m, depth_confidence=None)
+    return replace(plate, depth_m=depth.depth_m, depth_confidence=None, depth_error_dioptres=0.0)
 
 
 def with_stereo(
@@ -409,6 +411,8 @@ def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus
     upright = replace(camera, camera_from_world=np.eye(4))
     depth_m, confidence = stack.depth_planes("Z", "confidence")
     plate = Plate(rgb=rgb, depth_m=depth_m, lens=focused, camera=upright, sharp_rgb=stack.all_in_focus(), depth_confidence=confidence)
+    steps = np.abs(np.diff([1.0 / stack.lens_of(index).focus_distance_m for index in range(len(stack))]))
+    plate = replace(plate, depth_error_dioptres=0.5 * float(np.median(steps)) if len(steps) else 0.0)
     return replace(plate, metres_guessed=not stack.metres_known, slopes_known=stack.metres_known, blur_from=blur_from)
 
 

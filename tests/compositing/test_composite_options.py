@@ -134,6 +134,21 @@ def test_the_ground_never_hides_what_stands_on_it_and_a_post_before_it_does() ->
     np.testing.assert_array_equal(hidden[80:], whole[80:])
 
 
+def test_depth_of_a_stack_hides_only_by_more_than_it_may_be_off() -> None:
+    """A table at one depth, with an error of 0.05 dioptres below the foot and a step of 0.1 above it, and slices 0.12 dioptres apart."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
+    ramp = np.clip((columns - WIDTH / 2) / 40.0, 0.0, 1.0)
+    below_m, above_m = 1.0 / (0.5 + 0.05 * ramp), 1.0 / (0.5 + 0.16 * ramp)
+    alpha = ((rows >= 30) & (rows <= 90)).astype(np.float32)
+    card = Layer(np.repeat(alpha[..., None], 3, axis=2), alpha, np.where(alpha > 0, 2.0, np.inf).astype(np.float32))
+    lens = replace(LENS, focus_distance_m=2.0)
+    plate = plate_of(plate_rgb(), lens, np.where(rows > 70, below_m, above_m).astype(np.float32))
+    for error, is_seen_below in ((0.06, True), (0.04, False)):
+        stack = with_ground_behind(replace(plate, depth_error_dioptres=error), [(10, 70)], [card])
+        seen = insertion_of("over").insert(stack, [card], ScatterReference()).rgb.min(axis=2) > 0.95
+        assert seen[80, WIDTH - 10] == is_seen_below and not seen[50, WIDTH - 10] and seen[50, 10] and seen[80, 10]
+
+
 def test_blur_stays_when_depth_is_told_in_metres() -> None:
     """A phone's depth of 10 to 40 units, focused at 16, is told to be 1 to 20 m: dioptres go from 0.1..0.025 to 1..0.05."""
     units = np.linspace(10.0, 40.0, HEIGHT * WIDTH, dtype=np.float32).reshape(HEIGHT, WIDTH)
