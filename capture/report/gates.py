@@ -37,6 +37,7 @@ LARGEST_DEPTH_SHARE = 0.05
 LARGEST_MOVING = 0.02
 LARGEST_SATURATED = 0.02
 LARGEST_BEYOND = 0.25
+LARGEST_MIDWAY = 0.005
 LEAST_CORRELATION = 0.8
 LARGEST_JUMP = 0.01
 LEAST_TRUSTED = 0.2
@@ -288,6 +289,13 @@ SATURATION = Rule(
 )
 
 
+SOLVED_SPACING = replace(
+    SPACING,
+    limit=f"what lies midway between two slices blurred by at most {LARGEST_MIDWAY:.1%} of the width in both",
+    advice="Take the photographs that lie between these two into the stack, or refocus only where slices are near each other.",
+)
+
+
 SOLVED_FOCUS = replace(
     FOCUS,
     advice="Focus was solved from the slices, as not all of it is stated: it errs where blur is large or texture is missing. "
@@ -338,6 +346,12 @@ def by_use(gates: Sequence[Gate]) -> dict[str, list[Gate]]:
 
 
 def verdict_line(use: str, gates: Sequence[Gate]) -> str:
-    """Return one line: which gates passed, which failed and which were not judged."""
-    names = {verdict: list(dict.fromkeys(each.name for each in gates if each.verdict is verdict)) for verdict in Verdict}
+    """Return one line: which gates passed, which failed and which were not judged; of one that did both, where."""
+    alike = {name for name, count in Counter(name for name, _ in {(each.name, each.verdict) for each in gates}).items() if count == 1}
+    names = {
+        verdict: list(
+            dict.fromkeys(each.name if each.name in alike else f"{each.name} ({each.where})" for each in gates if each.verdict is verdict)
+        )
+        for verdict in Verdict
+    }
     return f"{use}: " + "; ".join(f"{verdict}: {', '.join(which)}" for verdict, which in names.items() if which)

@@ -11,7 +11,7 @@ from capture.report.findings import SliceFindings, StackFindings
 from capture.report.gates import Gate, Rule
 from capture.report.registration_check import NeighbourDisplacement
 from capture.report.slice_fit import Change
-from mrbokeh.stacks.guessed_metres import metres_facts
+from mrbokeh.stacks.guessed_metres import SLICE_POSITION, metres_facts
 
 
 def stack_gates(findings: StackFindings) -> list[Gate]:
@@ -113,6 +113,13 @@ def _pair_residuals_px(findings: StackFindings, measured: Sequence[NeighbourDisp
 
 
 def _spacing(findings: StackFindings) -> Gate:
+    positions_px = [each.metadata.get(SLICE_POSITION) for each in findings.stack.slices]
+    if len(positions_px) > 1 and None not in positions_px:
+        midway = 0.5 * np.abs(np.diff(np.array(positions_px, np.float64))) / findings.full_size_px[0]
+        first = int(midway.argmax())
+        measured = f"midway between slices {first} and {first + 1} all is blurred by {midway[first] * findings.full_size_px[0]:.1f} px"
+        largest = float(midway[first])
+        return rules.SOLVED_SPACING.judge(findings.name, largest, f"{measured} ({largest:.2%})", largest <= rules.LARGEST_MIDWAY)
     spacing = findings.spacing
     if spacing is None:
         return rules.SPACING.absent(findings.name, "focus distances are unknown: add focus_distances_m to lens.toml and ingest again")

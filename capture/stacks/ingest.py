@@ -25,6 +25,7 @@ from capture.stacks.slice_files import reporting_full_disk
 from capture.stacks.stack_description import FEWEST_TO_MERGE, StackReport, finish_stack, finished_before, ingest_digest, lens_text
 from capture.stacks.stack_ingest import Development, StackWork, stack_work
 from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.stacks.guessed_metres import STATED_DISTANCE, is_lens_guessed
 from mrbokeh.system.channel import say, show, warn
 from mrbokeh.system.console import progress_bars
 from mrbokeh.system.errors import InputError
@@ -180,8 +181,9 @@ def _some_names(paths: Sequence[Path]) -> str:
 
 
 def focus_text(stack: FocalStack) -> str:
-    """Return the range of focus distances: "0.4 .. 2.1 m", "... inf", "unknown"."""
-    known = [distance for distance in stack.focus_distances_m if distance is not None]
+    """Return the range of the focus distances that are stated: "0.4 .. 2.1 m", "... inf", "unknown"."""
+    stated = (each.metadata.get(STATED_DISTANCE, each.focus_distance_m) for each in stack.slices)
+    known = [float(distance) for distance in stated if distance is not None]
     if not known:
         return "unknown"
     ends = [f"{distance:.4g}" if math.isfinite(distance) else "inf" for distance in (min(known), max(known))]
@@ -195,4 +197,5 @@ def _cells(report: StackReport) -> tuple[str, ...]:
         return report.name, "none", "", "", "", skipped
     kept = f" ({report.kept} from before)" if report.kept else ""
     size = f"{report.size_px[0]}x{report.size_px[1]}"
-    return report.name, f"{len(report.stack)}{kept}", size, focus_text(report.stack), lens_text(report.stack.lens), skipped
+    lens = None if is_lens_guessed(report.stack) else report.stack.lens
+    return report.name, f"{len(report.stack)}{kept}", size, focus_text(report.stack), lens_text(lens), skipped

@@ -10,7 +10,8 @@ from mrbokeh.commands._insertion_options import ANY_LENS, ANY_RENDERER, FocusAtO
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.refocus import Refocusing
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
-from mrbokeh.system.channel import guess, tell
+from mrbokeh.stacks.guessed_metres import unit_of
+from mrbokeh.system.channel import guess, tell, warn
 from mrbokeh.system.errors import InputError
 
 app = typer.Typer(add_completion=False)
@@ -70,7 +71,7 @@ def refocus(
     from mrbokeh.images.image_io import require_suffix
     from mrbokeh.stacks.focal_stack import read_focal_stack, write_focal_stack
     from mrbokeh.stacks.focus_places import FocusLookup, parse_focus
-    from mrbokeh.stacks.guessed_metres import growth_note, guess_metres, inherited_facts, unit_of
+    from mrbokeh.stacks.guessed_metres import growth_note, guess_metres, inherited_facts
     from mrbokeh.system.atomic_files import require_safe_outputs
     from mrbokeh.system.console import kept_when_interrupted
 
@@ -91,6 +92,7 @@ def refocus(
     distances_m = parse_focus(str(focus), seen)
     guess_metres(source)
     guess(growth_note(source, way.lens))
+    _tell_of_focus_beyond(source, distances_m)
     _make_room(out, result.overwrite)
     settings = {"stack": str(stack.resolve()), **vars(blur), **facts.given, "lens": str(blur.lens)}
     with kept_when_interrupted(f"finished slices are kept in {out}", result.overwrite):
@@ -105,6 +107,18 @@ def refocus(
     told = f"wrote {out} ({len(slices)} slice{'' if len(slices) == 1 else 's'}, in focus at {focused} {unit_of(source)} from the lens)"
     lens_facts, figures = (way.lens_at(distances_m[0]).facts, {"focus_distances_m": distances_m}) if source.metres_known else ({}, {})
     tell(told, known=lens_facts, slices=len(slices), **figures)
+
+
+def _tell_of_focus_beyond(source: FocalStack, distances_m: tuple[float, ...]) -> None:
+    """Warn of focus at which no slice is: nothing that the depth knows is sharp there."""
+    ends_m = [each for each in source.focus_distances_m if each is not None]
+    near_m, far_m = min(ends_m), max(ends_m)
+    # Half a step beyond an end, depth from focus still reaches.
+    margin = 0.5 * (1.0 / near_m - 1.0 / far_m) / max(1, len(ends_m) - 1)
+    beyond = [each for each in distances_m if not 1.0 / far_m - margin <= 1.0 / each <= 1.0 / near_m + margin]
+    if beyond:
+        named = ", ".join(f"{each:.3g}" for each in beyond)
+        warn(f"{named} {unit_of(source)}: hardly anything is sharp there, beyond the slices focused at {near_m:.3g} to {far_m:.3g}")
 
 
 def _write_sharp(source: FocalStack, made: FocalStack, distances_m: tuple[float, ...]) -> None:
@@ -178,7 +192,6 @@ def _growth(way: Refocusing, distance_m: float) -> dict:
 
 def _write_sheet(path: Path, made: FocalStack) -> None:
     from mrbokeh.images.image_io import SheetRow, write_contact_sheet
-    from mrbokeh.stacks.guessed_metres import unit_of
 
     pictures = {f"{each.focus_distance_m:.5g} {unit_of(made)}": made.slice_rgb(index) for index, each in enumerate(made.slices)}
     write_contact_sheet(path, [SheetRow("focus", pictures)])

@@ -234,7 +234,11 @@ def write_focal_stack(stack: FocalStack) -> None:
 def read_focal_stack(folder: Path | str) -> FocalStack:
     """Read the stack in a folder; pictures are not opened. Raises InputError if the folder is not one."""
     folder = Path(folder)
-    require_file(folder / FILE_NAME, "a focal stack", ": make one of photographs by `mrbokeh capture process PHOTOGRAPHS --out SCENE`")
+    within = " or ".join(str(each.parent) for each in sorted(folder.glob(f"*/{FILE_NAME}")))
+    advice = (
+        f"give {within}, which lies in it" if within else "make one of photographs by `mrbokeh capture process PHOTOGRAPHS --out SCENE`"
+    )
+    require_file(folder / FILE_NAME, "a focal stack", f": {advice}")
     document = read_json(folder / FILE_NAME, "a focal stack")
     if document.get("format") != FORMAT or document.get("version") != VERSION:
         raise InputError(

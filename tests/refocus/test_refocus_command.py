@@ -142,7 +142,10 @@ def test_residuals_gain_on_a_traced_stack(tmp_path: Path) -> None:
 
 def test_the_command_writes_a_focal_stack(tmp_path: Path) -> None:
     stack = card_stack(tmp_path / "stack")
-    run(stack.folder, "--focus", "0.52,0.55,inf", "--out", tmp_path / "new", "--renderer", "scatter", "--sheet", tmp_path / "sheet.png")
+    refused(f"give {stack.folder}, which lies in it", run, tmp_path, "--focus", "0.52", "--out", tmp_path / "new")
+    words = ("--out", tmp_path / "new", "--renderer", "scatter", "--sheet", tmp_path / "sheet.png")
+    said = run(stack.folder, "--focus", "0.52,0.55,inf", *words)
+    assert "inf m: hardly anything is sharp there" in said and "0.52, inf" not in said
     made = read_focal_stack(tmp_path / "new")
     assert made.focus_distances_m == (0.52, 0.55, float("inf")) and made.merged
     np.testing.assert_array_equal(made.slice_rgb(1), stack.slice_rgb(1))

@@ -14,6 +14,7 @@ from capture.commands.report import report_command
 from capture.poses.sparse_model import SparseModel, SparseView, write_sparse_model
 from capture.report.exclusion import REASONS, Disagreement, board_mask, exclusion_masks, moving
 from capture.report.findings import SliceFindings, StackFindings, focus_curve, focus_spacing
+from capture.report.gates import Verdict, verdict_line
 from capture.report.picture_sharpness import PictureFindings
 from capture.report.registration_check import drift_of
 from capture.report.scene_gates import Reconstruction, scales_in, scene_gates
@@ -28,6 +29,7 @@ from mrbokeh.layering.layering import Layering
 from mrbokeh.optics.camera import Camera
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
+from mrbokeh.stacks.guessed_metres import SLICE_POSITION
 from mrbokeh.system.atomic_files import write_json
 from tests.support.command_line import printed_by
 from tests.support.traced_focal_stack import FOCUS_M, traced, write_stack
@@ -162,6 +164,22 @@ def test_registration_and_spacing_are_read() -> None:
     np.testing.assert_allclose(drift.magnification, [1, 1, 1.01])
     assert drift.largest_jump_px == pytest.approx(np.hypot(3, 1))
     assert drift.least_correlation == 0.7 and drift.width_px == 160
+
+
+def test_steps_of_a_solved_focus_are_judged_by_the_blur_that_they_leave(scene: Path) -> None:
+    """Two slices at one place lose nothing; 2 px apart all between them is blurred by 1 px or more, 0.6 % of 160 px."""
+    stack = read_focal_stack(scene / "view_0")
+    picture, found = PictureFindings(None, None, 1.0, 1.0, (160, 107)), tuple(SliceFindings(index, 1.0, 0.0, 1.0) for index in range(6))
+    curve = focus_curve(np.zeros((4, 4), np.float32), np.ones((4, 4), np.float32), 6)
+    for step_px, passes in ((1.5, True), (2.0, False)):
+        positions_px = np.array([0.0, 0.0, 1.0, 1.0 + step_px, 2.0 + step_px, 3.0 + step_px])
+        slices = tuple(replace(each, metadata={SLICE_POSITION: float(at)}) for each, at in zip(stack.slices, positions_px, strict=True))
+        of_stack = StackFindings(replace(stack, slices=slices), (160, 107), (160, 107), found, curve, None, None, picture, ())
+        gate = next(each for each in stack_gates(of_stack) if each.name == "no slice missing")
+        assert gate.failed != passes and gate.measured.startswith("midway between slices 2 and 3") and gate.value == step_px / 320
+        other = replace(gate, where="other", verdict=Verdict.PASSED if gate.failed else Verdict.FAILED)
+        assert verdict_line("use", [gate, replace(gate, where="other")]) == f"use: {gate.verdict}: no slice missing"
+        assert "no slice missing (view_0)" in verdict_line("use", [gate, other])
 
 
 def test_movement_is_not_judged_from_three_slices(scene: Path) -> None:
