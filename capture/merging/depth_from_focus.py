@@ -93,7 +93,9 @@ def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "
     _let_lights_decide(costs, volume.reduced(by_light), volume.reduced(lights.core))
     labels = aggregate_costs(costs, SMALL_STEP_COST, LARGE_STEP_COST).argmin(axis=0)
     if len(costs) >= FEWEST_SLICES_FOR_RIMS:
-        labels = aggregate_costs(_with_outlines(costs, volume, labels), SMALL_STEP_COST, LARGE_STEP_COST).argmin(axis=0)
+        beside = _outlines(labels)
+        if beside.any():
+            labels = aggregate_costs(_with_outlines(costs, volume, beside), SMALL_STEP_COST, LARGE_STEP_COST).argmin(axis=0)
     offset, _ = peak_parabola(np.log1p(energies, out=energies), labels)
     # In plain places the label is not the peak of the pixel's own energies.
     offset += plain * (peak_parabola(np.negative(costs, out=costs), labels)[0] - offset)
@@ -187,12 +189,17 @@ def _costs(energies: Volume, plain: Plane, sharp_light: Plane) -> Volume:
     return costs
 
 
-def _with_outlines(costs: Volume, volume: FocusVolume, labels: Labels) -> Volume:
-    """Return costs in which coarser detail has its say beside jumps of the labels."""
+def _outlines(labels: Labels) -> Bool[np.ndarray, "height width"]:
+    """Return what is beside jumps of the labels, but for thin things."""
     calm = cv2.medianBlur(np.minimum(labels, 255).astype(np.uint8), _THIN_PX).astype(np.float32)
-    reach, lit_reach = (cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * px + 1,) * 2) for px in (OUTLINE_REACH_PX, _LIT_REACH_PX))
-    asked = cv2.dilate(calm, reach) - cv2.erode(calm, reach) > OUTLINE_JUMP
-    asked &= cv2.dilate(volume.lights.max(axis=0), lit_reach) < _LIT
+    reach = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * OUTLINE_REACH_PX + 1,) * 2)
+    return cv2.dilate(calm, reach) - cv2.erode(calm, reach) > OUTLINE_JUMP
+
+
+def _with_outlines(costs: Volume, volume: FocusVolume, outlines: Bool[np.ndarray, "height width"]) -> Volume:
+    """Return costs in which coarser detail has its say beside jumps of the labels."""
+    lit_reach = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * _LIT_REACH_PX + 1,) * 2)
+    asked = outlines & (cv2.dilate(volume.lights.max(axis=0), lit_reach) < _LIT)
     mixed = np.stack([_coarse_detail(each.astype(np.float32)) for each in volume.lights])
     noise = float(np.percentile(mixed[:, ::3, ::3], 5.0)) + 1e-3
     say = np.float32(OUTLINE_SAY) * asked * share_above(mixed.max(axis=0), LABELLING_NOISE_FLOORS * noise)
@@ -210,11 +217,15 @@ def _coarse_detail(light: Plane) -> Plane:
 
 
 def _wider(energies: Volume, shrink: int, sharp_light: Plane) -> Float32[np.ndarray, "slices rows columns"]:
-    """Return energies averaged over wider windows that end at edges of light, smaller by `shrink` or more."""
+    """Return energies averaged over wider windows that end at edges of light, smaller by `shrink` or more.
+
+    Strong texture counts there no more than detail that speaks for itself, or it would reach over faint detail of another surface.
+    """
     height, width = energies.shape[1:]
     step = max(1.0, np.sqrt(height * width / WIDER_FROM_PX)) * shrink
     size = tuple(max(1, int(np.ceil(each / step))) for each in (width, height))
-    guide, *small = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (sharp_light, *energies))
+    share = np.float32(LABELLING_NOISE_FLOORS) / (np.float32(LABELLING_NOISE_FLOORS) + energies.max(axis=0))
+    guide, *small = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (sharp_light, *(share * each for each in energies)))
     return np.stack([cv2.ximgproc.dtFilter(guide, each, WIDER_REACH, WIDER_EDGE) for each in small])
 
 
