@@ -184,6 +184,7 @@ class Progress:
 
     pictures: drawn so far, by all processes together.
     best_psnr_db, best_step: of the best look at held-out slices; looks_since_best: how many came after it.
+    sharp_psnr_db: of the all-in-focus picture against the same slices, before any blur.
     points_due: parts of the budget noted in the curve so far.
     best_loss: the smallest smoothed one; steps_above: steps in a row that it is far above that.
     kept_step: of the finished network's weights; stopped_early: before the budget was used, for lack of improvement.
@@ -196,6 +197,7 @@ class Progress:
     best_psnr_db: float = -math.inf
     best_step: int = 0
     looks_since_best: int = 0
+    sharp_psnr_db: float = math.nan
     points_due: int = 0
     best_loss: float = math.inf
     steps_above: int = 0

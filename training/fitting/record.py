@@ -39,10 +39,12 @@ class Look:
     """A look at held-out slices.
 
     psnr_db: mean over slices, of linear radiance clipped to [0, 1] where the truth is known; nan if nothing is held out.
+    sharp_db: the same of the all-in-focus picture, before any blur.
     rows: for a sheet: the sharp picture, the network's prediction, and the photograph.
     """
 
     psnr_db: float
+    sharp_db: float = math.nan
     rows: tuple[SheetRow, ...] = ()
 
 
@@ -61,16 +63,17 @@ class HeldOutSlices:
     def look(self, network: torch.nn.Module, device: torch.device) -> Look:
         """Score and show the slices in full precision, whatever the training's."""
         scored = [self._scored(index, network, device) for index in self._chosen]
-        return Look(float(np.mean([value for value, _ in scored])) if scored else math.nan, tuple(row for _, row in scored))
+        found_db, sharp_db = (float(np.mean(each)) if scored else math.nan for each in ([s[0] for s in scored], [s[1] for s in scored]))
+        return Look(found_db, sharp_db, tuple(row for *_, row in scored))
 
-    def _scored(self, index: int, network: torch.nn.Module, device: torch.device) -> tuple[float, SheetRow]:
+    def _scored(self, index: int, network: torch.nn.Module, device: torch.device) -> tuple[float, float, SheetRow]:
         tiled = getattr(network, "grid", None) is not None
         batch = stack_pairs([self._pairs[index] if tiled else _middle(self._pairs[index])]).to(device)
         result = network(batch.rgb, batch.coc_px, batch.place, batch.lens)
         psnr_db = _psnr_db(result, batch)
         pictures = {"sharp": batch.rgb, f"network {psnr_db:.2f} dB": result, "photograph": batch.target}
         small = {caption: small_picture(picture[0].permute(1, 2, 0).cpu().numpy()) for caption, picture in pictures.items()}
-        return psnr_db, SheetRow(self._pairs.label(index), small)
+        return psnr_db, _psnr_db(batch.rgb, batch), SheetRow(self._pairs.label(index), small)
 
 
 def _middle(pair: Pair) -> Pair:
@@ -158,6 +161,7 @@ class Record:
     def look(self) -> bool:
         """Look at held-out slices and tell whether patience is exhausted."""
         look = self._task.held_out.look(self._learner.average, self._learner.device)
+        self._progress.sharp_psnr_db = look.sharp_db
         if self._progress.looked(look.psnr_db):
             self._learner.keep_best()
         self.note(look.psnr_db)
