@@ -23,8 +23,8 @@ _SCALES_PX = (0.8, 2.0)
 _CELL_PX = 12
 _KEPT = 0.05
 """The given order stays unless another is better by this share of what slices in no order cost."""
-_CLEAR = 0.2
-"""An order that costs more than this share is no clear one."""
+_CLEAR, _CLEARLY_BETTER = 0.2, 0.5
+"""An order that costs more than the first share, and more than the second one of what the given order costs, is no clear one."""
 _NOISE_PERCENTILE = 5.0
 _MOST_CELLS = 3000
 _MOST_STARTS = 8
@@ -168,8 +168,8 @@ def focus_order(read_rgb: Callable[[int], Rgb], count: int) -> tuple[int, ...]:
         return given
     violations = violations_of([detail_map(read_rgb(index)) for index in range(count)])
     best = best_order(violations)
-    gain = gain_of(violations, given, best)
-    if gain < _KEPT or cost_of(violations, best) > _CLEAR * violations.sum() / 6.0:
+    unclear = max(_CLEAR * violations.sum() / 6.0, _CLEARLY_BETTER * cost_of(violations, given))
+    if gain_of(violations, given, best) < _KEPT or cost_of(violations, best) > unclear:
         return given
     return tuple(best if _rises(best) else best[::-1])
 
