@@ -66,6 +66,7 @@ _NOISE = 0.01
 """Light below 0 that noise of a camera explains."""
 _MOST_CHANGE, _LEAST_PART = 3.0, 0.02
 _UNEXPLAINED = 0.5
+_HARDLY_FREE = (0.02, 0.12)
 Colours = Float32[np.ndarray, "places 3"]
 Shares = Float32[np.ndarray, " places"]
 Exact = Float64[np.ndarray, " places"]
@@ -137,7 +138,7 @@ def _far_light(
     far = surfaces + before
     # Where hardly anything gets past the near, its share is rounding: a faint shadow would take all that the near does not explain.
     least = 1.0 - np.minimum(rays.most_covering.reshape(-1)[places], 1.0)[:, None]
-    return _explained(photo_rgb, near_rgb, far), np.clip((surfaces * stays + after) / np.maximum(far, _ROUND), least, 1.0)
+    return _explained(photo_rgb, near_rgb, far, free), np.clip((surfaces * stays + after) / np.maximum(far, _ROUND), least, 1.0)
 
 
 def _least_around(alpha: Plane) -> Plane:
@@ -154,11 +155,16 @@ def _colour_change(means: PupilMeans) -> Colours:
     return np.where(enough, np.clip(change, 1.0 / _MOST_CHANGE, _MOST_CHANGE), np.float32(1.0))
 
 
-def _explained(photo_rgb: Colours, near_rgb: Colours, far_rgb: ExactColours) -> ExactColours:
-    """Return the far light of the photograph: what was blurred anew, and its share, by the squares of both, of what that leaves over."""
+def _explained(photo_rgb: Colours, near_rgb: Colours, far_rgb: ExactColours, free: Exact) -> ExactColours:
+    """Return the far light of the photograph: what was blurred anew, and its share, by the squares of both, of what that leaves over.
+
+    Much that is left over is far light, but hardly where next to nothing of the pupil looks past the near things: there it is theirs, as
+    their sharp picture may lie beside them (letters on a post, photographed from the hand, were torn to pieces).
+    """
     left_over = photo_rgb - near_rgb - far_rgb
     far_share = far_rgb**2 / np.maximum(far_rgb**2 + near_rgb**2, _ROUND)
-    far_share = np.where(left_over > _UNEXPLAINED * (near_rgb + far_rgb), 1.0, far_share)
+    past = np.clip((free - _HARDLY_FREE[0]) / (_HARDLY_FREE[1] - _HARDLY_FREE[0]), 0.0, 1.0)[:, None]
+    far_share = np.where(left_over > _UNEXPLAINED * (near_rgb + far_rgb), past, past * far_share)
     return np.clip(far_rgb + left_over * far_share, 0.0, np.maximum(photo_rgb, 0.0))
 
 
