@@ -23,7 +23,7 @@ from jaxtyping import Float, Float32
 from capture.merging.merged_pictures import write_readable_pictures
 from capture.merging.preferred_side import PREFERRED
 from capture.merging.retouch import RETOUCHES
-from capture.merging.second_pass import DEPTH_SOURCE, SliceOptics, first_pass_path, keep_first_pass, second_pass
+from capture.merging.second_pass import SliceOptics, first_pass_path, keep_first_pass, second_pass
 from capture.poses.colmap_job import JOB_NAME, MODEL_FOLDER, RECONSTRUCTION_FOLDER, job_from_json
 from capture.poses.sparse_model import SparseModel, SparseView, read_sparse_model
 from mrbokeh.depth.views.dense_depth import DenseDepth, DenseSettings, dense_depth
@@ -34,7 +34,7 @@ from mrbokeh.figures.stack_pictures import write_merge_sheet
 from mrbokeh.images.camera_rgb import read_camera_rgb
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.optics.camera import Camera
-from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks, write_focal_stack, write_merged
+from mrbokeh.stacks.focal_stack import DEPTH_SOURCE, FocalStack, find_focal_stacks, write_focal_stack, write_merged
 from mrbokeh.system.atomic_files import read_json
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError

@@ -40,8 +40,8 @@ _GUESSED, _GUESSED_AROUND, _AROUND_PX = 0.05, 0.1, 21
 walls beside near things had the depth of these, and cut holes into objects before them."""
 _RIM_SHARE = 0.02
 """What is left of the rims of near things lies on the farther surface. So of the confidence of near places beside farther ones only this
-share counts for all places but these themselves. Traced (a desk of RAW, two rooms, checkers and a fence before walls), with both of
-these the mean error is 7, 5, 24, 14 and 20 % less."""
+share counts for all places but these themselves. Traced (a desk of RAW, two rooms, checkers and a fence before walls), with guesses and
+rims so treated the mean error is 7, 5, 24, 14 and 20 % less."""
 
 
 def with_edges_of_light(focus: FocusMap, sharp_rgb: Rgb, near_first: bool) -> FocusMap:
@@ -52,7 +52,14 @@ def with_edges_of_light(focus: FocusMap, sharp_rgb: Rgb, near_first: bool) -> Fo
     jump = max(_JUMP * float(high - low), _LEAST_JUMP)
     nearness = _from_coarse_to_fine(nearness, sharp_rgb, focus.confidence > _TRUSTED, jump)
     most = min(_SAME_SURFACE * jump, _LARGEST_SHARE * float(high - low))
-    return replace(focus, focus_index=sign * _evened(nearness, focus.confidence, sharp_rgb, jump, most))
+    around = np.minimum(cv2.blur(focus.confidence, (_AROUND_PX, _AROUND_PX)) / np.float32(_GUESSED_AROUND), np.float32(1.0))
+    guessed = (focus.confidence < _GUESSED) | (around < 1.0)
+    if high - low <= 1.0:  # of two slices the surer one would take all
+        guessed[:] = False
+    elif focus.lit is not None:
+        guessed &= ~focus.lit
+    even = _evened(nearness, focus.confidence * around * around, sharp_rgb, guessed, jump)
+    return replace(focus, focus_index=sign * np.where(guessed | (np.abs(even - nearness) <= most), even, nearness))
 
 
 def _from_coarse_to_fine(nearness: Plane, rgb: Rgb, trusted: Mask, jump: float) -> Plane:
@@ -77,15 +84,13 @@ def _moved(nearness: Plane, rgb: Rgb, trusted: Mask, jump: float, reaches_px: Se
     return np.where(grown(now != hard, _RAMP_PX), now, nearness)
 
 
-def _evened(nearness: Plane, confidence: Plane, rgb: Rgb, jump: float, most: float) -> Plane:
-    """Return nearness as its confident places say, up to edges of the picture; what is no guess is changed by so much at most."""
+def _evened(nearness: Plane, says: Plane, rgb: Rgb, guessed: Mask, jump: float) -> Plane:
+    """Return nearness as places say, each as far as it may, up to edges of the picture."""
     root = np.sqrt(np.maximum(rgb, np.float32(0.0)))
     guide = np.minimum(root / np.float32(max(np.percentile(root[::4, ::4], _WHITE), 1e-6)), np.float32(1.0))
-    window = (_AROUND_PX, _AROUND_PX)
-    around = np.minimum(cv2.blur(confidence, window) / np.float32(_GUESSED_AROUND), np.float32(1.0))
-    guessed = (confidence < _GUESSED) | (around < 1.0)
-    rim = nearness - cv2.erode(nearness, np.ones(window, np.uint8)) > jump
-    says = confidence * around * around, confidence * around * around * np.where(rim, np.float32(_RIM_SHARE), np.float32(1.0))
-    even, beyond = (interpolate(nearness, np.maximum(say, _LEAST_TRUST), guide, _SMOOTHNESS, _CONTRAST) for say in says)
-    even = np.clip(np.where(rim & ~guessed, even, beyond), nearness.min(), nearness.max())
-    return np.where(guessed | (np.abs(even - nearness) <= most), even, nearness)
+    even = interpolate(nearness, np.maximum(says, _LEAST_TRUST), guide, _SMOOTHNESS, _CONTRAST)
+    rim = nearness - cv2.erode(nearness, np.ones((_AROUND_PX, _AROUND_PX), np.uint8)) > jump
+    if rim.any():
+        without_rims = np.maximum(np.where(rim, np.float32(_RIM_SHARE) * says, says), _LEAST_TRUST)
+        even = np.where(rim & ~guessed, even, interpolate(nearness, without_rims, guide, _SMOOTHNESS, _CONTRAST))
+    return np.clip(even, nearness.min(), nearness.max())

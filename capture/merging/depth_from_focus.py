@@ -69,11 +69,13 @@ class FocusMap:
     """Depth from focus, as slice indices.
 
     focus_index: (H, W) fractional index of the slice in which the surface is sharp.
-    confidence: (H, W) in [0, 1], 0 where the index is a guess from the surroundings.
+    confidence: (H, W) in [0, 1], 0 where the index is a guess from the surroundings, and in the reach of lights.
+    lit: (H, W) of lights, whose index is measured although they have no confidence; None without any.
     """
 
     focus_index: Plane
     confidence: Plane
+    lit: Bool[np.ndarray, "height width"] | None = None
 
 
 def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "height width"] | None = None) -> FocusMap:
@@ -104,7 +106,7 @@ def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "
     trust = volume.enlarged(trust) * _share_of_one_surface(index)
     confidence = np.where(vetoed(by_light, saturated), 0.0, trust).astype(np.float32)
     index[lights.core] = lights.focus_index[lights.zone[lights.core] - 1]
-    return FocusMap(index, confidence)
+    return FocusMap(index, confidence, lights.core if lights.core.any() else None)
 
 
 def aggregate_costs(costs: Costs, small: float, large: float) -> Costs:
@@ -224,7 +226,7 @@ def _wider(energies: Volume, shrink: int, sharp_light: Plane) -> Float32[np.ndar
     height, width = energies.shape[1:]
     step = max(1.0, np.sqrt(height * width / WIDER_FROM_PX)) * shrink
     size = tuple(max(1, int(np.ceil(each / step))) for each in (width, height))
-    share = np.float32(LABELLING_NOISE_FLOORS) / (np.float32(LABELLING_NOISE_FLOORS) + energies.max(axis=0))
+    share = 1.0 - share_above(energies.max(axis=0), LABELLING_NOISE_FLOORS)
     guide, *small = (cv2.resize(each, size, interpolation=cv2.INTER_AREA) for each in (sharp_light, *(share * each for each in energies)))
     return np.stack([cv2.ximgproc.dtFilter(guide, each, WIDER_REACH, WIDER_EDGE) for each in small])
 

@@ -25,13 +25,13 @@ from capture.merging.registration.registration_file import FILE_NAME as REGISTRA
 from capture.merging.registration.registration_file import Registration, read_registration, write_registration
 from capture.merging.restored_lights import RestoredLight, known_opening, restored_lights, with_restored_lights
 from capture.merging.retouch import RETOUCHES
-from capture.merging.second_pass import DEPTH_SOURCE, FIRST_PASS_FOLDER, FROM_FOCUS, SliceOptics
+from capture.merging.second_pass import FIRST_PASS_FOLDER, SliceOptics
 from capture.stacks.slice_files import reporting_full_disk, stated_by_sentinel
 from mrbokeh.figures.stack_pictures import depth_codes, write_merge_sheet
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
-from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks, write_focal_stack, write_merged
+from mrbokeh.stacks.focal_stack import DEPTH_SOURCE, FROM_FOCUS, FocalStack, find_focal_stacks, write_focal_stack, write_merged
 from mrbokeh.stacks.guessed_metres import is_near_first
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError

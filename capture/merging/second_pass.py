@@ -40,9 +40,6 @@ LARGEST_COC_PX = 12.0
 BLOCKED_COST_PX = 6.0
 LARGEST_BLOCKED_SHARE = 0.8
 FIRST_PASS_FOLDER = "first_pass"
-DEPTH_SOURCE = "depth_source"
-"""Key in a stack's metadata: where depth.exr and all_in_focus.exr come from; FROM_FOCUS after merging."""
-FROM_FOCUS = "focus"
 
 Plane = Float32[np.ndarray, "height width"]
 Rgb = Float32[np.ndarray, "height width 3"]

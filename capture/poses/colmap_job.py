@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 
 from capture.merging.metres.relative_stack import as_stated
-from capture.poses.lens_calibration import stated_distances_m
 from mrbokeh.images.color import luminance
 from mrbokeh.images.image_io import write_preview
 from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.stacks.guessed_metres import stated_distances_m
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 

@@ -16,7 +16,7 @@ import numpy as np
 from capture.merging.merged_pictures import depth_m_of
 from capture.merging.metres.known_metres import with_known_nearest, write_changed_metres
 from mrbokeh.stacks.focal_stack import GROWTH, GROWTH_WIDTH, FocalStack, Slice, find_focal_stacks, write_focal_stack
-from mrbokeh.stacks.guessed_metres import STATED_DISTANCE, is_near_first
+from mrbokeh.stacks.guessed_metres import STATED_DISTANCE, is_near_first, stated_distances_m
 from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError
 
@@ -115,12 +115,6 @@ def focused_stack(stack: FocalStack, slices: Sequence[Slice]) -> FocalStack:
     """Return the stack with these slices and its lens focused as in its reference."""
     changed = replace(stack, slices=tuple(slices))
     return changed if changed.lens is None else replace(changed, lens=changed.stated_lens_of(changed.reference))
-
-
-def stated_distances_m(stack: FocalStack) -> tuple[float | None, ...]:
-    """Return the distances stated by the camera or the user, also after a calibration has replaced them."""
-    stated = (each.metadata.get(STATED_DISTANCE, each.focus_distance_m) for each in stack.slices)
-    return tuple(None if each is None else float(each) for each in stated)
 
 
 def lens_model_of(stack: FocalStack) -> str | None:

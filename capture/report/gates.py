@@ -8,6 +8,8 @@ from focus. 7 % leaves twice that, and is below a tenth.
 
 The gates that need no lens were set on 14 real stacks. Registered slices, measured where both are sharp, lie 0.0 to 0.6 px apart
 (standard errors 0.01 to 0.4); those of a phone held by hand 1.4 px at a width of 1600. 1 px tells them apart, and is what one sees at 100%.
+Between slices of 62 real stacks, most of them light fields, what lies midway is blurred by 0.1 to 1.4 % of the width, and by less than
+0.5 % (5 px of 1080, which one sees at 100%) in 50 of them.
 Where too little is sharp in both, what is left is how far pairs of the registration disagree at a corner: at most 0.17% of the width on 30
 stacks from a light field camera, whose slices cannot move, and 0.25% on others, but 0.4% on one of these whose slices were put 1% apart.
 """
@@ -291,7 +293,7 @@ SATURATION = Rule(
 
 SOLVED_SPACING = replace(
     SPACING,
-    limit=f"what lies midway between two slices blurred by at most {LARGEST_MIDWAY:.1%} of the width in both",
+    limit=f"what lies midway between the focus of two slices blurred by at most {LARGEST_MIDWAY:.1%} of the width",
     advice="Take the photographs that lie between these two into the stack, or refocus only where slices are near each other.",
 )
 
@@ -346,12 +348,13 @@ def by_use(gates: Sequence[Gate]) -> dict[str, list[Gate]]:
 
 
 def verdict_line(use: str, gates: Sequence[Gate]) -> str:
-    """Return one line: which gates passed, which failed and which were not judged; of one that did both, where."""
-    alike = {name for name, count in Counter(name for name, _ in {(each.name, each.verdict) for each in gates}).items() if count == 1}
-    names = {
-        verdict: list(
-            dict.fromkeys(each.name if each.name in alike else f"{each.name} ({each.where})" for each in gates if each.verdict is verdict)
-        )
-        for verdict in Verdict
-    }
+    """Return one line: which gates passed, which failed and which were not judged. One that failed in some places passed in none."""
+    failing = {each.name for each in failed(gates)}
+    counts_of = Counter(each.name for each in gates)
+    names: dict[Verdict, list[str]] = {verdict: [] for verdict in Verdict}
+    for each in gates:
+        if each.verdict is Verdict.FAILED and counts_of[each.name] > 1:
+            names[each.verdict].append(f"{each.name} ({each.where})")
+        elif (each.failed or each.name not in failing) and each.name not in names[each.verdict]:
+            names[each.verdict].append(each.name)
     return f"{use}: " + "; ".join(f"{verdict}: {', '.join(which)}" for verdict, which in names.items() if which)

@@ -117,8 +117,9 @@ def _spacing(findings: StackFindings) -> Gate:
     if len(positions_px) > 1 and None not in positions_px:
         midway = 0.5 * np.abs(np.diff(np.array(positions_px, np.float64))) / findings.full_size_px[0]
         first = int(midway.argmax())
-        measured = f"midway between slices {first} and {first + 1} all is blurred by {midway[first] * findings.full_size_px[0]:.1f} px"
         largest = float(midway[first])
+        blur_px = largest * findings.full_size_px[0]
+        measured = f"what lies midway between slices {first} and {first + 1} is blurred by {blur_px:.1f} px"
         return rules.SOLVED_SPACING.judge(findings.name, largest, f"{measured} ({largest:.2%})", largest <= rules.LARGEST_MIDWAY)
     spacing = findings.spacing
     if spacing is None:

@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int
 
 from capture.poses.cauchy_loss import CAUCHY_95, deviation
-from capture.poses.lens_calibration import stated_distances_m
 from capture.poses.sparse_model import SparseModel
 from capture.scale.answer import ScaleAnswer
 from capture.stacks.slice_files import stated_by_sentinel
 from mrbokeh.images.color import luminance
 from mrbokeh.stacks.focal_stack import FocalStack
+from mrbokeh.stacks.guessed_metres import stated_distances_m
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 

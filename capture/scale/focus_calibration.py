@@ -22,7 +22,6 @@ from capture.poses.lens_calibration import (
     LensCalibration,
     focused_stack,
     lens_model_of,
-    stated_distances_m,
     with_calibrated_focus,
 )
 from capture.poses.sparse_model import SparseModel, SparseView
@@ -31,6 +30,7 @@ from capture.stacks.slice_files import stated_by_sentinel
 from mrbokeh.images.color import luminance
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.stacks.focal_stack import METRES, FocalStack
+from mrbokeh.stacks.guessed_metres import stated_distances_m
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
 

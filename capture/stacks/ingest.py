@@ -25,7 +25,7 @@ from capture.stacks.slice_files import reporting_full_disk
 from capture.stacks.stack_description import FEWEST_TO_MERGE, StackReport, finish_stack, finished_before, ingest_digest, lens_text
 from capture.stacks.stack_ingest import Development, StackWork, stack_work
 from mrbokeh.stacks.focal_stack import FocalStack
-from mrbokeh.stacks.guessed_metres import STATED_DISTANCE, is_lens_guessed
+from mrbokeh.stacks.guessed_metres import is_lens_guessed, stated_distances_m
 from mrbokeh.system.channel import say, show, warn
 from mrbokeh.system.console import progress_bars
 from mrbokeh.system.errors import InputError
@@ -182,8 +182,7 @@ def _some_names(paths: Sequence[Path]) -> str:
 
 def focus_text(stack: FocalStack) -> str:
     """Return the range of the focus distances that are stated: "0.4 .. 2.1 m", "... inf", "unknown"."""
-    stated = (each.metadata.get(STATED_DISTANCE, each.focus_distance_m) for each in stack.slices)
-    known = [float(distance) for distance in stated if distance is not None]
+    known = [distance for distance in stated_distances_m(stack) if distance is not None]
     if not known:
         return "unknown"
     ends = [f"{distance:.4g}" if math.isfinite(distance) else "inf" for distance in (min(known), max(known))]

@@ -110,7 +110,8 @@ def composite(
     elif depth_m is not None:
         surface_m, seen_rgb = _depth_of(depth_m, with_holes=not exact_depth), plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb
         mends = not exact_depth and surface_m.shape == seen_rgb.shape[:2]
-        plate = replace(plate, depth_m=mended_aloud(surface_m, seen_rgb) if mends else surface_m, depth_confidence=None)
+        plate = replace(plate, depth_m=mended_aloud(surface_m, seen_rgb) if mends else surface_m)
+        plate = replace(plate, depth_confidence=None, depth_error_dioptres=0.0)
     if isinstance(focus, tuple):
         if plate.depth_m is None:
             raise InputError("to focus on a pixel the photograph needs depth: give depth_m, or focus in metres")

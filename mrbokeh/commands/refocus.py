@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 
 from mrbokeh.commands._insertion_options import ANY_LENS, ANY_RENDERER, FocusAtOption, LensFacts, require_one_focus, typed_place
@@ -92,7 +93,7 @@ def refocus(
     distances_m = parse_focus(str(focus), seen)
     guess_metres(source)
     guess(growth_note(source, way.lens))
-    _tell_of_focus_beyond(source, distances_m)
+    _tell_of_mush(way, distances_m)
     _make_room(out, result.overwrite)
     settings = {"stack": str(stack.resolve()), **vars(blur), **facts.given, "lens": str(blur.lens)}
     with kept_when_interrupted(f"finished slices are kept in {out}", result.overwrite):
@@ -109,16 +110,17 @@ def refocus(
     tell(told, known=lens_facts, slices=len(slices), **figures)
 
 
-def _tell_of_focus_beyond(source: FocalStack, distances_m: tuple[float, ...]) -> None:
-    """Warn of focus at which no slice is: nothing that the depth knows is sharp there."""
-    ends_m = [each for each in source.focus_distances_m if each is not None]
-    near_m, far_m = min(ends_m), max(ends_m)
-    # Half a step beyond an end, depth from focus still reaches.
-    margin = 0.5 * (1.0 / near_m - 1.0 / far_m) / max(1, len(ends_m) - 1)
-    beyond = [each for each in distances_m if not 1.0 / far_m - margin <= 1.0 / each <= 1.0 / near_m + margin]
-    if beyond:
-        named = ", ".join(f"{each:.3g}" for each in beyond)
-        warn(f"{named} {unit_of(source)}: hardly anything is sharp there, beyond the slices focused at {near_m:.3g} to {far_m:.3g}")
+def _tell_of_mush(way: Refocusing, distances_m: tuple[float, ...]) -> None:
+    """Warn of focus at which hardly anything lies."""
+    depth_m, ends_m = way.stack.depth_m(), [each for each in way.stack.focus_distances_m if each is not None]
+    for focus_m in distances_m:
+        least_px = float(np.percentile(np.abs(way.lens_at(focus_m).coc_px(depth_m[::4, ::4], -(-depth_m.shape[1] // 4))), 1.0)) * 4.0
+        if least_px > _MUSH_PX:
+            unit, slices = unit_of(way.stack), f"{min(ends_m):.3g} to {max(ends_m):.3g}"
+            warn(f"nothing is sharp at {focus_m:.3g} {unit}: all is blurred by {least_px:.0f} px or more (slices are focused at {slices})")
+
+
+_MUSH_PX = 4.0
 
 
 def _write_sharp(source: FocalStack, made: FocalStack, distances_m: tuple[float, ...]) -> None:

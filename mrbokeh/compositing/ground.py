@@ -69,8 +69,8 @@ def with_ground_behind(plate: Plate, feet_px: Sequence[Pixel], layers: Sequence[
 
     A floor or a table is the farther the higher it is in the picture, so that it never hides what stands on it; depth that says otherwise
     is wrong. The ground is what goes on from a foot without a jump of depth, but not what is clearly nearer than the foot although it is
-    higher (in a stack by more than lies between two slices): that stands before the object. Below the foot, where near things stand, it is
-    only what is nearer than the object by no more than the depth may be off.
+    higher (by a tenth, or in a stack by what lies between two slices if that is less): that stands before the object. Below the foot,
+    where near things stand, it is only what is nearer than the object by no more than the depth may be off.
     """
     if plate.depth_m is None:
         return plate

@@ -37,7 +37,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.solving.sun_of_photograph import SunOfPhotograph, sun_of_photograph
 from mrbokeh.stacks.capture_bundle import CaptureBundle
-from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, read_focal_stack
+from mrbokeh.stacks.focal_stack import DEPTH_SOURCE, FILE_NAME, FROM_FOCUS, FocalStack, read_focal_stack
 from mrbokeh.stacks.guessed_metres import is_lens_guessed
 from mrbokeh.stacks.photograph import Photograph, lens_for_photograph, read_photograph
 from mrbokeh.system.channel import guess
@@ -60,7 +60,7 @@ class Plate:
     rgb: (H, W, 3) linear, blurred by the real lens. depth_m: (H, W) of the sharp scene or None. lens: as focused for this photograph.
     sharp_rgb: (H, W, 3) the same view all in focus (of a focal stack), in the colours of rgb, or None.
     depth_confidence: (H, W) in [0, 1], of a focal stack: 0 where nothing there told the depth, which is then that of its surroundings.
-    depth_error_dioptres: how far the depth of a focal stack may be off: half of what lies between two of its slices.
+    depth_error_dioptres: how far depth from focus may be off; 0 of other depth.
     near_alpha: (H, W) in [0, 1], a user's own matte of what stands in front of the virtual objects: sharp where its distance is known
     (by depth or told), else as the photograph shows it; NaN where depth is to tell; or None.
     alpha: (H, W) in [0, 1], the plate's own, by which rgb is multiplied; None is opaque.
@@ -411,9 +411,16 @@ def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus
     upright = replace(camera, camera_from_world=np.eye(4))
     depth_m, confidence = stack.depth_planes("Z", "confidence")
     plate = Plate(rgb=rgb, depth_m=depth_m, lens=focused, camera=upright, sharp_rgb=stack.all_in_focus(), depth_confidence=confidence)
-    steps = np.abs(np.diff([1.0 / stack.lens_of(index).focus_distance_m for index in range(len(stack))]))
-    plate = replace(plate, depth_error_dioptres=0.5 * float(np.median(steps)) if len(steps) else 0.0)
-    return replace(plate, metres_guessed=not stack.metres_known, slopes_known=stack.metres_known, blur_from=blur_from)
+    plate = replace(plate, depth_error_dioptres=depth_error_dioptres(stack), blur_from=blur_from)
+    return replace(plate, metres_guessed=not stack.metres_known, slopes_known=stack.metres_known)
+
+
+def depth_error_dioptres(stack: FocalStack) -> float:
+    """Return how far the depth of a merged stack may be off: half of what lies between two slices; 0 if it is not from their focus."""
+    dioptres = [1.0 / each for each in stack.focus_distances_m if each is not None]
+    if stack.metadata.get(DEPTH_SOURCE) != FROM_FOCUS or len(dioptres) < 2:
+        return 0.0
+    return 0.5 * float(np.median(np.abs(np.diff(dioptres))))
 
 
 def slice_lens(stack: FocalStack, slice_index: int, lens: Lens | None, focus_m: float | None) -> tuple[Lens, str]:

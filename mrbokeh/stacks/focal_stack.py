@@ -26,6 +26,8 @@ VERSION = 2
 FILE_NAME = "stack.json"
 METRES = "metres"
 """Key in a stack's metadata: what is known of its metres, see `mrbokeh.stacks.guessed_metres`."""
+DEPTH_SOURCE, FROM_FOCUS = "depth_source", "focus"
+"""Key in a stack's metadata: where depth.exr and all_in_focus.exr come from; FROM_FOCUS after merging."""
 GROWTH, GROWTH_WIDTH = "px_per_dioptre", "px_per_dioptre_width_px"
 """Keys in a slice's metadata: how fast its blur grows before registration enlarges it, in a picture so wide."""
 
@@ -234,11 +236,11 @@ def write_focal_stack(stack: FocalStack) -> None:
 def read_focal_stack(folder: Path | str) -> FocalStack:
     """Read the stack in a folder; pictures are not opened. Raises InputError if the folder is not one."""
     folder = Path(folder)
-    within = " or ".join(str(each.parent) for each in sorted(folder.glob(f"*/{FILE_NAME}")))
-    advice = (
-        f"give {within}, which lies in it" if within else "make one of photographs by `mrbokeh capture process PHOTOGRAPHS --out SCENE`"
-    )
-    require_file(folder / FILE_NAME, "a focal stack", f": {advice}")
+    if not (folder / FILE_NAME).is_file():
+        within = [str(each.parent) for each in sorted(folder.glob(f"*/{FILE_NAME}"))]
+        others = f", or another of the {len(within)} in it" if len(within) > 1 else ", which lies in it"
+        make = "make one of photographs by `mrbokeh capture process PHOTOGRAPHS --out SCENE`"
+        require_file(folder / FILE_NAME, "a focal stack", f": give {within[0]}{others}" if within else f": {make}")
     document = read_json(folder / FILE_NAME, "a focal stack")
     if document.get("format") != FORMAT or document.get("version") != VERSION:
         raise InputError(

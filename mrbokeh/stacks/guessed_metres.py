@@ -26,6 +26,12 @@ TOLD = "told"
 _OF_ITS_DEPTH = ("known", "why", "guessed")
 
 
+def stated_distances_m(stack: FocalStack) -> tuple[float | None, ...]:
+    """Return the distances stated by the camera or the user, also after a calibration has replaced them."""
+    stated = (each.metadata.get(STATED_DISTANCE, each.focus_distance_m) for each in stack.slices)
+    return tuple(None if each is None else float(each) for each in stated)
+
+
 def metres_facts(stack: FocalStack) -> Mapping[str, Any]:
     """Return what is known of a stack's metres; {} for stacks that state theirs.
 

@@ -1,5 +1,7 @@
 """Edges of depth from focus where the all-in-focus picture has them, in pictures small and large."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -39,7 +41,7 @@ def test_two_slices_are_not_evened_out_into_one() -> None:
     """A far surface that is sure would draw an unsure near one of nearly its colour over to itself."""
     near = disc((120, 160))
     rgb = np.where(near[..., None], (0.30, 0.31, 0.30), (0.31, 0.30, 0.30)).astype(np.float32)
-    focus = FocusMap((~near).astype(np.float32), np.where(near, np.float32(0.12), np.float32(1.0)))
+    focus = FocusMap((~near).astype(np.float32), np.where(near, np.float32(0.02), np.float32(1.0)))
     found = with_edges_of_light(focus, rgb, near_first=True).focus_index
     assert found[near].max() < 0.5
 
@@ -54,3 +56,14 @@ def test_a_plain_wall_beside_a_near_thing_has_the_depth_of_its_detail_farther_of
     rgb = np.where(near[..., None], RED, GREEN).astype(np.float32)
     found = with_edges_of_light(FocusMap(index, confidence), rgb, near_first=True).focus_index
     assert found[guess].min() > 6.0 and (found[near] > 2.0).mean() < 0.001
+
+
+def test_a_light_keeps_its_own_depth_before_another_surface() -> None:
+    """It has no confidence, as its disc is no detail, but its slice is measured."""
+    near = disc((240, 320))
+    index = np.where(near, np.float32(2.0), np.float32(7.0))
+    focus = FocusMap(index, np.where(near, np.float32(0.0), np.float32(0.8)), lit=near)
+    even = np.full((240, 320, 3), 0.3, np.float32)
+    found = with_edges_of_light(focus, even, near_first=True).focus_index[near]
+    lost = with_edges_of_light(replace(focus, lit=None), even, near_first=True).focus_index[near]
+    assert np.median(found) == pytest.approx(2.0, abs=0.1) and np.median(lost) > 5.0

@@ -11,7 +11,7 @@ import pytest
 
 from capture.merging.merge import merge_scene
 from capture.merging.registration.registration_file import read_registration, write_registration
-from capture.merging.second_pass import DEPTH_SOURCE, FROM_FOCUS, first_pass_path, keep_first_pass, second_pass
+from capture.merging.second_pass import first_pass_path, keep_first_pass, second_pass
 from capture.stacks.grouping import Grouping
 from capture.stacks.ingest import IngestSettings, ingest
 from capture.stacks.stack_ingest import Development
@@ -21,7 +21,7 @@ from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.images.image_metrics import depth_edge_mask, psnr
 from mrbokeh.optics.aperture import Aperture
-from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
+from mrbokeh.stacks.focal_stack import DEPTH_SOURCE, FROM_FOCUS, FocalStack, Slice, read_focal_stack, write_focal_stack
 from tests.support.refusals import refused
 
 VIEW = "view_1"

@@ -172,7 +172,7 @@ def test_a_right_order_and_a_sweep_there_and_back() -> None:
 
 
 def test_two_far_slices_are_neighbours_though_the_hand_moved_between_them() -> None:
-    """Each moved by 8 % of the width in turn, no order is free of contradictions, but with the near one between them it has five times more."""
+    """Where both moved by 8 % of the width no order is free of contradictions; with the near one between them it has five times more."""
     near, far, beyond = (rendered(0.01).slices[each] for each in (0, 5, 4))
     moved = [np.roll(far, 24, axis=1), near, np.roll(beyond, -24, axis=1)]
     assert focus_order(lambda index: moved[index], 3) == (0, 2, 1)

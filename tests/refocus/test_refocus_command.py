@@ -145,7 +145,8 @@ def test_the_command_writes_a_focal_stack(tmp_path: Path) -> None:
     refused(f"give {stack.folder}, which lies in it", run, tmp_path, "--focus", "0.52", "--out", tmp_path / "new")
     words = ("--out", tmp_path / "new", "--renderer", "scatter", "--sheet", tmp_path / "sheet.png")
     said = run(stack.folder, "--focus", "0.52,0.55,inf", *words)
-    assert "inf m: hardly anything is sharp there" in said and "0.52, inf" not in said
+    # Focused at infinity the lens blurs the card and the wall, at 0.5 and 0.7 m, by more than 4 px.
+    assert said.count("nothing is sharp at") == 1 and "nothing is sharp at inf m" in said
     made = read_focal_stack(tmp_path / "new")
     assert made.focus_distances_m == (0.52, 0.55, float("inf")) and made.merged
     np.testing.assert_array_equal(made.slice_rgb(1), stack.slice_rgb(1))

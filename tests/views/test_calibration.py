@@ -14,7 +14,6 @@ from capture.poses.lens_calibration import (
     apply_lens_calibration,
     calibrate_scene,
     read_lens_calibration,
-    stated_distances_m,
     write_lens_calibration,
 )
 from capture.scale.focus_calibration import (
@@ -33,6 +32,7 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
+from mrbokeh.stacks.guessed_metres import stated_distances_m
 from tests.support.command_line import printed_by
 from tests.support.refusals import refused
 

@@ -9,7 +9,7 @@ import pytest
 
 from capture.cli import app
 from capture.dataset.stack_writer import require_usable
-from capture.dense.scene_depth import DEPTH_SOURCE, PatchMatchScene, SceneDepthSettings, deepen_scene, nearest_views
+from capture.dense.scene_depth import PatchMatchScene, SceneDepthSettings, deepen_scene, nearest_views
 from capture.merging.merge import merge_scene
 from capture.poses.colmap_job import ColmapJob, ColmapPicture, job_to_json
 from capture.poses.sparse_model import SparseModel, SparseView, read_sparse_model, write_sparse_model
@@ -19,7 +19,7 @@ from mrbokeh.demo.plan import DATA, VIEWS
 from mrbokeh.depth.views.dense_depth import DenseDepth
 from mrbokeh.images.image_io import read_image
 from mrbokeh.optics.camera import Camera
-from mrbokeh.stacks.focal_stack import find_focal_stacks, read_focal_stack
+from mrbokeh.stacks.focal_stack import DEPTH_SOURCE, find_focal_stacks, read_focal_stack
 from mrbokeh.system.atomic_files import write_json
 from tests.support.capture_truth import ViewTruth, picture_db, view_truth
 from tests.support.command_line import printed_by

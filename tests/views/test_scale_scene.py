@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from capture.poses.colmap import PoseSettings, find_scene_poses
-from capture.poses.lens_calibration import read_lens_calibration, stated_distances_m
+from capture.poses.lens_calibration import read_lens_calibration
 from capture.poses.sparse_model import SparseModel, read_sparse_model
 from capture.scale.board import BoardSearch, Similarity, umeyama
 from capture.scale.metric_scale import ScaledScene, ScaleRequest, scale_lines, scale_scene
 from mrbokeh.images.color import display_rgb8
 from mrbokeh.stacks.focal_stack import read_focal_stack
+from mrbokeh.stacks.guessed_metres import stated_distances_m
 from mrbokeh.system.errors import InputError
 from tests.support.traced_views import (
     BOARD,

@@ -135,7 +135,9 @@ def _summary(progress: "Progress") -> str:
     looks = [point.held_out_psnr_db for point in progress.curve if not math.isnan(point.held_out_psnr_db)]
     said = f"{progress.step} steps in {progress.elapsed_s:.0f} s, loss {progress.smoothed_loss:.2e}"
     if looks:
-        said += f", held-out slices {looks[-1]:.2f} dB (without any blur {progress.sharp_psnr_db:.2f} dB)"
+        said += f", held-out slices {looks[-1]:.2f} dB"
+    if looks and not math.isnan(progress.sharp_psnr_db):
+        said += f" (without any blur {progress.sharp_psnr_db:.2f} dB)"
     if progress.stopped_early:
         said += f"; stopped early: no improvement in the last {progress.looks_since_best} evaluations"
     if looks and progress.kept_step != progress.step:
