@@ -50,6 +50,8 @@ def find_photos(given: Sequence[Path], scene: Path) -> tuple[list[PhotoFolder], 
     found: dict[Path, Path] = {}
     skipped: list[SkippedFile] = []
     for path in (Path(each).resolve() for each in given):
+        if path == Path(scene).resolve():
+            raise InputError(f"the photographs lie in {scene}, where the scene was to be made: give another folder with --out")
         if not path.exists():
             raise InputError(f"expected photographs or folders of photographs, but there is nothing at {path}")
         if path.is_dir():

@@ -27,7 +27,7 @@ from mrbokeh.system.errors import InputError
 if TYPE_CHECKING:
     from mrbokeh.commands._composite_kept import KeptParts
 
-_NEARER, _MUCH_HIDDEN, _ALL_HIDDEN, _GUESSED_HIDES = 0.03, 0.4, 0.99, 0.01
+_NEARER, MUCH_HIDDEN, _ALL_HIDDEN, _GUESSED_HIDES = 0.03, 0.4, 0.99, 0.01
 _RASTER, _COLOURLESS = 200, 0.004
 
 
@@ -93,7 +93,7 @@ def composited(
         plate = with_ground_behind(plate, options.standing.pixels, sharp)
     if asked is not None and asked.object_ and (warning := placing_warning(drawn, " ".join(asked.height or ()))):
         warn(warning)
-    much = _MUCH_HIDDEN if asked is not None and asked.object_ else _ALL_HIDDEN  # layers of others may have a sky behind all
+    much = MUCH_HIDDEN if asked is not None and asked.object_ else _ALL_HIDDEN  # layers of others may have a sky behind all
     if asked is not None and (warning := hidden_warning(drawn, plate, mode, much)):
         in_metres = "; is Z of the layers in metres along the axis?" if plate.near_alpha is None and not asked.object_ else ""
         warn(warning + in_metres)
@@ -170,6 +170,8 @@ def hidden_warning(sharp: Sequence[Layer], plate: Plate, mode: str, much: float)
         return f"{hidden:.0%} of it lies behind what the depth says is nearer; --mode front ignores depth"
     if plate.depth_confidence is None:
         return None
+    if plate.near_alpha is not None:
+        hides &= np.isnan(plate.near_alpha)
     guessed = float((hides & (plate.depth_confidence < LEAST_CONFIDENCE)).sum() / whole)
     if guessed < _GUESSED_HIDES:
         return None

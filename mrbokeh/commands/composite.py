@@ -127,10 +127,19 @@ def _into_all_slices(
     options: CompositeOptions, plate: "Plate", bundle: "CaptureBundle | None", renderer: "Renderer", lens: "Lens | None", out: Path
 ) -> None:
     from mrbokeh.commands._composite_layers import layers_by
-    from mrbokeh.commands._composited import insertion_by
+    from mrbokeh.commands._composited import MUCH_HIDDEN, hidden_warning, insertion_by
+    from mrbokeh.compositing.ground import Standing
     from mrbokeh.compositing.stack_compositing import composite_stack
+    from mrbokeh.figures.stack_pictures import write_upright_png
     from mrbokeh.stacks.focal_stack import read_focal_stack
 
-    layers_for, (_mode, insertion) = layers_by(options, plate, bundle), insertion_by(options, plate)
-    composite_stack(read_focal_stack(options.photo), layers_for, insertion, renderer, out, lens)
-    tell(f"wrote the focal stack {out}")
+    layers_for, (mode, insertion) = layers_by(options, plate, bundle), insertion_by(options, plate)
+    if options.standing.object_ and (warning := hidden_warning(layers_for(plate), plate, mode, MUCH_HIDDEN)):
+        warn(warning)
+    if options.standing.at_pixel:
+        insertion = Standing(insertion, options.standing.pixels)
+    made = composite_stack(read_focal_stack(options.photo), layers_for, insertion, renderer, out, lens)
+    for index, each in enumerate(made.slices):
+        write_upright_png((out / each.path).with_suffix(".png"), made.slice_rgb(index), made)
+    write_upright_png(made.all_in_focus_path.with_suffix(".png"), made.all_in_focus(), made)
+    tell(f"wrote the focal stack {out}, with a PNG beside each slice")

@@ -1,13 +1,14 @@
 """Ground that an object stands on: its slope by the depth around the foot, what of it may hide the object, and where its shadow ends."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32
 
-from mrbokeh.compositing.plate import Plate
+from mrbokeh.compositing.plate import Inserted, Insertion, Plate
 from mrbokeh.images.layer import Layer
+from mrbokeh.renderers.base import Renderer
 from mrbokeh.scene.staging.scene_description import looking_down
 
 Pixel = tuple[float, float]
@@ -84,6 +85,17 @@ def with_ground_behind(plate: Plate, feet_px: Sequence[Pixel], layers: Sequence[
         within = np.where(is_above, calm_m > np.float32((1.0 - before) * foot_m), as_near)
         ground |= _same_surface(plate.depth_m, (x_px, y_px), within, _SAME_SURFACE) & np.isfinite(covered_m)
     return replace(plate, depth_m=np.where(ground, np.maximum(plate.depth_m, covered_m), plate.depth_m))
+
+
+@dataclass(frozen=True)
+class Standing:
+    """Insertion of what stands on the ground at some pixels, which never hides it (`with_ground_behind`)."""
+
+    insertion: Insertion
+    feet_px: Sequence[Pixel]
+
+    def insert(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> Inserted:
+        return self.insertion.insert(with_ground_behind(plate, self.feet_px, layers), layers, renderer)
 
 
 def ended_shadow(plate: Plate, feet_px: Sequence[Pixel], objects: Layer, shadow: Layer) -> Layer:

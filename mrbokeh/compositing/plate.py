@@ -30,7 +30,7 @@ from mrbokeh.images.apple_notes import held_by_phone
 from mrbokeh.images.exif import TIFF_SUFFIXES, header_of
 from mrbokeh.images.heif import HEIF_SUFFIXES
 from mrbokeh.images.image_io import read_image
-from mrbokeh.images.layer import Layer
+from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.images.xmp import jpeg_xmp
 from mrbokeh.optics.camera import Camera, camera_of_lens
 from mrbokeh.optics.lens import Lens
@@ -40,7 +40,7 @@ from mrbokeh.stacks.capture_bundle import CaptureBundle
 from mrbokeh.stacks.focal_stack import DEPTH_SOURCE, FILE_NAME, FROM_FOCUS, FocalStack, read_focal_stack
 from mrbokeh.stacks.guessed_metres import is_lens_guessed
 from mrbokeh.stacks.photograph import Photograph, lens_for_photograph, read_photograph
-from mrbokeh.system.channel import guess
+from mrbokeh.system.channel import guess, say
 from mrbokeh.system.errors import InputError, require_file
 
 _log = logging.getLogger(__name__)
@@ -405,7 +405,7 @@ def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus
             f"{folder} is a focal stack of {len(stack)} slices: choose one with --slice 0 to {len(stack) - 1}, or --all-slices"
         )
     focused, blur_from = slice_lens(stack, slice_index, lens, focus_m)
-    rgb = stack.slice_rgb(slice_index)
+    rgb = _with_border(stack, slice_index)
     camera = stack.camera or camera_of_lens(stack.lens_of(stack.reference), rgb.shape[1], rgb.shape[0])
     # A stack of a scene knows where its camera stood; objects are placed in camera axes.
     upright = replace(camera, camera_from_world=np.eye(4))
@@ -413,6 +413,19 @@ def _stack_plate(folder: Path, slice_index: int | None, lens: Lens | None, focus
     plate = Plate(rgb=rgb, depth_m=depth_m, lens=focused, camera=upright, sharp_rgb=stack.all_in_focus(), depth_confidence=confidence)
     plate = replace(plate, depth_error_dioptres=depth_error_dioptres(stack), blur_from=blur_from)
     return replace(plate, metres_guessed=not stack.metres_known, slopes_known=stack.metres_known)
+
+
+def _with_border(stack: FocalStack, slice_index: int) -> Float32[np.ndarray, "height width 3"]:
+    """Return a slice whose border, where registration moved it out of its photograph, is blurred anew from all slices, and say so."""
+    rgb, valid = stack.slice_rgb(slice_index), stack.slice_masks(slice_index).valid
+    missing = 1.0 - float(valid.mean())
+    if missing == 0.0 or stack.focus_distances_m[slice_index] is None:
+        return rgb
+    from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
+
+    say(f"{missing:.1%} of slice {slice_index}, at its border, is in the other slices only: blurred anew from them", err=True)
+    sharp = opaque(stack.all_in_focus(), stack.depth_m())
+    return np.where(valid[..., None], rgb, PolygonDifferences().render([sharp], stack.registered_lens_of(slice_index)).rgb)
 
 
 def depth_error_dioptres(stack: FocalStack) -> float:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from mrbokeh.compositing.plate import Inserted, Insertion, Plate, plate_of
+from mrbokeh.compositing.plate import Inserted, Insertion, Plate, depth_error_dioptres, plate_of
 from mrbokeh.images.camera_rgb import Matrix3x3, write_camera_rgb
 from mrbokeh.images.color import convert
 from mrbokeh.images.exr_io import read_exr, write_exr
@@ -74,7 +74,9 @@ def _plate(stack: FocalStack, index: int, depth_m: Float32[np.ndarray, "height w
     lens = stack.registered_lens_of(index) if other is None else other.focused_at(stack.lens_of(index).focus_distance_m)
     rgb = stack.slice_rgb(index)
     camera = stack.camera or plate_of(rgb, stack.lens_of(stack.reference)).camera
-    return Plate(rgb=rgb, depth_m=depth_m, lens=lens, camera=replace(camera, camera_from_world=np.eye(4)), sharp_rgb=sharp_rgb)
+    camera = replace(camera, camera_from_world=np.eye(4))
+    plate = Plate(rgb=rgb, depth_m=depth_m, lens=lens, camera=camera, sharp_rgb=sharp_rgb)
+    return replace(plate, depth_error_dioptres=depth_error_dioptres(stack))
 
 
 def _write_slice(stack: FocalStack, index: int, inserted: Inserted, folder: Path) -> None:

@@ -159,6 +159,7 @@ def test_holes_of_guessed_depth_are_told() -> None:
     assert "25% of it is hidden by depth that is a guess" in str(hidden_warning([card], plate, "between", 0.4))
     assert hidden_warning([card], replace(plate, depth_confidence=np.full_like(alpha, 0.5)), "between", 0.4) is None
     assert hidden_warning([card], plate, "front", 0.4) is None
+    assert hidden_warning([card], replace(plate, near_alpha=np.zeros_like(alpha)), "between", 0.4) is None, "a matte tells"
 
 
 PLACES = {"object_": [CAKE, ALIEN], "at_pixel": ["1,2", "3,4"]}

@@ -285,6 +285,7 @@ def test_which_files_are_photographs(tmp_path: Path) -> None:
     assert [path.name for path in folder.paths] == ["depth.exr"]
     assert [each.path.name for each in skipped] == ["notes.txt"]
     refused("there is nothing at", find_photos, [tmp_path / "absent"], tmp_path / "scene")
+    refused("give another folder with --out", find_photos, [tmp_path], tmp_path / ".")
 
 
 def test_damaged_files_are_named_and_the_rest_goes_on(shoot: Path, tmp_path: Path) -> None:
