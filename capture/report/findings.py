@@ -238,12 +238,26 @@ def _picture_from(document: dict[str, Any]) -> PictureFindings:
 
 
 def pair_document(found: NeighbourDisplacement, number: Number) -> dict[str, Any]:
-    return {"first": found.first, "off_px": number(found.off_px), "error_px": number(found.error_px), "place_px": list(found.place_px)}
+    return {
+        "first": found.first,
+        "off_px": number(found.off_px),
+        "error_px": number(found.error_px),
+        "place_px": list(found.place_px),
+        "parallax_px": number(found.parallax_px),
+        "parallax_place_px": list(found.parallax_place_px),
+    }
 
 
 def _pair_from(document: dict[str, Any]) -> NeighbourDisplacement:
-    x, y = document["place_px"]
-    return NeighbourDisplacement(int(document["first"]), _number(document["off_px"]), float(document["error_px"]), (int(x), int(y)))
+    (x, y), (far_x, far_y) = document["place_px"], document["parallax_place_px"]
+    return NeighbourDisplacement(
+        first=int(document["first"]),
+        off_px=_number(document["off_px"]),
+        error_px=float(document["error_px"]),
+        place_px=(int(x), int(y)),
+        parallax_px=float(document["parallax_px"]),
+        parallax_place_px=(int(far_x), int(far_y)),
+    )
 
 
 def _slice_from(document: dict[str, Any]) -> SliceFindings:

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from capture.report.gates import LARGEST_FLAT, LARGEST_LOST, LARGEST_TOP, LIGHT, PLACES, SEAMS, SHARP
+from capture.report.gates import LARGEST_FLAT, LARGEST_LOST, LARGEST_PARALLAX, LARGEST_TOP, LIGHT, PLACES, SEAMS, SHARP
 from capture.report.picture_sharpness import PictureLook
 from capture.report.registration_check import NeighbourDisplacement
 from capture.report.stack_view import StackView
@@ -128,7 +128,7 @@ def crops_shown(crops: Sequence[tuple[str, Rgb]], block: tuple[int, int, int], *
 
 def worst_places(look: PictureLook, focus_index: Plane, pairs: Sequence[NeighbourDisplacement]) -> list[Place]:
     """Return up to three places for a gate that fails, one where none does. focus_index: in which slice each pixel is sharp."""
-    return [*_lost(look), *_seams(look, focus_index), *_brightest(look), *_farthest_apart(pairs)]
+    return [*_lost(look), *_seams(look, focus_index), *_brightest(look), *_farthest_apart(pairs, focus_index.shape[1])]
 
 
 def shown_places(stack: FocalStack, picture: Rgb, places: Sequence[Place]) -> list[ShownPlace]:
@@ -209,7 +209,12 @@ def _brightest(look: PictureLook) -> list[Place]:
     return places
 
 
-def _farthest_apart(pairs: Sequence[NeighbourDisplacement]) -> list[Place]:
+def _farthest_apart(pairs: Sequence[NeighbourDisplacement], width_px: int) -> list[Place]:
+    shifted = max(pairs, key=lambda each: each.parallax_px, default=None)
+    if shifted is not None and shifted.parallax_px > LARGEST_PARALLAX * width_px:
+        names = tuple((index, f"slice {index}") for index in (shifted.first, shifted.first + 1))
+        x, y = (max(each - BLOCK_PX // 2, 0) for each in shifted.parallax_place_px)
+        return [Place(PLACES.name, (x, y), f"up to {shifted.parallax_px:.0f} px apart: the camera moved sideways", names)]
     known = [each for each in pairs if each.off_px is not None]
     if not known:
         return []

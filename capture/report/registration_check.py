@@ -3,11 +3,14 @@
 Patches that are sharp in both slices are found again by normalised cross-correlation, which blur by an even kernel leaves in place, and
 one similarity is fitted to their displacements (Cauchy's weights). Patches that are blurred in one of the two are left out: where the
 opening is cut off, blurred things move with the focus, and no registration could help that.
+
+A camera that moved sideways sees near things before another place of what is far. No one plane fits both, and what is near is sharp in
+one slice only, so that nobody sees it. So both slices are made small and as blurred as that, and followed by optical flow.
 """
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -32,6 +35,11 @@ _ROUNDS = 20
 _LEAST_SCATTER_PX = 0.05
 _SURELY = 3.0
 """Standard errors by which nothing lies apart by chance."""
+_SMALL_PX, _SMALL_SIGMA_PX, _SMALL_BLOCK_PX = 320, 4.0, 20
+_CONTRAST, _THERE_AND_BACK_PX, _BLOCK_SHARE = 2.0, 0.5, 0.3
+"""Where flow is followed: slopes per pixel, of 255, a way that leads back, and so much of a block like that."""
+_MOST_APART = 90.0
+"""Percentile of the blocks' displacements: a few are of water, people and leaves."""
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -45,12 +53,15 @@ class NeighbourDisplacement:
 
     off_px: root mean square of the fitted displacements, in pixels of the stored pictures; None where too few patches are sharp in both.
     error_px: its standard error. place_px: x, y of the middle of the patch to look at, in pixels of the stored pictures.
+    parallax_px, parallax_place_px: how far things of some size lie apart, sharp or not, and where to look.
     """
 
     first: int
     off_px: float | None
     error_px: float
     place_px: tuple[int, int]
+    parallax_px: float = 0.0
+    parallax_place_px: tuple[int, int] = (0, 0)
 
     def exceeds(self, limit_px: float) -> bool:
         """Return whether they lie farther apart than the limit, and not by chance."""
@@ -68,6 +79,8 @@ class DisplacementEvidence:
     _last: tuple[Plane, Mask, Plane] | None = None
     _sharpest: Plane | None = None
     _pairs: list["_Patches"] = field(default_factory=list)
+    _small: Plane | None = None
+    _parallax: list[tuple[float, float, float]] = field(default_factory=list)
 
     def add(self, rgb: Rgb, usable: Mask) -> None:
         luminance = display_luminance(rgb)
@@ -77,6 +90,10 @@ class DisplacementEvidence:
             before, usable_before, energy_before = self._last
             allowed = _whole_patches(usable & usable_before)
             self._pairs.append(_matched(before, fine, np.where(allowed, np.minimum(energy, energy_before), 0.0)))
+        small = _small_of(luminance, usable)
+        if self._small is not None:
+            self._parallax.append(_parallax(self._small, small, luminance.shape[1] / small.shape[1]))
+        self._small = small
         self._sharpest = energy if self._sharpest is None else np.maximum(self._sharpest, energy)
         self._last = (fine, usable, energy)
 
@@ -84,7 +101,11 @@ class DisplacementEvidence:
         """Return the displacement of every pair of neighbours. stored_per_px: pixels of the stored pictures for each of those added."""
         if self._sharpest is None:
             return ()
-        return tuple(_place(index, each, self._sharpest, stored_per_px) for index, each in enumerate(self._pairs))
+        places = [_place(index, each, self._sharpest, stored_per_px) for index, each in enumerate(self._pairs)]
+        return tuple(
+            replace(each, parallax_px=apart * stored_per_px, parallax_place_px=(int(x * stored_per_px), int(y * stored_per_px)))
+            for each, (apart, x, y) in zip(places, self._parallax, strict=True)
+        )
 
 
 @dataclass(frozen=True)
@@ -253,6 +274,42 @@ def _fitted(patches: _Patches) -> tuple[Displacements, float]:
     covariance = np.linalg.inv((columns.T * weight) @ columns + ridge) * scatter_px**2
     variance = np.einsum("ik,kl,il->i", columns, covariance, columns)
     return (columns @ change).reshape(2, count).T, float(np.sqrt(2.0 * variance.mean()))
+
+
+def _small_of(luminance: Plane, usable: Mask) -> Float32[np.ndarray, "rows columns"]:
+    """Return a small, blurred picture; NaN where it shows what is not usable."""
+    height, width = luminance.shape
+    size = (min(_SMALL_PX, width), max(1, round(height * min(_SMALL_PX, width) / width)))
+    small = cv2.GaussianBlur(cv2.resize(luminance, size, interpolation=cv2.INTER_AREA), (0, 0), _SMALL_SIGMA_PX)
+    known = cv2.resize(usable.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.99
+    return np.where(known, small, np.float32(np.nan))
+
+
+def _parallax(before: Plane, after: Plane, px: float) -> tuple[float, float, float]:
+    """Return how far blocks of two small pictures lie apart, and x and y of the farthest. px: pixels of the pictures for each small one."""
+    known = np.isfinite(before) & np.isfinite(after)
+    if min(before.shape) < 2 * _SMALL_BLOCK_PX or not known.any():
+        return 0.0, 0.0, 0.0
+    low, high = np.percentile(before[known], (1.0, 99.0))
+    scaled = (255.0 * (np.nan_to_num(each) - low) / max(high - low, 1e-6) for each in (before, after))
+    first, second = (np.clip(each, 0, 255).astype(np.uint8) for each in scaled)
+    follower, still = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM), np.zeros((*first.shape, 2), np.float32)
+    follower.setFinestScale(0)
+    forth, back = (np.asarray(follower.calc(*each, still.copy())) for each in ((first, second), (second, first)))
+    y, x = np.indices(first.shape, np.float32)
+    returned = forth + cv2.remap(back, x + forth[..., 0], y + forth[..., 1], cv2.INTER_LINEAR)
+    slope = np.hypot(*(cv2.Sobel(first, cv2.CV_32F, *each) / 8.0 for each in ((1, 0), (0, 1))))
+    followed = known & (np.hypot(*returned.transpose(2, 0, 1)) < _THERE_AND_BACK_PX) & (slope > _CONTRAST)
+    apart, found = np.hypot(*forth.transpose(2, 0, 1)), []
+    for top in range(0, first.shape[0] - _SMALL_BLOCK_PX + 1, _SMALL_BLOCK_PX):
+        for left in range(0, first.shape[1] - _SMALL_BLOCK_PX + 1, _SMALL_BLOCK_PX):
+            block = np.s_[top : top + _SMALL_BLOCK_PX, left : left + _SMALL_BLOCK_PX]
+            if followed[block].mean() > _BLOCK_SHARE:
+                middle = px * (np.array([left, top]) + 0.5 * _SMALL_BLOCK_PX)
+                found.append((px * float(np.median(apart[block][followed[block]])), float(middle[0]), float(middle[1])))
+    if not found:
+        return 0.0, 0.0, 0.0
+    return float(np.percentile([each for each, *_ in found], _MOST_APART)), *max(found)[1:]
 
 
 def _document(stack: FocalStack) -> dict[str, Any]:

@@ -27,7 +27,7 @@ Mask = Bool[np.ndarray, "height width"]
 Signature = dict[str, Any]
 
 FOLDER, JSON_NAME, MOVING_NAME = "report", "found.json", "moving.png"
-VERSION = 4
+VERSION = 5
 """A number that rises whenever other numbers or pictures would be found in the same stack."""
 
 

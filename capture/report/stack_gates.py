@@ -86,17 +86,22 @@ def _places(findings: StackFindings) -> Gate:
     if worst_residual is not None:
         first, residual_px = worst_residual
         parts.append(f"pairs of the registration disagree by {residual_px:.1f} px at slices {first} and {first + 1}")
+    shifted = max(findings.pairs, key=lambda each: each.parallax_px)
+    is_shifted = shifted.parallax_px > rules.LARGEST_PARALLAX * width_px
+    if is_shifted:
+        names = f"slices {shifted.first} and {shifted.first + 1}"
+        parts.append(f"things at other depths lie up to {shifted.parallax_px:.0f} px apart in {names}")
     unknown = [str(each.first) for each in findings.pairs if each not in measured and each.first not in residuals]
     if unknown:
         parts.append(
             f"slices {', '.join(unknown)} cannot be placed surely, as little is sharp in two, and no pair of the registration held"
         )
-    if not measured and worst_residual is None:
+    if not measured and worst_residual is None and not is_shifted:
         return rules.PLACES.absent(findings.name, f"{'; '.join(parts)}: use smaller focus steps")
     wrong = any(each.exceeds(limit_px) for each in measured)
     disagree = worst_residual is not None and worst_residual[1] > rules.LARGEST_PAIR_RESIDUAL * width_px
-    value = max([each.off_px or 0.0 for each in measured] + list(residuals.values()))
-    return rules.PLACES.judge(findings.name, value, "; ".join(parts), not (wrong or disagree))
+    value = max([each.off_px or 0.0 for each in measured] + list(residuals.values()) + [shifted.parallax_px] * is_shifted)
+    return rules.PLACES.judge(findings.name, value, "; ".join(parts), not (wrong or disagree or is_shifted))
 
 
 def _pair_residuals_px(findings: StackFindings, measured: Sequence[NeighbourDisplacement]) -> dict[int, float]:

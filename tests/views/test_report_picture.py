@@ -18,7 +18,7 @@ from capture.report.picture_sharpness import PictureFindings
 from capture.report.registration_check import DisplacementEvidence, NeighbourDisplacement
 from capture.report.report_cache import CachedPlace
 from capture.report.scene_report import GATE_NAMES, SceneReport, report_scene
-from capture.report.stack_gates import picture_gates
+from capture.report.stack_gates import picture_gates, stack_gates
 from capture.stacks.slice_looks import BLOCK_PX
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.images.image_io import read_image
@@ -225,6 +225,32 @@ def test_shifts_and_turns_are_measured_where_there_is_data() -> None:
     evidence.add(surface(), np.ones_like(usable))
     evidence.add(other, usable)
     assert evidence.places()[0].off_px == pytest.approx(0.0, abs=0.1)
+
+
+def test_what_is_blurred_in_both_slices_is_seen_to_move_sideways_and_blur_alone_is_not() -> None:
+    """A disc at another depth, blurred by 6 and by 9 px (standard deviations), 2 % of the width aside in the second picture."""
+    usable, rows, columns = np.ones((HEIGHT_PX, WIDTH_PX), bool), *np.mgrid[:HEIGHT_PX, :WIDTH_PX]
+
+    def seen(moved_px: float, sigma_px: float) -> np.ndarray:
+        disc = (np.hypot(rows - HEIGHT_PX / 2, columns - WIDTH_PX / 2 - moved_px) < HEIGHT_PX / 4).astype(np.float32)
+        cover = cv2.GaussianBlur(disc, (0, 0), sigma_px)[..., None]
+        return ((1.0 - cover) * 0.5 * cv2.GaussianBlur(surface(), (0, 0), 3.0) + cover * 0.9).astype(np.float32)
+
+    for moved_px in (0.0, 0.02 * WIDTH_PX):
+        evidence = DisplacementEvidence()
+        evidence.add(seen(0.0, 6.0), usable)
+        evidence.add(seen(moved_px, 9.0), usable)
+        (found,) = evidence.places()
+        assert found.parallax_px == pytest.approx(moved_px, abs=0.005 * WIDTH_PX)
+    assert np.hypot(found.parallax_place_px[0] - WIDTH_PX / 2, found.parallax_place_px[1] - HEIGHT_PX / 2) < 0.4 * HEIGHT_PX
+
+
+def test_a_hand_that_moved_sideways_fails_the_gate(tmp_path: Path) -> None:
+    """Beyond 0.8 % of 1000 px, though all that is sharp in both slices lies where it should."""
+    for parallax_px, verdict in ((7.0, "passed"), (9.0, "failed")):
+        pair = NeighbourDisplacement(0, 0.1, 0.05, (100, 100), parallax_px, (300, 200))
+        judged = next(each for each in stack_gates(findings_with(tmp_path, [0.1, 0.1], (pair,))) if each.name == PLACES.name)
+        assert judged.verdict == verdict and ("up to 9 px apart" in judged.measured) == (verdict == "failed")
 
 
 SHARP_PICTURE = PictureFindings(0.0, 1.0, 0.5, 0.5, (1000, 800))
