@@ -12,7 +12,7 @@ from mrbokeh.commands._composite_options import CompositeOptions, ObjectOptions,
 from mrbokeh.commands._insertion_options import VirtualOptions
 from mrbokeh.commands._level_ground import focused_on_foot, held_as_told, held_told, on_level_ground, sun_by_shadow
 from mrbokeh.compositing.choose import best_mode, insertion_of, without_what_touches_the_lens
-from mrbokeh.compositing.ground import with_ground_behind
+from mrbokeh.compositing.ground import with_ground_behind, without_specks
 from mrbokeh.compositing.near_and_far import nearer_than
 from mrbokeh.compositing.plate import LEAST_CONFIDENCE, Inserted, Insertion, Plate
 from mrbokeh.compositing.plate_look.finishing import Finishing, finished
@@ -90,7 +90,7 @@ def composited(
     if asked is not None and touching > 0.0:
         warn(f"{touching:.0%} of what is put in all but touches the lens, where its blur is wider than two pictures: it is left out")
     if options.standing.at_pixel:
-        plate = with_ground_behind(plate, options.standing.pixels, sharp)
+        plate = without_specks(with_ground_behind(plate, options.standing.pixels, sharp), sharp)
     if asked is not None and asked.object_ and (warning := placing_warning(drawn, " ".join(asked.height or ()))):
         warn(warning)
     much = MUCH_HIDDEN if asked is not None and asked.object_ else _ALL_HIDDEN  # layers of others may have a sky behind all

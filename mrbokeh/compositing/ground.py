@@ -18,6 +18,8 @@ _SAME_SURFACE, _SURELY_SAME = 0.02, 0.01
 _FARTHER, _STANDS_BEFORE, _JUST_BEFORE = 0.05, 0.1, np.float32(0.999)
 _NEARER = (0.05, 0.12)
 """Shares by which what stands on the ground is nearer than its plane: the first still catches the shadow whole, the second none of it."""
+_SPECK, _UNSURE, _FEW_SLICES = 0.005, 0.1, 3.0
+"""Share of what is put in below which a part that hides it is small; mean confidence and slices before it below which it is a speck."""
 _FOUND = 2
 _NEAR_FOOT = 0.05
 """Half width of the ground that is looked at around a foot, in widths of the picture."""
@@ -87,6 +89,27 @@ def with_ground_behind(plate: Plate, feet_px: Sequence[Pixel], layers: Sequence[
     return replace(plate, depth_m=np.where(ground, np.maximum(plate.depth_m, covered_m), plate.depth_m))
 
 
+def without_specks(plate: Plate, layers: Sequence[Layer]) -> Plate:
+    """Return the plate in which no specks of depth from focus hide what is put in.
+
+    Specks are small, and hardly more than a guess; or lie within the covered area and but a few slices before it.
+    """
+    import cv2
+
+    if plate.depth_m is None or plate.depth_confidence is None:
+        return plate
+    covered_m = np.minimum.reduce([np.where(layer.alpha > 0.0, layer.depth_m, np.inf) for layer in layers])
+    covered = np.isfinite(covered_m)
+    before = 1.0 / plate.depth_m - 1.0 / covered_m
+    count, parts, facts, _ = cv2.connectedComponentsWithStats((covered & (before > 0.0)).astype(np.uint8), connectivity=8)
+    area_px, on_edge = facts[:, cv2.CC_STAT_AREA], cv2.dilate((~covered).astype(np.uint8), np.ones((3, 3))) > 0
+    trust, mean_before = (np.bincount(parts.ravel(), each.ravel(), count) / area_px for each in (plate.depth_confidence, before))
+    within = (np.bincount(parts[on_edge], minlength=count) == 0) & (mean_before < _FEW_SLICES * 2.0 * plate.depth_error_dioptres)
+    speck = (area_px < _SPECK * covered.sum()) & ((trust < _UNSURE) | within)
+    speck[0] = False
+    return replace(plate, depth_m=np.where(speck[parts], covered_m, plate.depth_m))
+
+
 @dataclass(frozen=True)
 class Standing:
     """Insertion of what stands on the ground at some pixels, which never hides it (`with_ground_behind`)."""
@@ -95,7 +118,7 @@ class Standing:
     feet_px: Sequence[Pixel]
 
     def insert(self, plate: Plate, layers: Sequence[Layer], renderer: Renderer) -> Inserted:
-        return self.insertion.insert(with_ground_behind(plate, self.feet_px, layers), layers, renderer)
+        return self.insertion.insert(without_specks(with_ground_behind(plate, self.feet_px, layers), layers), layers, renderer)
 
 
 def ended_shadow(plate: Plate, feet_px: Sequence[Pixel], objects: Layer, shadow: Layer) -> Layer:

@@ -53,14 +53,14 @@ def composite_stack(
         raise InputError(
             f"{stack.folder} is not registered, so that one scene cannot fit all its slices: run `mrbokeh capture merge` on it"
         )
-    depth_m, sharp_rgb = stack.depth_m(), stack.all_in_focus()
+    whole = _all_in_focus_plate(stack, lens)
     with atomic_folder(out) as folder:
         for index in track(range(len(stack)), "compositing slices"):
-            plate = _plate(stack, index, depth_m, sharp_rgb, lens)
+            plate = replace(whole, rgb=stack.slice_rgb(index), lens=_lens_of(stack, index, lens))
             inserted = insertion.insert(plate, _layers(layers, plate), renderer)
             _write_slice(stack, index, inserted, folder)
-        plate = replace(_plate(stack, stack.reference, depth_m, sharp_rgb, lens), rgb=sharp_rgb)
-        _write_merge(stack, insertion.insert(plate, _layers(layers, plate), Unblurred()), depth_m, folder)
+        assert whole.depth_m is not None
+        _write_merge(stack, insertion.insert(whole, _layers(layers, whole), Unblurred()), whole.depth_m, folder)
         write_focal_stack(replace(stack, folder=folder, metadata=stack.metadata | {"composited_from": stack.folder.name}))
     return replace(stack, folder=out, metadata=stack.metadata | {"composited_from": stack.folder.name})
 
@@ -69,14 +69,24 @@ def _layers(layers: Sequence[Layer] | Callable[[Plate], Sequence[Layer]], plate:
     return layers(plate) if callable(layers) else layers
 
 
-def _plate(stack: FocalStack, index: int, depth_m: Float32[np.ndarray, "height width"], sharp_rgb: Rgb, other: Lens | None) -> Plate:
-    """Return the plate of a slice. All slices are seen by one camera; another lens takes the slice's focus and nothing else."""
-    lens = stack.registered_lens_of(index) if other is None else other.focused_at(stack.lens_of(index).focus_distance_m)
-    rgb = stack.slice_rgb(index)
-    camera = stack.camera or plate_of(rgb, stack.lens_of(stack.reference)).camera
-    camera = replace(camera, camera_from_world=np.eye(4))
-    plate = Plate(rgb=rgb, depth_m=depth_m, lens=lens, camera=camera, sharp_rgb=sharp_rgb)
-    return replace(plate, depth_error_dioptres=depth_error_dioptres(stack))
+def _all_in_focus_plate(stack: FocalStack, other: Lens | None) -> Plate:
+    """Return the plate of the all-in-focus picture. All slices are seen by one camera."""
+    sharp_rgb, (depth_m, confidence) = stack.all_in_focus(), stack.depth_planes("Z", "confidence")
+    camera = stack.camera or plate_of(sharp_rgb, stack.lens_of(stack.reference)).camera
+    return Plate(
+        rgb=sharp_rgb,
+        depth_m=depth_m,
+        lens=_lens_of(stack, stack.reference, other),
+        camera=replace(camera, camera_from_world=np.eye(4)),
+        sharp_rgb=sharp_rgb,
+        depth_confidence=confidence,
+        depth_error_dioptres=depth_error_dioptres(stack),
+    )
+
+
+def _lens_of(stack: FocalStack, index: int, other: Lens | None) -> Lens:
+    """Return the lens of a slice; another one takes the slice's focus and nothing else."""
+    return stack.registered_lens_of(index) if other is None else other.focused_at(stack.lens_of(index).focus_distance_m)
 
 
 def _write_slice(stack: FocalStack, index: int, inserted: Inserted, folder: Path) -> None:

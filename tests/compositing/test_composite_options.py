@@ -15,7 +15,7 @@ from mrbokeh.commands._composite_parts import plate_by
 from mrbokeh.commands._composited import placing_warning
 from mrbokeh.commands.composite import app
 from mrbokeh.compositing.choose import best_mode, insertion_of
-from mrbokeh.compositing.ground import ended_shadow, with_ground_behind
+from mrbokeh.compositing.ground import ended_shadow, with_ground_behind, without_specks
 from mrbokeh.compositing.plate import open_plate, plate_of, with_blur_in_metres
 from mrbokeh.demo.plan import DATA
 from mrbokeh.depth.phone_depth import read_phone_photo
@@ -151,6 +151,22 @@ def test_depth_of_a_stack_hides_only_by_more_than_it_may_be_off() -> None:
         stack = with_ground_behind(replace(plate, depth_error_dioptres=error), [(10, 70)], [card])
         seen = insertion_of("over").insert(stack, [card], ScatterReference()).rgb.min(axis=2) > 0.95
         assert seen[80, WIDTH - 10] == is_seen_below and not seen[50, WIDTH - 10] and seen[50, 10] and seen[80, 10]
+
+
+def test_specks_of_depth_cut_no_holes_and_what_surely_stands_before_does() -> None:
+    """Four small parts before a card at 0.5 dioptres, slices 0.04 apart: unsure; near it; far before it; near it, at its edge."""
+    depth_m, confidence = np.full((HEIGHT, WIDTH), 4.0, np.float32), np.full((HEIGHT, WIDTH), 0.8, np.float32)
+    alpha = np.zeros((HEIGHT, WIDTH), np.float32)
+    alpha[10:90, 10:130] = 1.0
+    parts = {(20, 20): (1.0, 0.02, True), (40, 40): (0.55, 0.8, True), (60, 60): (1.0, 0.8, False), (70, 8): (0.55, 0.8, False)}
+    for (row, column), (dioptres, trust, _) in parts.items():
+        depth_m[row : row + 4, column : column + 4], confidence[row : row + 4, column : column + 4] = 1.0 / dioptres, trust
+    card = Layer(np.repeat(alpha[..., None], 3, axis=2), alpha, np.where(alpha > 0, 2.0, np.inf).astype(np.float32))
+    plate = replace(plate_of(plate_rgb(), LENS, depth_m), depth_confidence=confidence, depth_error_dioptres=0.02)
+    found_m = without_specks(plate, [card]).depth_m
+    assert found_m is not None
+    for (row, column), (*_, is_speck) in parts.items():
+        assert (found_m[row + 1, column + 2] == 2.0) == is_speck
 
 
 def test_the_border_that_a_moved_slice_lacks_is_blurred_anew(tmp_path: Path) -> None:
