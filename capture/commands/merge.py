@@ -49,6 +49,20 @@ def merge_command(
         bool, typer.Option("--overwrite", help="merge again what is merged already; retouches and what was told to `scale` are dropped")
     ] = False,
 ) -> None:
+    if from_slice or mask:
+        if overwrite or registration is not None or prefer is not None:
+            raise InputError(
+                "--from-slice and --mask retouch what is merged: leave out --overwrite, --registration and --prefer, or merge first"
+            )
+        _tell_of_report([_retouch(scene, from_slice or [], mask or [])])
+        return
+    _tell_of_report(merge_aloud(scene, registration=registration, prefer=prefer, overwrite=overwrite))
+
+
+def merge_aloud(
+    scene: Path, registration: Path | None = None, prefer: Literal["near", "far"] | None = None, *, overwrite: bool
+) -> "list[FocalStack]":
+    """Merge the stacks of a scene and tell of those that are new, or of all where none is."""
     from capture.merging.merge import merge_scene
     from capture.merging.metres.known_metres import scale_options
     from capture.merging.metres.relative_stack import ORDER
@@ -58,19 +72,17 @@ def merge_command(
     from mrbokeh.system.console import kept_when_interrupted
     from mrbokeh.system.resources import keep_freed_pictures
 
-    if from_slice or mask:
-        if overwrite or registration is not None or prefer is not None:
-            raise InputError(
-                "--from-slice and --mask retouch what is merged: leave out --overwrite, --registration and --prefer, or merge first"
-            )
-        _tell_of_report([_retouch(scene, from_slice or [], mask or [])])
-        return
     keep_freed_pictures()
     before = [each for each in stacks_before(scene) if overwrite or not each.merged]
     retouched, scaled = retouched_stacks(before), {each.folder: scale_options(each) for each in before}
     with kept_when_interrupted(f"finished stacks are kept in {scene}", overwrite):
         stacks = merge_scene(scene, overwrite, registration, prefer)
+    new = {each.folder for each in before}
     for stack in stacks:
+        if prefer is not None and preferred_side(stack) != prefer:
+            say(f"{stack.folder} was merged before, without --prefer {prefer}: --overwrite merges it again")
+        if new and stack.folder not in new:
+            continue
         _tell(stack)
         guess(metres_note(stack))
         for told in (stack.metadata.get(ORDER), metres_facts(stack).get("why") if not metres_note(stack) else None):
@@ -78,13 +90,11 @@ def merge_command(
                 say(f"  {told}")
         for line in preferred_lines(stack):
             say(f"  {line}")
-        if prefer is not None and preferred_side(stack) != prefer:
-            say(f"  merged before, without --prefer {prefer}: --overwrite merges it again")
         if stack.folder in retouched:
             say(f"  merged anew without its retouches ({retouched[stack.folder]}): give --from-slice and --mask again")
         if told := scaled.get(stack.folder):
             say(f"  merged anew without what was told of it: tell it again by `mrbokeh capture scale {stack.folder} {told}`")
-    _tell_of_report(stacks)
+    return stacks
 
 
 def _tell(stack: "FocalStack") -> None:

@@ -43,7 +43,7 @@ def process_command(
 ) -> None:
     from capture.commands.depth import depth_command
     from capture.commands.ingest import ingest_command
-    from capture.commands.merge import merge_command
+    from capture.commands.merge import merge_aloud
     from capture.commands.poses import poses_command
     from capture.commands.report import report_command
     from capture.commands.scale import scale_command
@@ -64,7 +64,7 @@ def process_command(
         say(f"{out} is there already: what is finished is kept, the rest goes on (--overwrite makes all of it again)")
     with undone_when_refused(out, _is_of_use):
         ingest_command(photographs, out, sidecar=sidecar, max_width=max_width, overwrite=overwrite)
-        merge_command(out, prefer=prefer, overwrite=overwrite)
+        merge_aloud(out, prefer=prefer, overwrite=overwrite)
     if len(find_focal_stacks(out)) < 2:
         say("one viewpoint: depth comes from focus alone (photograph five or more for depth from several views)")
     else:
