@@ -100,7 +100,8 @@ class Plate:
 
     def __post_init__(self) -> None:
         size = self.rgb.shape[:2]
-        for what, plane in (("depth map", self.depth_m), ("all-in-focus picture", self.sharp_rgb), ("matte", self.near_alpha)):
+        planes = (self.depth_m, self.depth_confidence, self.sharp_rgb, self.near_alpha)
+        for what, plane in zip(("depth map", "confidence", "all-in-focus picture", "matte"), planes, strict=True):
             if plane is not None and plane.shape[:2] != size:
                 raise InputError(
                     f"the {what} of the photograph is {plane.shape[1]}x{plane.shape[0]} px but the photograph is {size[1]}x{size[0]} px: "
