@@ -182,14 +182,15 @@ def recipe_of(
     objects = virtual.object_names
     files = tuple(LayerFiles(path.resolve(), objects, taken.missing) for path in virtual.layer or ())
     _require_all_there(source, files, taken)
+    depth = _depth(taken, virtual, source.path)
     recipe = CompositeRecipe(
         lens=None if lens is None else lens.resolve(),
         layers=sources_by_depth(files, _scene_layers(source, virtual, rendering)),
         renderer=_renderer(blur.renderer),
-        mode=virtual.mode or (DEFAULT_MODE if taken.matte is None else "between"),
+        mode=virtual.mode or (DEFAULT_MODE if taken.matte is None and depth is None else "between"),
         camera=_camera(source, virtual),
         focus=pull,
-        depth=_depth(taken, virtual, source.path),
+        depth=depth,
         exact_depth=taken.exact_depth,
         matte=None if taken.matte is None else MatteFiles(taken.matte.resolve()),
         near_m=taken.near_distance,

@@ -269,7 +269,7 @@ def test_layers_and_depth_of_each_frame(clip: Path, tmp_path: Path) -> None:
         write_exr(tmp_path / f"depth.{1001 + i}.exr", ExrPart({"Z": depth_m}))
     options = ["--lens", tmp_path / "lens.json", "--layer", tmp_path / "moving.%04d.exr", "--first-number", "1001"]
     out = tmp_path / "out.mkv"
-    run(clip, *options, "--depth", tmp_path / "depth.%04d.exr", "--renderer", "scatter", "--out", out)
+    assert "; between)" in run(clip, *options, "--depth", tmp_path / "depth.%04d.exr", "--renderer", "scatter", "--out", out)
     for index, (before, after) in enumerate(zip(read_frames(clip), read_frames(out), strict=True)):
         layers = [read_layer(tmp_path / f"moving.{1001 + index}.exr")] if index < 6 else []
         np.testing.assert_allclose(
