@@ -16,6 +16,8 @@ from capture.merging.lights import Lights
 SMALL_STEP_COST = 0.3
 LARGE_STEP_COST = 3.0
 LARGEST_COST = 4.0
+# No path bears with what is not there.
+_NO_DATA_COST = 100.0
 # Detail has half its say in the labelling, and half its confidence, where its energy is this many times that of the noise.
 LABELLING_NOISE_FLOORS = 30.0
 CONFIDENCE_NOISE_FLOORS = 10.0
@@ -93,6 +95,8 @@ def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "
     sharp = _sharp_light(volume, detail)
     costs = _costs(detail, plain, sharp)
     _let_lights_decide(costs, volume.reduced(by_light), volume.reduced(lights.core))
+    if volume.missing is not None:
+        costs[volume.missing] = _NO_DATA_COST
     labels = aggregate_costs(costs, SMALL_STEP_COST, LARGE_STEP_COST).argmin(axis=0)
     if len(costs) >= FEWEST_SLICES_FOR_RIMS:
         beside = _outlines(labels)
@@ -101,6 +105,9 @@ def focus_map(volume: FocusVolume, lights: Lights, saturated: Bool[np.ndarray, "
     offset, _ = peak_parabola(np.log1p(energies, out=energies), labels)
     # In plain places the label is not the peak of the pixel's own energies.
     offset += plain * (peak_parabola(np.negative(costs, out=costs), labels)[0] - offset)
+    if volume.missing is not None:  # a parabola needs both neighbours
+        neighbours = (np.clip(labels + step, 0, len(costs) - 1) for step in (-1, 1))
+        offset[np.logical_or.reduce([np.take_along_axis(volume.missing, each[None], axis=0)[0] for each in neighbours])] = 0.0
     index = volume.enlarged(np.where(volume.reduced(by_light) >= 0, labels, labels + offset).astype(np.float32), SURFACE_STEP)
     trust = share_above(strongest, CONFIDENCE_NOISE_FLOORS) * _confidence(volume, labels)
     trust = volume.enlarged(trust) * _share_of_one_surface(index)

@@ -39,7 +39,8 @@ class FocusVolume:
 
     energies (slices, h, w): local energy of fine detail in every slice, with the noise of the noisiest of the place, over that noise.
     noise (h, w): that noise, as `focus_energy`. lights (slices, h, w): mean over the channels of the square root of light, 255 at display
-    white. shape: (H, W) of the pictures, h = ceil(H / shrink). details: of every slice, by blocks (`block_detail`).
+    white. shape: (H, W) of the pictures, h = ceil(H / shrink). details: of every slice, by blocks (`block_detail`), 0 in blocks that lack
+    data. missing (slices, h, w): where a slice has no data and another has; None where all have.
     """
 
     energies: Volume
@@ -47,6 +48,7 @@ class FocusVolume:
     lights: UInt8[np.ndarray, "slices height width"]
     shape: tuple[int, int]
     details: tuple[Blocks, ...]
+    missing: Bool[np.ndarray, "slices height width"] | None = None
 
     def calmed(self) -> Volume:
         """Return energies with the noise of single slices averaged out where it matters: weights 1, 2, 1 along the slices.
@@ -60,6 +62,8 @@ class FocusVolume:
         for index, energy in enumerate(self.energies):
             before, after = self.energies[max(index - 1, 0)], self.energies[min(index + 1, last)]
             result[index] = energy + share * (before + after - 2.0 * energy)
+        if self.missing is not None:
+            result[self.missing] = 0.0
         return result
 
     def without(self, spread: Bool[np.ndarray, "slices height width"]) -> "FocusVolume":
@@ -100,14 +104,21 @@ def focus_volume(registered: Iterable[Rgb], valid: Callable[[int], Mask] | None 
     lights: list[Light] = []
     levels: list[Light] = []
     details: list[Blocks] = []
+    missing: list[Mask] = []
     for index, rgb in enumerate(registered):
         encoded = np.maximum(rgb, 0.0)
         cv2.sqrt(encoded, dst=encoded)
         energy = _energy(encoded)
         details.append(block_detail(encoded))
-        if valid is not None:
-            energy[~valid(index)] = 0.0
         height, width = _reduced_size(energy.shape, count)
+        if valid is not None:
+            outside = ~valid(index)
+            energy[outside] = 0.0
+            # One pixel more, for choices go over into one another from pixel to pixel.
+            share = cv2.resize(outside.astype(np.float32), (width, height), interpolation=cv2.INTER_AREA)
+            missing.append(cv2.dilate((share > 0).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0)
+            if outside.any():
+                details[-1] = np.where(block_means(outside.astype(np.float32)) > 0, np.float32(0.0), details[-1])
         energies.append(cv2.resize(energy, (width, height), interpolation=cv2.INTER_AREA))
         small = cv2.resize(encoded, (width, height), interpolation=cv2.INTER_AREA)
         lights.append(np.minimum(cv2.transform(small, np.full((1, 3), _WHITE / 3.0)), _WHITE).astype(np.uint8))
@@ -115,7 +126,11 @@ def focus_volume(registered: Iterable[Rgb], valid: Callable[[int], Mask] | None 
     volume = np.stack(energies)
     noise = _as_noisy_as_the_noisiest(volume, levels, noise_floors(volume, levels))
     shape = (rgb.shape[0], rgb.shape[1])
-    return FocusVolume(energies=volume, noise=noise, lights=np.stack(lights), shape=shape, details=tuple(details))
+    lacks = np.stack(missing) if any(each.any() for each in missing) else None
+    if lacks is not None:
+        lacks &= ~lacks.all(axis=0)
+        volume[lacks] = 0.0
+    return FocusVolume(volume, noise=noise, lights=np.stack(lights), shape=shape, details=tuple(details), missing=lacks)
 
 
 def focus_energy(rgb: Rgb, window_px: float = 2.5) -> Plane:

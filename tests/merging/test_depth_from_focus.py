@@ -176,6 +176,22 @@ def test_what_stands_in_for_missing_data_tells_of_no_change() -> None:
     assert np.abs(focus_index[8:-8, -50:] - 2.0).mean() < 0.06
 
 
+def test_a_border_that_a_slice_lacks_is_taken_from_another_even_where_it_is_sharpest() -> None:
+    """Slice 0 is the sharp one, but its first 40 columns repeat the 41st: streaks, which no slice shows."""
+    rng = np.random.default_rng(2)
+    root = 0.4 + rng.normal(0.0, 0.02, (80, 160)).astype(np.float32).repeat(2, axis=0).repeat(2, axis=1)
+    root[:, :60] = 0.4 + 0.1 * (root[:, :60] - 0.4)
+    truth, masks = (root * root)[..., None].repeat(3, axis=2), [np.ones((160, 320), bool) for _ in range(3)]
+    slices = [cv2.filter2D(truth, -1, disc_kernel(4.0 * index + 0.5)) + rng.normal(0.0, 0.001, truth.shape) for index in range(3)]
+    slices = [np.maximum(each, 0.0).astype(np.float32) for each in slices]
+    slices[0][:, :40], masks[0][:, :40] = slices[0][:, 40:41], False
+    volume = focus_volume(slices, lambda index: masks[index])
+    focus_index = focus_map(volume, no_lights((160, 320))).focus_index
+    merged = sharp_all_in_focus(lambda: slices, focus_index, volume)
+    assert focus_index[:, :38].min() >= 0.75 and focus_index[:, 60:].max() < 0.5
+    np.testing.assert_allclose(merged[:, :30], slices[1][:, :30], atol=0.01)
+
+
 def test_the_tip_of_a_plain_leaf_is_not_overruled_by_the_ground_behind_it() -> None:
     """A leaf of faint detail, sharp in slice 1, whose tip reaches far over textured ground that is sharp in slice 6."""
     rng = np.random.default_rng(5)
