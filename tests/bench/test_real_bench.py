@@ -67,9 +67,10 @@ def test_a_program_that_fails_says_how_and_one_that_hangs_is_ended() -> None:
 
 
 def test_memory_is_that_of_the_program() -> None:
-    # 200 MB of ones (190.7 MiB) are touched by the started program, and none by a plain one, whose own memory differs by a MiB or two.
+    # 200 MB of ones (190.7 MiB) are touched by the started program, and none by a plain one. At their start both take 8 to 11 MiB, some of
+    # which is free again when the ones are made.
     large, plain = (attempted(["python3", "-c", code]).memory_mb for code in ("x = b'1' * 200_000_000", "pass"))
-    assert 188.0 < large - plain < 215.0
+    assert 180.0 < large - plain < 215.0
 
 
 def test_a_peers_picture_is_laid_on_the_slices(tmp_path: Path) -> None:

@@ -92,9 +92,10 @@ def region_of(whole: WholePhotograph, options: CompositeOptions, kept: KeptParts
     part = replace(
         plate,
         rgb=whole.light(box),
-        depth_m=None if plate.depth_m is None else np.ascontiguousarray(box.of(plate.depth_m)),
-        sharp_rgb=None if plate.sharp_rgb is None else np.ascontiguousarray(box.of(plate.sharp_rgb)),
-        near_alpha=None if plate.near_alpha is None else np.ascontiguousarray(box.of(plate.near_alpha)),
+        depth_m=_part_of(plate.depth_m, box),
+        depth_confidence=_part_of(plate.depth_confidence, box),
+        sharp_rgb=_part_of(plate.sharp_rgb, box),
+        near_alpha=_part_of(plate.near_alpha, box),
         alpha=None,
         lens=box.lens_of(plate.lens, width_px),
         camera=box.camera_of(plate.camera),
@@ -105,6 +106,10 @@ def region_of(whole: WholePhotograph, options: CompositeOptions, kept: KeptParts
     inner = light[wanted.top - box.top : wanted.bottom - box.top, wanted.left - box.left : wanted.right - box.left]
     shown[wanted.top - seen.top : wanted.bottom - seen.top, wanted.left - seen.left : wanted.right - seen.left] = inner
     return shown
+
+
+def _part_of(plane: np.ndarray | None, box: Box) -> np.ndarray | None:
+    return None if plane is None else np.ascontiguousarray(box.of(plane))
 
 
 def _standing(whole: WholePhotograph, options: CompositeOptions) -> tuple[Plate, Renderer, CompositeOptions]:
