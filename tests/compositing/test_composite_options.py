@@ -176,8 +176,8 @@ def test_the_border_that_a_moved_slice_lacks_is_blurred_anew(tmp_path: Path) -> 
     valid[:, :12] = False
     write_camera_rgb(stack.folder / stack.slices[1].path, np.where(valid[..., None], truth, np.float32(0.0)), None, valid=valid, half=False)
     found = open_plate(stack.folder, 1).rgb
-    np.testing.assert_array_equal(found[valid], truth[valid])
-    assert np.abs(found - truth)[~valid].mean() < 0.02 < 0.2 < truth[~valid].mean()
+    np.testing.assert_array_equal(found[:, 12 + 24 :], truth[:, 12 + 24 :])
+    assert np.abs(found - truth)[:, : 12 + 24].mean() < 0.02 < 0.2 < truth[~valid].mean()
 
 
 def test_blur_stays_when_depth_is_told_in_metres() -> None:
