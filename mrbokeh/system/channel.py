@@ -26,7 +26,7 @@ class Channel:
     """Way of a command's words, and what --json says of it.
 
     inputs: by option; outputs: files and folders that were finished; kept: what is left after Ctrl-C. spinner: what turns on the terminal
-    while the command says nothing, if anything does (a Live of rich).
+    while the command says nothing, or tells a log that it is at work; None outside a command.
     """
 
     quiet: bool = False
@@ -78,7 +78,7 @@ class _Warnings(logging.Handler):
         warn(record.getMessage())
 
 
-_channel = Channel()
+_channel = OF_NO_COMMAND = Channel()
 _apart: ContextVar[Channel | None] = ContextVar("apart", default=None)
 _terminal, _resting = RLock(), 0
 """How many blocks, of all threads, have the terminal to themselves."""
@@ -159,6 +159,12 @@ def say(text: str, err: bool = False) -> None:
     if not channel().quiet:
         with resting():
             print(text, file=sys.stderr if err else sys.stdout, flush=True)
+
+
+def say_in_between(text: str) -> None:
+    """Say on standard error, from another thread, what a log should know while the command is silent."""
+    channel().said(text)
+    print(text, file=sys.stderr, flush=True)
 
 
 def tell(text: str, known: Mapping[str, Any] | None = None, **figures: Any) -> None:

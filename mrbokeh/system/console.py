@@ -1,20 +1,30 @@
 """Words and bars of a command on the terminal: progress with the time left, the line after Ctrl-C, and the names of its options.
 
-On a terminal progress is drawn as bars, in a log as a plain line now and then.
+On a terminal progress is drawn as bars, in a log as a plain line now and then, and so is work of which nobody knows how far it is.
 """
 
 import sys
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from datetime import timedelta
+from threading import Event, Thread
 from typing import Any, TypeVar
 
 from rich.console import Console
-from rich.live import Live
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, Task, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.spinner import Spinner
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    Task,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
 
-from mrbokeh.system.channel import channel, resting
+from mrbokeh.system.channel import OF_NO_COMMAND, channel, resting, say_in_between
 
 Item = TypeVar("Item")
 
@@ -22,6 +32,31 @@ LINE_EVERY_S, LINE_EVERY_SHARE = 10.0, 0.05
 """Time between lines: the longer of the two, the second a share of the time so far; a night of training is no thousand lines."""
 WORTH_A_LINE_S = 2.0
 """Shortest task whose end is worth a line: a command that is done at once leaves no log of its parts."""
+
+
+SILENT_S, SILENT_MORE = 20.0, 1.5
+"""Longest time without a word in a log, and how many times as long the next may be."""
+
+
+class Heartbeat:
+    """Line in a log whenever a command has been silent for long. line: what it is at, or "" if that was told lately."""
+
+    def __init__(self, line: Callable[[], str]) -> None:
+        self._line, self._ended = line, Event()
+
+    def start(self) -> None:
+        self._ended = Event()
+        Thread(target=self._beat, args=(self._ended,), daemon=True).start()
+
+    def stop(self, **_: object) -> None:
+        self._ended.set()
+
+    def _beat(self, ended: Event) -> None:
+        silent_s = SILENT_S
+        while not ended.wait(silent_s):
+            if line := self._line():
+                say_in_between(line)
+                silent_s *= SILENT_MORE
 
 
 class PlainLines(Progress):
@@ -32,6 +67,7 @@ class PlainLines(Progress):
         self._told: dict[TaskID, tuple[float, float]] = {}
         self._ended: set[TaskID] = set()
         self._begun_with: dict[TaskID, float] = {}
+        self._heartbeat = Heartbeat(self._silent_line)
 
     def add_task(self, description: str, *args: Any, **fields: Any) -> TaskID:
         task = super().add_task(description, *args, **fields)
@@ -48,11 +84,25 @@ class PlainLines(Progress):
         self._tell(task_id)
 
     def start(self) -> None:
-        """Draw nothing; lines are printed as tasks advance."""
+        """Draw nothing; lines are printed as tasks advance, or when they have not for long."""
+        self._heartbeat.start()
 
     def stop(self) -> None:
+        self._heartbeat.stop()
         for task in self.task_ids:
             self._tell(task, last=True)
+
+    def _silent_line(self) -> str:
+        """Return how far the newest task is, or "" if a line told it lately."""
+        with self._lock:
+            if not self._tasks:
+                return ""
+            task_id, now = max(self._tasks), self.get_time()
+            task, (told_at, told) = self._tasks[task_id], self._told[task_id]
+            if task.finished or now - told_at < SILENT_S:
+                return ""
+            self._told[task_id] = now, told
+        return _line(task, now - (now if task.start_time is None else task.start_time), self._begun_with[task_id])
 
     def _tell(self, task_id: TaskID, last: bool = False) -> None:
         with self._lock:
@@ -109,17 +159,32 @@ def track(items: Iterable[Item], description: str, total: int | None = None) -> 
 @contextmanager
 def working(description: str) -> Iterator[None]:
     """Show a spinner on the terminal while something of unknown length runs."""
-    with resting(), Console(stderr=True, emoji=False).status(description):
+    console = Console(stderr=True, emoji=False)
+    with ExitStack() as shown:
+        if console.is_terminal:
+            shown.enter_context(resting())
+            shown.enter_context(_spinner(description, console))
         yield
 
 
 def begin(command: str) -> None:
-    """Let a spinner turn on the terminal, if there is one, whenever the command neither says nor shows anything."""
-    console = Console(stderr=True, emoji=False)
-    if console.is_terminal and sys.stdout.isatty():  # not over the page of a pager
-        spinner = Spinner("dots", f"{command} ...")
-        channel().spinner = Live(spinner, console=console, transient=True, redirect_stdout=False, redirect_stderr=False)
-        channel().spinner.start(refresh=True)
+    """Whenever the command neither says nor shows anything, let a spinner turn on the terminal, or tell a log that it is at work."""
+    console, began_s = Console(stderr=True, emoji=False), time.monotonic()
+    if channel() is OF_NO_COMMAND:
+        return
+    if not console.is_terminal:
+        channel().spinner = Heartbeat(lambda: f"{command}: at work, {timedelta(seconds=round(time.monotonic() - began_s))}")
+    elif sys.stdout.isatty():  # not over the page of a pager
+        channel().spinner = _spinner(command, console)
+    if channel().spinner:
+        channel().spinner.start()
+
+
+def _spinner(description: str, console: Console) -> Progress:
+    columns = SpinnerColumn(), TextColumn("{task.description} ..."), TimeElapsedColumn()
+    spinner = Progress(*columns, console=console, transient=True, redirect_stdout=False, redirect_stderr=False)
+    spinner.add_task(description, total=None)
+    return spinner
 
 
 @contextmanager

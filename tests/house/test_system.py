@@ -2,6 +2,7 @@
 that is handed out again, which tethered camera is meant, and what its errors mean."""
 
 import io
+import time
 from collections.abc import Iterator
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from rich.console import Console
 
 from mrbokeh.system import console
+from mrbokeh.system.channel import opened
 from mrbokeh.system.console import PlainLines, track
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.gphoto2_library import NoCameraError, chosen_of, explanation, library
@@ -64,6 +66,34 @@ def test_long_work_is_told_less_and_less_often(clock: Clock, said: io.StringIO) 
     list(track(slow(clock, 3600, 1.0), "train", 3600))
     lines = said.getvalue().splitlines()
     assert sum(int(line.split()[1]) <= 100 for line in lines) == 10 and 60 < len(lines) < 85
+
+
+def test_silent_work_says_in_a_log_that_it_goes_on(
+    clock: Clock, said: io.StringIO, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A command whose parts nobody counts, then a task whose first part takes long: one heartbeat each."""
+    monkeypatch.setattr(console, "SILENT_S", 0.05)
+    monkeypatch.setattr(console, "SILENT_MORE", 1e6)
+    errors = ""
+
+    def heard(word: str) -> None:
+        nonlocal errors
+        ends_s = time.monotonic() + 10.0
+        while word not in errors and time.monotonic() < ends_s:
+            time.sleep(0.01)
+            errors += capsys.readouterr().err
+        assert word in errors
+
+    with opened():
+        console.begin("export")
+        heard("export: at work, 0:00:0")
+        with console.progress_bars() as bars:
+            bars.add_task("slices", total=5)
+            clock.now_s += 60.0
+            heard("slices: 0 of 5, 0:01:00")
+    assert said.getvalue() == "slices: 0 of 5, 0:01:00\n", "the end of what was broken off"
+    time.sleep(0.2)
+    assert capsys.readouterr().err == "", "nothing after the command"
 
 
 @pytest.mark.parametrize(("total", "lines"), [(0, ["frames: 4, 0:00:08"]), (2, ["frames: 2 of 2, 0:00:04", "frames: 4 of 2, 0:00:08"])])
