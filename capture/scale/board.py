@@ -22,9 +22,9 @@ from mrbokeh.tracking.charuco.detector import CharucoDetector, Corners
 _ENLARGED_UP_TO_PX = 2000
 FEWEST_CORNERS = 6
 POSES_SIGMA, POSES_SIGMA_WITH_DISTORTION = 5e-4, 1e-3
-"""What errors of poses and lens leave, which the corners do not show: 0.00 to 0.04 % on traced scenes where the lens has no
-distortion and none is fitted; 0.12 and 0.16 % where its distortion has to be found too. That is noise of the matches: 0.1 px on 500
-points of the lab's seven views leave 0.09 % root mean square beside a term of distortion that is there, and 0.06 % without one.
+"""Error of the scale that poses and lens cause and residuals of the corners do not show: 0.00 to 0.04 % on traced scenes where the lens
+has no distortion and none is fitted; 0.12 and 0.16 % where its distortion has to be found too. That is noise of the matches: 0.1 px on 500
+points of the lab's seven views leave 0.09 % root mean square when a term of distortion is fitted, and 0.06 % when none is.
 """
 _WRONG_SIGMAS = 5.0
 _LEAST_WRONG_PX = 0.1
@@ -68,7 +68,7 @@ def detect_board(board: CharucoBoard, pictures: Iterator[UInt8[np.ndarray, "_ _ 
 
 
 def scale_of_detections(model: SparseModel, board: CharucoBoard, seen: BoardDetections) -> ScaleAnswer:
-    """Fit a similarity to the triangulated corners (Umeyama 1991), then refine it on the pixels, where all errors have one size."""
+    """Fit a similarity to the triangulated corners (Umeyama 1991), then refine it on the pixels, where all have the same noise."""
     seen = seen.only(_seen_twice(seen))
     corners = np.unique(seen.corners)
     if len(corners) < FEWEST_CORNERS:
@@ -201,7 +201,7 @@ class BoardSearch:
 
     The board is tried as printed by OpenCV before and since 4.6, since nobody knows which version made a print.
     The whole print is not fitted to the picture (mrbokeh.tracking.charuco.board_alignment). On a traced board with white paper around it
-    that took the corners' error from 0.070 to 0.016 px and their share of the scale's from 0.02 to 0.004 %, where poses leave 0.05 %;
+    that took the corners' error from 0.070 to 0.016 px and what they add to the scale's error from 0.02 to 0.004 %, where poses add 0.05 %;
     but its homography knows no distortion, which photographs keep here, and a board cut off at its squares does not fit.
     """
 

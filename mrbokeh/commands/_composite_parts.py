@@ -1,4 +1,4 @@
-"""Ends of `mrbokeh composite`: the plate by its options, and its results: the picture, with .exr all layers, and files beside it."""
+"""Beginning and end of `mrbokeh composite`: opens the plate that its options name, writes the picture, its layers and files beside it."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -41,7 +41,7 @@ from mrbokeh.video.image_sequence import read_numbers
 def plate_by(whole: CompositeOptions, bundle: CaptureBundle | None, *, lens: Lens | None, focus_m: float | None) -> Plate:
     """Open the photograph, slice or bundle, with depth and matte from their files. lens, focus_m: in place of its own.
 
-    What a photograph does not tell of its lens is guessed where the options guess its ground.
+    Where the options guess the ground, facts of the lens that the photograph lacks are guessed too.
     """
     photo, options, colour, facts = whole.photo, whole.taken, whole.colour, {} if lens else whole.facts.given
     if facts and photo.is_dir():
@@ -99,7 +99,7 @@ def check_outputs(out: Path, result: ResultOptions, read: Sequence[Path | None],
 
 
 def blur_told(plate: Plate, sharp: Sequence[Layer]) -> tuple[str, dict[str, Any], dict[str, Any]]:
-    """Describe the lens and its blur, with what is known of the lens, and figures; if metres are guessed, give the measured pixels."""
+    """Return a text on lens and blur, the known facts of the lens, and figures; if metres are guessed, figures in pixels only."""
     lens, width_px = plate.lens, plate.rgb.shape[1]
     unit = GUESSED if plate.metres_guessed else "m"
     told = f"{plate.blur_from}," if plate.blur_from else f"{lens.focal_length_mm:.4g} mm f/{lens.f_number:.3g}"
@@ -150,7 +150,7 @@ def alpha_lost(out: Path, plate: Plate) -> str | None:
 
 
 def _write_layers(out: Path, inserted: Inserted, plate: Plate, sharp: Layer, options: CompositeOptions) -> None:
-    """Depth is that of the frontmost sharp surface; circles of confusion follow from it."""
+    """Write the EXR file with all layers. Depth is that of the frontmost sharp surface; circles of confusion follow from it."""
     from mrbokeh.images.carried_exr import CarriedExr
     from mrbokeh.stacks.exr_layers.composite_exr import CompositeLayers, write_composite_exr
     from mrbokeh.stacks.exr_layers.cryptomatte import cryptomatte_among

@@ -30,7 +30,7 @@ def place_m(standing: ObjectOptions, number: int = 0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("pitch_deg", [0.0, 20.0])
-def test_an_object_stands_so_far_below_the_camera_as_that_is_high(pitch_deg: float) -> None:
+def test_an_object_stands_as_far_below_the_camera_as_the_camera_is_high(pitch_deg: float) -> None:
     plate, standing = on_level_ground(photograph(), replace(FOOT, pitch=pitch_deg, camera_height=1.6))
     foot_m = place_m(standing)
     np.testing.assert_allclose(plate.camera.project(foot_m[None])[0][0], (500.0, 450.0), atol=1e-3)
@@ -95,8 +95,9 @@ def test_where_nothing_tells_ground_lies_as_deep_as_it_usually_does(focus_m: flo
 
 @pytest.mark.parametrize(("rows", "down_deg"), [(240, 4.41), (390, -6.6), (60, 0.0), (20, 0.0)])
 def test_blue_sky_ends_no_lower_than_the_horizon(rows: int, down_deg: float) -> None:
-    """Ground 30 px below the end of the sky would have a horizon 10 degrees over it. A horizon 60 px over the middle is 4.4 degrees, one
-    90 px below it is looking up; little sky tells nothing, and ground in row 450 is 11 degrees below a level view, which is enough.
+    """With ground 30 px below the end of the sky, a horizon 10 degrees above that ground would lie in the sky. A horizon 60 px over the
+    middle is 4.4 degrees, one 90 px below it is looking up; little sky tells nothing, and ground in row 450 is 11 degrees below a level
+    view, which is enough.
     """
     rgb = np.random.default_rng(1).uniform(0.15, 0.25, (600, 800, 3)).astype(np.float32)
     rgb[:rows] = np.linspace(0.6, 0.9, rows, dtype=np.float32)[:, None, None] * np.float32([0.3, 0.5, 0.9])
