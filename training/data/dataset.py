@@ -35,7 +35,7 @@ class Window:
 class ReadAhead:
     """A cache of windows that were used or are expected; the least recently used go first when `limit_bytes` is full.
 
-    The result of reading does not depend on the expectation; only its time does. All calls come from one thread.
+    Expecting windows makes reading faster and never changes what is read. All calls come from one thread.
     Beyond the limit there is only what reading takes in passing (about one window more for each reader) and a single window larger
     than the limit. An error in a reader is raised where its window is requested.
     """
@@ -107,7 +107,7 @@ class ReadAhead:
 class PairSet:
     """The pairs of some stacks; recently used and expected pictures are cached, up to a limit.
 
-    slices: only these of the stacks that it names.
+    slices: which to use, by name of the stack; stacks without an entry use all.
     cache_mib: the limit. If all pairs fit they stay, and each file is read once; slices share what belongs to their stack.
     Otherwise crops are cut from windows: only the rows of a crop are read, over the whole width, as the file holds them. On slices of
     24 megapixels 256 rows take 1/16 of the time and memory of a whole one. Reading takes about one window more in passing for each reader.

@@ -1,4 +1,4 @@
-"""EncodedStream: finished pictures encoded once for each codec in use, whoever many watch.
+"""EncodedStream: finished pictures encoded once for each codec in use, however many watch.
 
 For each of the Audience a ViewerQueue keeps what waits between encoder and network, a few packets or nothing until a keyframe.
 """
@@ -40,7 +40,7 @@ class _State(Enum):
     # Nothing can be shown before a keyframe.
     AWAITING_KEYFRAME = auto()
     FLOWING = auto()
-    # Fell behind and has not come back: gets nothing, and nobody makes an effort for it.
+    # Fell behind and has not come back: gets nothing, and nothing is encoded for it.
     STALLED = auto()
 
 
@@ -123,7 +123,7 @@ class Audience:
         return any(viewer.wants_frames for viewer in self.viewers)
 
     def join(self, codec: str, wake: Callable[[], None]) -> ViewerQueue:
-        """Return a new viewer's queue; who comes while the stream fails is told."""
+        """Return a new viewer's queue; a viewer who joins while the stream is failing is told so."""
         viewer = ViewerQueue(codec, self._capacity, wake)
         viewer.failure = self.failure
         with self._lock:
