@@ -39,8 +39,11 @@ check: $(READY)
 	$(RUN)/mypy
 	$(MAKE) test
 
+# Those that bring what they measure; bench_real, bench_pixel4, bench_photographs and bench_views_depth want a folder, bench_device is `make gpu`.
+WANTING := device real pixel4 photographs views_depth
 bench: $(READY)
-	for bench in $(filter-out %/bench_device.py,$(wildcard tests/bench/bench_*.py)); do $(RUN)/python -m tests.bench.$$(basename $$bench .py) || exit 1; done
+	for bench in $(filter-out $(WANTING:%=tests/bench/bench_%.py),$(wildcard tests/bench/bench_*.py)); do \
+		echo "== $$(date +%T) $$bench"; $(RUN)/python -m tests.bench.$$(basename $$bench .py) || exit 1; done
 
 # What runs on an NVIDIA GPU, measured and tested in less than 8 minutes: bench_out/device/device.md. Without one the processor stands in.
 gpu: $(READY)
