@@ -10,17 +10,8 @@ from jaxtyping import Float32
 
 from mrbokeh.commands._composite_options import CompositeOptions, ResultOptions
 from mrbokeh.commands._insertion_options import ColourOptions, near_far_of
-from mrbokeh.compositing.plate import (
-    Inserted,
-    Plate,
-    bundle_plate,
-    open_plate,
-    read_matte,
-    with_blur_in_metres,
-    with_depth,
-    with_own_alpha,
-    with_stereo,
-)
+from mrbokeh.compositing.open_plate import bundle_plate, open_plate, with_blur_in_metres, with_depth, with_stereo
+from mrbokeh.compositing.plate import Inserted, Plate, read_matte, with_own_alpha
 from mrbokeh.depth.depth_map import DepthSettings, parse_near_far, parse_stereo
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.alpha_io import HOLDING_ALPHA, alpha_with, write_finished

@@ -90,7 +90,8 @@ def composite(
     from mrbokeh.commands._composite_options import CompositeOptions, ObjectOptions
     from mrbokeh.compositing.choose import best_mode, insertion_of
     from mrbokeh.compositing.ground import with_ground_behind
-    from mrbokeh.compositing.plate import open_plate, plate_of, with_depth
+    from mrbokeh.compositing.open_plate import open_plate, with_depth
+    from mrbokeh.compositing.plate import plate_of
     from mrbokeh.depth.depth_map import DepthSettings
     from mrbokeh.depth.mended_depth import mended_aloud
     from mrbokeh.images.image_io import read_layer

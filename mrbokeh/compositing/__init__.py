@@ -6,6 +6,7 @@ inserted = insertion_of("between").insert(plate, layers, renderer)
 picture = inserted.rgb
 
 plate            Plate: the photograph; Insertion: the protocol of every mode; Inserted: its picture in two parts
+open_plate       plates of photographs, slices of focal stacks, and captures of the viewfinder
 choose           insertion_of: by the name of the mode; InDirtyRectangle: any mode, computed only in reach of virtual light
 over             blurred layers over the photograph, hidden by its depth first, as they are or with the paper's smoothed matte
 between          behind what is near and blurred in the photograph, before the rest; Rerendered: everything blurred together;

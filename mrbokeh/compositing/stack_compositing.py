@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from mrbokeh.compositing.plate import Inserted, Insertion, Plate, depth_error_dioptres, plate_of
+from mrbokeh.compositing.open_plate import depth_error_dioptres
+from mrbokeh.compositing.plate import Inserted, Insertion, Plate, plate_of
 from mrbokeh.images.camera_rgb import Matrix3x3, write_camera_rgb
 from mrbokeh.images.color import convert
 from mrbokeh.images.exr_io import read_exr, write_exr

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.compositing.plate import open_plate
+from mrbokeh.compositing.open_plate import open_plate
 from mrbokeh.demo.plan import DATA
 from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer
 from mrbokeh.images.image_metrics import psnr

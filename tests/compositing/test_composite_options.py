@@ -16,7 +16,8 @@ from mrbokeh.commands._composited import placing_warning
 from mrbokeh.commands.composite import app
 from mrbokeh.compositing.choose import best_mode, insertion_of
 from mrbokeh.compositing.ground import ended_shadow, with_ground_behind, without_specks
-from mrbokeh.compositing.plate import open_plate, plate_of, with_blur_in_metres
+from mrbokeh.compositing.open_plate import open_plate, with_blur_in_metres
+from mrbokeh.compositing.plate import plate_of
 from mrbokeh.demo.plan import DATA
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.camera_rgb import write_camera_rgb

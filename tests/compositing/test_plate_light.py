@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from mrbokeh.compositing.ground import ground_under
-from mrbokeh.compositing.plate import Plate, open_plate, plate_of
+from mrbokeh.compositing.open_plate import open_plate
+from mrbokeh.compositing.plate import Plate, plate_of
 from mrbokeh.compositing.plate_light import Surroundings, is_sunlit, picture_light, white_at
 from mrbokeh.demo.plan import DATA
 from mrbokeh.images.color import luminance

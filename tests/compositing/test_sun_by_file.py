@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import mrbokeh
-from mrbokeh.compositing.plate import open_plate
+from mrbokeh.compositing.open_plate import open_plate
 from mrbokeh.compositing.plate_light import is_sunlit
 from mrbokeh.demo.plan import DATA
 from mrbokeh.images.image_io import read_image

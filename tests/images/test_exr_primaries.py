@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from capture.photos.developing import develop
 from mrbokeh.commands.render import app as render
-from mrbokeh.compositing.plate import open_plate
+from mrbokeh.compositing.open_plate import open_plate
 from mrbokeh.images.camera_rgb import chromaticities, matrix3x3, read_camera_rgb, write_camera_rgb
 from mrbokeh.images.color import convert
 from mrbokeh.images.exr_io import ExrPart, read_exr, rec709_from_chromaticities, write_exr

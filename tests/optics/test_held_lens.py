@@ -9,7 +9,7 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from mrbokeh.commands.composite import app
-from mrbokeh.compositing.plate import open_plate
+from mrbokeh.compositing.open_plate import open_plate
 from mrbokeh.images.exif import cut_from_px
 from mrbokeh.images.image_io import write_layer
 from mrbokeh.images.layer import Layer

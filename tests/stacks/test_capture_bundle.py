@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
+from mrbokeh.compositing.open_plate import bundle_plate
 from mrbokeh.compositing.over import OverPhotograph
 from mrbokeh.compositing.overlay import Overlay
-from mrbokeh.compositing.plate import bundle_plate
 from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.layer import Layer, clear

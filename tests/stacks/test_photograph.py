@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageOps
 
-from mrbokeh.compositing.plate import open_plate
+from mrbokeh.compositing.open_plate import open_plate
 from mrbokeh.images.color import srgb_to_linear
 from mrbokeh.images.exif import as_stored, upright
 from mrbokeh.stacks.photograph import read_photograph

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.commands._composite_kept import KeptParts
-from mrbokeh.compositing.plate import open_plate
+from mrbokeh.compositing.open_plate import open_plate
 from mrbokeh.images.color import srgb_codes
 from mrbokeh.system.errors import InputError
 from tests.support.card_stack import CARD_PX, SIZE, make_card_stack

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mrbokeh.compositing.open_plate import bundle_plate
 from mrbokeh.compositing.over import OverPhotograph
-from mrbokeh.compositing.plate import bundle_plate
 from mrbokeh.renderers.choose import make_renderer
 from mrbokeh.stacks.capture_bundle import read_bundle
 from mrbokeh.video.clip import read_display_frames

@@ -12,20 +12,17 @@ from mrbokeh.commands._composite_layers import held_upright
 from mrbokeh.commands._composite_options import CompositeOptions, typed_sun
 from mrbokeh.commands._insertion_options import focused_at_pixel, require_one_focus
 from mrbokeh.commands._level_ground import HIGH_SHARE, held_as_told, on_level_ground, sun_by_shadow, usual_tilt_rad, with_camera_of_file
-from mrbokeh.compositing.plate import (
+from mrbokeh.compositing.open_plate import (
     HeldLens,
     LensWishes,
-    Plate,
     held_lens,
     open_plate,
     phone_photo,
     photograph_plate,
-    read_matte,
-    shrunk,
-    shrunk_matte,
     slice_lens,
     with_depth,
 )
+from mrbokeh.compositing.plate import Plate, read_matte, shrunk, shrunk_matte
 from mrbokeh.compositing.plate_look.finishing import Finishing
 from mrbokeh.depth.depth_map import DepthSettings
 from mrbokeh.depth.phone_depth import PhonePhoto
