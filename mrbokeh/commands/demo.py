@@ -13,7 +13,6 @@ app = typer.Typer(add_completion=False)
 @app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for everything it makes.")] = Path("demo_out"),
-    minutes: Annotated[float, typer.Option(min=0.05, help="Training time of the first network; the second takes a third of it.")] = 2.8,
     quick: Annotated[bool, typer.Option("--quick", help="Half a minute, without training: an object in a focus stack.")] = False,
 ) -> None:
     """Run the whole path from RAW photographs to virtual objects with the blur of their lens: capture, train, composite, report.
@@ -32,7 +31,7 @@ def demo(
         write_quick_story(out, run_stages(quick_stages(out / "quick"), out))
         tell(f"\nOpen {(out / 'quick.html').resolve()}")
         return
-    measurements = write_story(out, run_stages(demo_stages(out, minutes), out))
+    measurements = write_story(out, run_stages(demo_stages(out), out))
     for each in measurements:
         tell(f"{'ok    ' if each.met else 'missed'} {each.what}: {each.text} ({each.wanted})")
     tell(f"\nOpen {(out / 'report.html').resolve()}", measurements=[vars(each) for each in measurements])

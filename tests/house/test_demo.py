@@ -116,7 +116,7 @@ def test_the_demo_goes_on_without_an_optional_stage_and_finds_it_later(tmp_path:
 
 
 def test_every_stage_of_the_plan_names_its_outputs(tmp_path: Path) -> None:
-    planned = demo_stages(tmp_path, 1.0)
+    planned = demo_stages(tmp_path)
     assert len({stage.name for stage in planned}) == len(planned)
     assert all(stage.outputs and str(tmp_path) in stage.command_line for stage in planned)
     capture = {("capture", name) for name in ("ingest", "merge", "poses", "scale", "depth", "report")}
@@ -138,7 +138,7 @@ def test_the_quick_demo_shows_an_object_before_and_after_and_is_not_done_twice(t
 
 def test_merging_again_takes_everything_after_it_again(tmp_path: Path) -> None:
     """`merge` overwrites the pictures that `depth` made, so that no later stage may be skipped."""
-    planned = {stage.name: stage for stage in demo_stages(tmp_path, 1.0)}
+    planned = {stage.name: stage for stage in demo_stages(tmp_path)}
     fed = {name for name, stage in planned.items() if planned["desk_merge"].feeds(stage)}
     assert {"desk_poses", "desk_scale", "desk_depth", "desk_report", "desk_fit", "desk_evaluate", "desk_cake_sharp_network"} <= fed
     assert not any(name.startswith("board") for name in fed)
