@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair, write_blur_pair
-from mrbokeh.lens_measuring.fitting.pair_matching import blurred_by_disc
+from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair, blurred_by_disc, write_blur_pair
 from mrbokeh.system.errors import InputError
 from tests.lens_measuring.test_blur_pairs import DIAMETER_PX, SIZE, pair
 from tests.support.command_line import printed_by
