@@ -84,7 +84,7 @@ class FocusOptions:
 
 def reconstructed(renderer: Renderer, method: str, samples: Path, lens: Lens) -> Layer:
     """A picture from noisy samples, by a renderer that takes them."""
-    from mrbokeh.stacks.light_field_samples_file import read_samples
+    from mrbokeh.layering.light_field_samples import read_samples
 
     if not hasattr(renderer, "reconstruct"):
         raise InputError(f"--samples are for --renderer lrdm or laplacian, got --renderer {method}")

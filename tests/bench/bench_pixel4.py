@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 
 from mrbokeh.images.layer import opaque
-from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair, match, write_blur_pair
+from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair, match
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import field_positions
 from mrbokeh.optics.lens import Lens
@@ -41,6 +41,7 @@ from tests.bench.pixel4_measures import decibels, in_even_light, in_even_light_d
 from tests.bench.pixel4_page import write_pixel4_page
 from tests.bench.pixel4_set import COLUMNS, KERNEL_PX, ROWS, SIZE, Scene, bank_of_kernels, centred, published_kernels, read_scene, scenes
 from tests.bench.process_cost import mrbokeh
+from tests.support.blur_pair_files import write_blur_pair
 
 BAR_DB, FITTED_BAR_DB, CORRELATION_BAR = 35.0, 0.5, 0.97
 METHODS = ("no blur", "Gaussian", "disc", "exact", "published", "ours", "network")

@@ -22,7 +22,6 @@ from mrbokeh.lens_measuring.fitting.blur_pairs import (
     find_blur_pairs,
     match,
     read_blur_pair,
-    write_blur_pair,
 )
 from mrbokeh.lens_measuring.fitting.lens_fit import FitSettings, fit_lens
 from mrbokeh.lens_measuring.fitting.stack_equations import usable_pixels
@@ -31,6 +30,7 @@ from mrbokeh.optics.psf_bank_file import read_bank
 from mrbokeh.renderers.scatter_reference import scatter
 from mrbokeh.system.errors import InputError
 from tests.lens_measuring.test_lens_fitting import kernels_are_like
+from tests.support.blur_pair_files import write_blur_pair
 from tests.support.refusals import refused
 
 SIZE = (110, 150)

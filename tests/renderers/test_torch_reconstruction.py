@@ -11,10 +11,9 @@ import numpy as np
 import pytest
 
 from mrbokeh.images.image_metrics import psnr
-from mrbokeh.layering.light_field_samples import LightFieldSamples
+from mrbokeh.layering.light_field_samples import LightFieldSamples, read_samples
 from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
-from mrbokeh.stacks.light_field_samples_file import read_samples
 from mrbokeh.system.errors import InputError, MissingExtraError
 from tests.support.sampled_planes import LENS, fence_scene, sample_planes
 

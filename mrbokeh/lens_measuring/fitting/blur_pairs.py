@@ -8,9 +8,12 @@ surfaces mirror something else once a light or a camera has moved. A kernel woul
 a disc of the diameters that are known, and what brings that nearest to the blurred one is solved for by Gauss and Newton's steps (Lucas and
 Kanade 1981): six numbers of an affine map, the light in common and its slow change over the frame. The shape of the kernel, which is not
 known yet, is not needed: a disc of the right size has the right middle.
+
+A fit sees slices of focal stacks and pairs as StackSlices: one view after the other.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -19,14 +22,17 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 from scipy.ndimage import distance_transform_edt
 
-from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
+from mrbokeh.images.camera_rgb import SliceMasks
+from mrbokeh.images.exr_io import read_exr
 from mrbokeh.lens_measuring.fitting.pupil_picture import EXTENT
-from mrbokeh.lens_measuring.fitting.stack_equations import SliceView, usable_pixels
+from mrbokeh.lens_measuring.fitting.stack_equations import LEAST_CONFIDENCE, SliceView, smoothed_coc, usable_pixels
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
+from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.system.errors import InputError
 
+_NO_TRUTH = ("moving", "border", "board")
 Mask = Bool[np.ndarray, "height width"]
 
 _PIXELS = 30_000
@@ -222,14 +228,79 @@ def read_blur_pair(folder: Path) -> BlurPair:
     return BlurPair(folder, sharp, blurred, np.asarray(part.planes([COC])[0], np.float32))
 
 
-def write_blur_pair(pair: BlurPair) -> None:
-    """Write both files into the pair's folder, in float32."""
-    pair.folder.mkdir(parents=True, exist_ok=True)
-    planes = {name: np.ascontiguousarray(pair.sharp[..., i]) for i, name in enumerate("RGB")}
-    write_exr(pair.folder / SHARP, ExrPart(planes | {COC: pair.coc_px}))
-    write_exr(pair.folder / BLURRED, ExrPart({name: np.ascontiguousarray(pair.blurred[..., i]) for i, name in enumerate("RGB")}))
-
-
 def find_blur_pairs(folder: Path) -> list[BlurPair]:
     """Read the pairs in a folder: itself, or the folders under it, by name."""
     return [read_blur_pair(path.parent) for path in sorted(Path(folder).rglob(SHARP)) if is_blur_pair(path.parent)]
+
+
+def known_pixels(confidence: Plane, masks: SliceMasks, exclusions: Mapping[str, Mask]) -> Mask:
+    """Return the pixels with a trusted depth whose light was measured."""
+    known = (confidence >= LEAST_CONFIDENCE) & masks.valid & ~masks.saturated
+    for reason in (*_NO_TRUTH, "low_confidence"):
+        known &= ~exclusions.get(reason, np.zeros_like(known))
+    return np.asarray(known)
+
+
+@dataclass
+class StackSlices:
+    """Slices of all stacks, one after the other; pictures that a stack's slices share are kept while it is read. A pair is one slice."""
+
+    stacks: tuple[FocalStack | BlurPair, ...]
+    longest: int
+    _of_stack: dict[int, tuple[np.ndarray, ...]] = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def of(cls, stacks: Sequence[FocalStack | BlurPair]) -> "StackSlices":
+        """Open stacks and pairs. Raises InputError if a stack is not registered, merged and metric."""
+        for stack in stacks:
+            if not isinstance(stack, FocalStack):
+                continue
+            if not stack.registered:
+                raise InputError(
+                    f"{stack.folder} is not registered, so its slices do not lie on its depth: run `mrbokeh capture merge` on it"
+                )
+            stack.depth_m()
+            stack.stated_lens_of(0)
+        return cls(tuple(stacks), max((len(stack) for stack in stacks), default=1))
+
+    def __len__(self) -> int:
+        return sum(len(stack) for stack in self.stacks)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Return width and height of the first stack."""
+        first = self.stacks[0]
+        if not isinstance(first, FocalStack):
+            return first.size
+        height, width = first.depth_m().shape
+        return width, height
+
+    def place(self, number: int) -> tuple[FocalStack | BlurPair, int]:
+        """Return the stack and slice of a number."""
+        for stack in self.stacks:
+            if number < len(stack):
+                return stack, number
+            number -= len(stack)
+        raise IndexError(number)
+
+    def view(self, number: int) -> SliceView:
+        stack, index = self.place(number)
+        if not isinstance(stack, FocalStack):
+            return stack.view
+        if id(stack) not in self._of_stack:
+            self._of_stack = {id(stack): (stack.all_in_focus(), stack.depth_m(), stack.depth_confidence())}
+        sharp, depth_m, confidence = self._of_stack[id(stack)]
+        known = known_pixels(confidence, stack.slice_masks(index), stack.exclusions()) & (depth_m > 0.0)
+        return SliceView(sharp, stack.slice_rgb(index), smoothed_coc(stack.coc_px(index, depth_m), confidence), known)
+
+
+def largest_diameter_px(stacks: Sequence[FocalStack | BlurPair]) -> float:
+    """Return the largest circle of confusion of any slice; 0 without stacks."""
+    return max((_largest_px(stack) for stack in stacks), default=0.0)
+
+
+def _largest_px(stack: FocalStack | BlurPair) -> float:
+    if not isinstance(stack, FocalStack):
+        return stack.largest_px
+    depth_m = stack.depth_m()
+    return max(float(np.abs(stack.coc_px(index, depth_m)).max()) for index in range(len(stack)))

@@ -1,12 +1,11 @@
 """Light tracing by torch: on an NVIDIA GPU, or on any processor that torch runs on (models of Leimkuehler et al. 2018, Section 5.1).
 
-Twins of the compiled loops (`_physical_lens_numba` and so on; of `_volume_numba` here), a step of theirs at a time for all rays or photons
-of a block. They take the
-same quasi-random points, and photons the same random numbers, in double precision and in the same order of operations. A ray
-then lands where the compiled one lands but for rounding (torch's square roots, sines and logarithms may differ in the last
-bit): within 1e-13 mm behind the double Gauss, so that about one ray in a million million takes the pixel beside. Light is
-added up in whole numbers (`_sums`), which come out the same in any order. A bank is therefore the same to float32 on any device,
-and a half-built one goes on on another.
+Twins of the compiled loops (`_physical_lens_numba`, `_rays_numba`), a step of theirs at a time for all rays or photons of a block. They
+take the same quasi-random points, and photons the same random numbers, in double precision and in the same order of operations. A ray
+then lands where the compiled one lands but for rounding (torch's square roots, sines and logarithms may differ in the last bit): within
+1e-13 mm behind the double Gauss, so that about one ray in a million million takes the pixel beside. Light is added up in whole numbers
+(`_sums`), which come out the same in any order. A bank is therefore the same to float32 on any device, and a half-built one goes on on
+another.
 
 What does not grow with the rays stays on the CPU: the points themselves, the search for chief rays and windows, the turning of
 rings into pixels.
@@ -120,7 +119,7 @@ def trace_photons(
     majorant_per_m: float,
     anisotropy: float,
 ) -> tuple[Photons, Int64[Tensor, " photons"]]:
-    """Return (cosines between headings and normals, collisions): see `_volume_numba.trace_photons`. Finished photons leave the loop."""
+    """Return (cosines between headings and normals, collisions): see `_rays_numba.trace_photons`. Finished photons leave the loop."""
     radii = on(device_named(device), radii_m)
     cosines, collisions = torch.ones_like(radii), torch.zeros_like(radii, dtype=torch.int64)
     if density_per_m <= 0.0:
@@ -158,7 +157,7 @@ def photons_in_rings(
     ring_px: float,
     rings: int,
 ) -> Float64[np.ndarray, "rings channels"]:
-    """Sort photons into rings as `_volume_numba.add_to_rings` does."""
+    """Sort photons into rings as `_rays_numba.add_to_rings` does."""
     sine = torch.sqrt((1.0 - cosines * cosines).clamp(min=0.0))
     ring = torch.where(cosines > 0.0, focal_px * sine / (cosines * ring_px), math.inf)
     caught = ring < rings
