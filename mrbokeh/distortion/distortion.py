@@ -116,7 +116,7 @@ HUGIN_UNIT = 1.0 / np.hypot(1.0, 1.5)
 class LensDistortion:
     """Model of `mrbokeh.distortion.radial` with its values, or an ST map, about a camera's principal point.
 
-    model: its name; "none" bends nothing. values: in the order of models.PARAMETERS.
+    model: its name; "none" bends nothing. values: in the order of radial.PARAMETERS.
     unit_half_diagonals: for ptlens, poly3 and poly5 the radius 1 of the polynomial, in half diagonals of the camera's frame.
     st_map: in place of a model.
     Every method takes the plate's camera, of any resolution; only its frame and intrinsics count. The pinhole has the same

@@ -28,7 +28,7 @@ from training.fitting.checkpoint import CurvePoint, Learner, Progress, draw_curv
 from training.fitting.run_folder import RunFacts, save_network
 from training.fitting.settings import TrainSettings, settings_words, tried_rates
 
-FILE_NAME = "index.html"
+PAGE_NAME = "index.html"
 SHEETS = "sheets"
 _MOMENTS = 6
 _COLUMNS = 3  # of a sheet: sharp picture, network, photograph
@@ -267,7 +267,7 @@ def write_run_page(
         section("Curves", "Training loss (smoothed), PSNR of held-out slices, learning rate.", [f'<div class="curve">{curve_svg}</div>']),
         section("Held-out slices as they came along", words if strips else none, strips),
     ]
-    write_page(folder / FILE_NAME, f"{folder.resolve().name}, step {progress.step}", blocks, _STYLE)
+    write_page(folder / PAGE_NAME, f"{folder.resolve().name}, step {progress.step}", blocks, _STYLE)
 
 
 def facts_of_run(progress: Progress, settings: TrainSettings, facts: RunFacts, pairs: int, stopped: bool) -> dict[str, str]:
