@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from datasets_scripts.made_sets.set_files import Overwrite, mistakes_told
 from datasets_scripts.scenes.textures import mottled
 from datasets_scripts.tracers._sheet_numba import PackedLens, PackedTable, shade
-from mrbokeh.optics.camera import Camera, camera_from_json, camera_of_lens, camera_to_json
+from mrbokeh.optics.camera import Camera, camera_of_lens, camera_to_json
 from mrbokeh.optics.lens import MM_PER_M, Lens
 from mrbokeh.system.atomic_files import read_json, refuse_existing, write_json
 from mrbokeh.system.console import track
@@ -170,12 +170,6 @@ def write_clip(path: Path, clip: BoardClip, *, overwrite: bool = False) -> None:
     lens = {"focal_length_mm": clip.lens.focal_length_mm, "f_number": clip.lens.f_number, "focus_distance_m": clip.lens.focus_distance_m}
     cameras = [camera_to_json(clip.camera(frame)) for frame in range(clip.frames)]
     write_json(path.with_suffix(".json"), {"fps": clip.fps, "lens": lens, "cameras": cameras})
-
-
-def read_clip_cameras(path: Path) -> list[Camera]:
-    """Read the cameras from the .json beside a clip."""
-    document = read_json(path, "the cameras of a clip")
-    return [camera_from_json(each, f"{path}, frame {number}") for number, each in enumerate(document["cameras"])]
 
 
 def read_sheet(path: Path) -> Sheet:

@@ -5,7 +5,7 @@ true shape of the blur, errors of the all-in-focus picture) can be carried over 
 Section 5.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +18,6 @@ from mrbokeh.depth.open_depth import open_depth
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.images.image_io import write_image
-from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
@@ -166,36 +165,6 @@ def _smoothed(residual: Rgb, sigma_px: float) -> Rgb:
     import cv2
 
     return cv2.GaussianBlur(residual, (0, 0), sigma_px, borderType=cv2.BORDER_REFLECT) if sigma_px > 0.1 else residual
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """A slice predicted from the others: linear PSNR in dB, clipped to [0, 1], without and with residuals, and of the nearest slice."""
-
-    index: int
-    focus_distance_m: float
-    rendered_db: float
-    with_residuals_db: float
-    nearest_slice_db: float
-
-
-def leave_one_out(stack: FocalStack, renderer: Renderer, most: int | None = None) -> Iterator[LeftOut]:
-    """Predict each slice but the first and the last from the others. The all-in-focus picture has seen it, as in use it has not.
-
-    most: so many slices at most, evenly taken; None for all.
-    """
-    plain, full = Refocusing(stack, renderer, residuals=False), Refocusing(stack, renderer)
-    order = sorted(range(len(stack)), key=lambda index: 1.0 / float(stack.slices[index].focus_distance_m or np.inf))
-    inner = range(1, len(order) - 1)
-    for place in inner if most is None or len(inner) <= most else np.linspace(1, len(order) - 2, most).round().astype(int):
-        before, index, after = order[place - 1 : place + 2]
-        truth, focus_m = stack.slice_rgb(index), float(stack.slices[index].focus_distance_m or np.inf)
-        mask = stack.slice_masks(index).valid
-        nearest = max(psnr(stack.slice_rgb(other), truth, mask=mask) for other in (before, after))
-        predicted = [psnr(way.slice_at(focus_m, leave_out=index), truth, mask=mask) for way in (plain, full)]
-        yield LeftOut(
-            index=index, focus_distance_m=focus_m, rendered_db=predicted[0], with_residuals_db=predicted[1], nearest_slice_db=nearest
-        )
 
 
 @dataclass(frozen=True)

@@ -29,8 +29,7 @@ from capture.report.gates import (
 )
 from capture.report.pictures import Shown, ShownPlace, shown_places, slice_triple, stack_maps, worst_places
 from capture.report.report_cache import read_cache, signature_of, write_cache
-from capture.report.scene_gates import SCENE_RULES, WHERE, Reconstruction, merged_gate, read_reconstruction, scene_gates
-from capture.report.stack_gates import stack_gates
+from capture.report.stack_gates import SCENE_RULES, WHERE, Reconstruction, merged_gate, read_reconstruction, scene_gates, stack_gates
 from capture.report.stack_section import ExaminedStack, gate_table, stack_section
 from capture.report.stack_view import DEFAULT_WIDTH_PX, Reblur, StackView
 from mrbokeh import __version__

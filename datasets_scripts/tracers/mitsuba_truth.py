@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Float32, Int
 
 from datasets_scripts.tracers.pupil import pupil_table
-from datasets_scripts.tracers.sobol import owen_scrambled, scramble_seed, sobol_table
 from datasets_scripts.tracers.truth import (
     LAMP_STREAM,
     OWN_LAMP,
@@ -25,6 +24,9 @@ from datasets_scripts.tracers.truth import (
     field_scale,
     lamp_flux,
     lamps_of,
+    owen_scrambled,
+    scramble_seed,
+    sobol_table,
     triangles_of,
 )
 from datasets_scripts.tracers.truth_scene import FACET_COLUMNS, PackedScene

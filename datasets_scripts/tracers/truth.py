@@ -1,4 +1,4 @@
-"""The thin lens of the truth scenes: an opening, and what a tracer is asked for.
+"""The thin lens of the truth scenes: an opening, what a tracer is asked for, and the points that its rays start from.
 
 A camera ray goes from a point of the entrance pupil through the point of the focus plane that its film point is an image of.
 The film keeps its distance, so that the field of view does not change with the focus. A lens point u of the unit pupil
@@ -7,13 +7,18 @@ The film keeps its distance, so that the field of view does not change with the 
 Cat-eyes and stops: a front rim clips the pupil by a circle of radius 1 around -cat_eye * field_xy, where field_xy is the place of
 the point that is SEEN, in half diagonals from the middle of the frame; a stop (`pupil.FieldStop`) depends on that place too. Each
 ray counts 1 over the share of the pupil that is open for its point, so that nothing is vignetted.
+
+The points are Sobol's, with a nested uniform (Owen) scramble of their own for every pixel: Burley, Practical Hash-based Owen Scrambling
+(JCGT 9(4), 2020), whose constants are used here, after Laine and Karras (2011). Those functions take arrays of unsigned 32-bit numbers of
+NumPy or Dr.Jit alike: both wrap around.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, UInt32
 
 from datasets_scripts.tracers.pupil import FieldStop, OpenShares, open_shares
 from datasets_scripts.tracers.truth_scene import PackedScene
@@ -21,6 +26,7 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
 
+DIMENSIONS = 4
 Part = Literal["all", "thin", "rest"]
 Picture = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -115,3 +121,34 @@ def lamp_flux(scene: PackedScene, camera: Camera, number: int) -> Float64[np.nda
     """Return the sum of a lamp's light over all pixels where nothing hides it: radiance times the area of its sharp image."""
     lamp, depth_m = scene.lamps[number], float(scene.lamp_centres_m[number, 2])
     return np.asarray(lamp.radiance_rgb) * np.pi * lamp.radius_m**2 * np.prod(camera.focal_px) / depth_m**2
+
+
+def sobol_table(samples: int) -> UInt32[np.ndarray, "samples 4"]:
+    """Return the first points of the four-dimensional Sobol sequence as 32-bit fractions; a power of two is best."""
+    from scipy.stats import qmc
+
+    sequence = qmc.Sobol(DIMENSIONS, scramble=False, bits=32)
+    points = sequence.random(1 << max(0, (samples - 1).bit_length()))[:samples]
+    return np.round(points * 2.0**32).astype(np.uint64).astype(np.uint32)
+
+
+def owen_scrambled(bits: Any, seed: Any, reverse_bits: Callable[[Any], Any]) -> Any:
+    """Scramble a 32-bit fraction; points of one sequence stay well spread where they share the seed."""
+    x = reverse_bits(bits) + seed
+    x = x ^ (x * 0x6C50B47C)
+    x = x ^ (x * 0xB82F1E52)
+    x = x ^ (x * 0xC7AFE638)
+    x = x ^ (x * 0x8D22F6E6)
+    return reverse_bits(x)
+
+
+def scramble_seed(pixel: Any, stream: Any) -> Any:
+    """Return a seed for each pixel and each stream (a dimension of one picture)."""
+    return _mixed(pixel * 0x9E3779B9 + _mixed(stream + 0x85EBCA6B))
+
+
+def _mixed(x: Any) -> Any:
+    """Mix a number by the finaliser of MurmurHash3: every bit changes about half of the bits of the result."""
+    x = (x ^ (x >> 16)) * 0x85EBCA6B
+    x = (x ^ (x >> 13)) * 0xC2B2AE35
+    return x ^ (x >> 16)

@@ -27,8 +27,7 @@ from mrbokeh.images.exr_io import ATTRIBUTE, headers_of
 from mrbokeh.renderers.choose import BY_NAME, lens_and_renderer
 from mrbokeh.shots.composite_recipe import CompositeRecipe
 from mrbokeh.shots.executors import DaskExecutor, Executor, ProcessExecutor, SerialExecutor
-from mrbokeh.shots.found_depth import find_depth, found_depth_files
-from mrbokeh.shots.frame_sources import CameraFile, ClipLook, DepthFiles, FocusPulled, MatteFiles
+from mrbokeh.shots.frame_sources import CameraFile, ClipLook, DepthFiles, FocusPulled, MatteFiles, find_depth, found_depth_files
 from mrbokeh.shots.inputs import Moment
 from mrbokeh.shots.layer_sources import LayerFiles, sources_by_depth, with_cryptomatte
 from mrbokeh.shots.proxies import proxy_recipe

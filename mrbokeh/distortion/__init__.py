@@ -6,7 +6,7 @@
     wide = overscan_camera(plate_camera, distortion)
     layer = distorted(renderer.render(scene, wide), wide, plate_camera, distortion)
 
-`distortion` holds LensDistortion with its JSON, COLMAP's models and ST maps, `models` the polynomials and their inverse, `warping` the
+`distortion` holds LensDistortion with its JSON, COLMAP's models and ST maps, `radial` the polynomials and their inverse, `warping` the
 overscan and the resampling of layers.
 """
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mrbokeh.distortion.models import IN_LENGTHS, PARAMETERS, bent, fold_radius, unbent
+from mrbokeh.distortion.radial import IN_LENGTHS, PARAMETERS, bent, fold_radius, unbent
 from mrbokeh.images.exr_io import read_exr
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.atomic_files import read_json
@@ -114,9 +114,9 @@ HUGIN_UNIT = 1.0 / np.hypot(1.0, 1.5)
 
 @dataclass(frozen=True)
 class LensDistortion:
-    """Model of `mrbokeh.distortion.models` with its values, or an ST map, about a camera's principal point.
+    """Model of `mrbokeh.distortion.radial` with its values, or an ST map, about a camera's principal point.
 
-    model: its name; "none" bends nothing. values: in the order of models.PARAMETERS.
+    model: its name; "none" bends nothing. values: in the order of radial.PARAMETERS.
     unit_half_diagonals: for ptlens, poly3 and poly5 the radius 1 of the polynomial, in half diagonals of the camera's frame.
     st_map: in place of a model.
     Every method takes the plate's camera, of any resolution; only its frame and intrinsics count. The pinhole has the same
@@ -226,21 +226,8 @@ def colmap_distortion(model: str, parameters: Sequence[float]) -> tuple[Pair, Pa
     return (float(focal[0]), float(focal[-1])), (float(cx), float(cy)), distortion
 
 
-def distortion_to_json(distortion: LensDistortion) -> dict[str, Any]:
-    """Return the JSON document of a distortion. Raises InputError for an ST map that was not read from a file."""
-    if distortion.st_map is not None:
-        if distortion.st_map.path is None:
-            raise InputError(
-                "an ST map is written by its file's name, but this one was made in memory: write it as EXR and read it from there"
-            )
-        return {"model": "st_map", "path": distortion.st_map.path, "kind": distortion.st_map.kind}
-    named = zip(PARAMETERS.get(distortion.model, ()), distortion.values, strict=True)
-    unit = {"unit_half_diagonals": distortion.unit_half_diagonals} if distortion.model in IN_LENGTHS else {}
-    return {"model": distortion.model, **{name: value for name, value in named if value}, **unit}
-
-
 def distortion_from_json(document: dict[str, Any], where: str = "distortion", folder: Path | str = ".") -> LensDistortion:
-    """Read the document of `distortion_to_json`; an ST map's path is relative to `folder`.
+    """Read {"model": "opencv", "k1": -0.1, ...}; an ST map's path is relative to `folder`.
 
     Values without a model are OpenCV's, as camera tracks have them: {"k1": -0.1}.
     COLMAP's names are understood too: {"model": "RADIAL", "values": [k1, k2]}, without focal length and principal point.

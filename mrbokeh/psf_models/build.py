@@ -91,7 +91,7 @@ class Combined:
 
     def kernel(self, box: Float64[np.ndarray, "axes 2"], rays: int, seed: int) -> Kernel:
         """See `PsfModel.kernel`."""
-        from mrbokeh.psf_models._lens_points_numba import fill_capsule
+        from mrbokeh.psf_models._rays_numba import fill_capsule
 
         size = _size(float(box[0, 1]), float(box[1, 1]))
         total = np.zeros((size, size))
@@ -117,7 +117,7 @@ def _tracer(device: str) -> Callable[..., float]:
         from mrbokeh.psf_models.torch_tracing import trace_capsule as trace_on
 
         return partial(trace_on, device)
-    from mrbokeh.psf_models._lens_points_numba import trace_capsule
+    from mrbokeh.psf_models._rays_numba import trace_capsule
 
     return trace_capsule
 

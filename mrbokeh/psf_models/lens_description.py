@@ -68,7 +68,7 @@ class TracedLight:
 
 
 class Bench:
-    """A lens before a sensor, focused as a photographer does; spot_mm: the mean radius of a point in focus on the axis."""
+    """A lens before a sensor, focused as a photographer does: a point on the axis is as small as it gets."""
 
     def __init__(self, prescription: LensPrescription, focus_distance_m: float, half_diagonal_mm: float) -> None:
         self.prescription, self.half_diagonal_mm = prescription, half_diagonal_mm
@@ -79,7 +79,7 @@ class Bench:
         moved = self._landed(LensBeam(prescription, paraxial_mm + 1.0, half_diagonal_mm), focus_distance_m, 0.0)
         reach = ends[0][:, 1, :] + shifts_mm[:, None, None] * (moved[0] - ends[0])[:, 1, :]
         spots_mm = (np.hypot(reach[..., 0], reach[..., 1]) * ends[1][:, 1]).sum(axis=1) / ends[1][:, 1].sum()
-        self.focus_shift_mm, self.spot_mm = float(shifts_mm[np.argmin(spots_mm)]), float(spots_mm.min())
+        self.focus_shift_mm = float(shifts_mm[np.argmin(spots_mm)])
         self.beam = LensBeam(prescription, paraxial_mm + self.focus_shift_mm, half_diagonal_mm)
 
     def light(self, depth_m: float, eccentricity: float) -> TracedLight:

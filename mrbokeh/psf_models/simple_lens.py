@@ -116,7 +116,7 @@ def _stylized_tracer(device: str) -> Callable[..., float]:
         from mrbokeh.psf_models.torch_tracing import trace_picture as trace_on
 
         return partial(trace_on, device)
-    from mrbokeh.psf_models._lens_points_numba import trace_picture
+    from mrbokeh.psf_models._rays_numba import trace_picture
 
     return trace_picture
 
@@ -259,13 +259,13 @@ def _tracer(device: str) -> Callable[..., float]:
         from mrbokeh.psf_models.torch_tracing import trace_lens as trace_on
 
         return partial(trace_on, device)
-    from mrbokeh.psf_models._lens_points_numba import trace_lens
+    from mrbokeh.psf_models._rays_numba import trace_lens
 
     return trace_lens
 
 
 def banded_edges(plain: Aperture, extent: float) -> tuple[Float64[np.ndarray, "edges 5"], Int64[np.ndarray, " bands_and_end"]]:
-    """Return (edges, starts) as `_lens_points_numba.opening_at` takes them: the edges of all outlines, sorted into bands of height.
+    """Return (edges, starts) as `_rays_numba.opening_at` takes them: the edges of all outlines, sorted into bands of height.
 
     The winding direction of an outline does not matter: its weight takes the sign of its area.
     """

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from mrbokeh.optics.psf_bank import Axis, Turns
-from mrbokeh.psf_models import _volume_numba as compiled
+from mrbokeh.psf_models import _rays_numba as compiled
 from mrbokeh.psf_models.base import Kernel, check_positive, sobol_blocks
 from mrbokeh.system.errors import InputError
 

@@ -1,9 +1,14 @@
-"""Camera, focus, depth, matte and look of each frame, from files and from the clip itself."""
+"""Camera, focus, depth, matte and look of each frame, from files and from the clip itself.
 
+Depth that is found from the clip and the track of its moving camera is kept in a folder beside the track.
+"""
+
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
+from time import monotonic
 
 import numpy as np
 from jaxtyping import Float32
@@ -14,10 +19,13 @@ from mrbokeh.compositing.plate_look.exposure_match import stated_exposure
 from mrbokeh.compositing.plate_look.finishing import Finishing, LookOptions, finished, finishing_of
 from mrbokeh.depth.depth_filters import TemporalDepthFilter
 from mrbokeh.depth.open_depth import depth_of_file
+from mrbokeh.depth.views import DEPTH_NAME
 from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.optics.camera import Camera, have_same_shape
 from mrbokeh.shots.inputs import CameraSource, DepthSource, Finisher, FocusSource, Kept, MatteSource, Moment
-from mrbokeh.system.atomic_files import read_json
+from mrbokeh.system.atomic_files import read_json, writing_alone
+from mrbokeh.system.channel import say
+from mrbokeh.system.console import kept_when_interrupted
 from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.camera_track.focus_pull import FocusPull, parse_focus_keys, read_focus_pull
 from mrbokeh.tracking.camera_track.formats import format_of_file, read_track
@@ -301,3 +309,33 @@ def _is_single_camera(path: Path) -> bool:
 def _remark(path: Path) -> str:
     """Return a hint that COLMAP's usual axis may be stated otherwise."""
     return " (as in most of COLMAP's maps; state another by --up in that conversion)" if format_of_file(path) == "colmap" else ""
+
+
+def found_depth_files(camera: Path, clip: Path) -> Path:
+    """Return the pattern of the files that hold the depth of a tracked clip. camera: its track."""
+    return _folder(camera, clip) / DEPTH_NAME
+
+
+def _folder(camera: Path, clip: Path) -> Path:
+    """Return where the depth of a tracked clip is kept: beside the track."""
+    name = re.sub(r"\W+", "_", re.sub(r"%0?\d*d|#+", "", clip.stem)).strip("_")
+    return camera.resolve().with_name(f"{camera.stem}_{name}_depth")
+
+
+def find_depth(source: PictureSource, camera: Path, taken: Sequence[int], first_number: int) -> None:
+    """Find the depth of the frames that are taken, as far as it is not kept from an earlier run."""
+    from mrbokeh.depth.views.clip_depth import ClipDepth
+    from mrbokeh.tracking.camera_track.formats import read_track
+    from mrbokeh.tracking.camera_track.track import TrackOptions
+
+    size_px, folder = (source.info.width_px, source.info.height_px), _folder(camera, source.path)
+    track = read_track(camera, TrackOptions(size_px=size_px))
+    if not track.metric:
+        say(f"the lengths of {camera.name} may not be metres: depth is in its unit, as places in a scene and Z of layers have to be")
+    found = ClipDepth(source, track, folder, first_number)
+    began_s = monotonic()
+    with writing_alone(folder), kept_when_interrupted(f"finished depth is kept in {folder}"):
+        made = found.write(taken)
+    if made:
+        took_s = (monotonic() - began_s) / made
+        say(f"depth of {made} frames lies in {folder} ({took_s:.1f} s a frame); what moves by itself has that of what is behind it")

@@ -19,10 +19,9 @@ from skimage.restoration import denoise_nl_means
 from mrbokeh.images.color import linear_to_srgb, srgb_to_linear
 from mrbokeh.images.image_io import read_image
 from mrbokeh.images.image_metrics import psnr, ssim
-from mrbokeh.layering.light_field_samples import LightFieldSamples
+from mrbokeh.layering.light_field_samples import LightFieldSamples, read_samples
 from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
-from mrbokeh.stacks.light_field_samples_file import read_samples
 from tests.bench.machine import in_turns, tell
 from tests.support.sampled_planes import LENS, Plane, checker, fence_scene, sample_planes, truth, waves
 

@@ -1,7 +1,7 @@
 """A real lens: photographs of a Pixel 4 predicted from their all-in-focus truth: `python -m tests.bench.bench_pixel4 DATA [--out PAGE]`.
 
 DATA is the folder of the set (`DP_data_pixel_4`, `gt_all_in_focus_im`, `gt_defocus_map`, `calibration`, see `pixel4_set`). Each scene's
-truth is registered to its photograph (`lens_measuring.fitting.pair_matching`: one affine map a scene, found through a disc, the same for
+truth is registered to its photograph (`lens_measuring.fitting.blur_pairs`: one affine map a scene, found through a disc, the same for
 all that are compared), blurred by our renderer through a Gaussian, a disc, the published kernels and the kernels that `mrbokeh lens fit`
 finds in the other scenes, and compared with the photograph: PSNR of linear light, 1 being what 0.1 % of the photograph's pixels exceed.
 
@@ -28,8 +28,7 @@ import cv2
 import numpy as np
 
 from mrbokeh.images.layer import opaque
-from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair, write_blur_pair
-from mrbokeh.lens_measuring.fitting.pair_matching import match
+from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair, match
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.camera import field_positions
 from mrbokeh.optics.lens import Lens
@@ -42,6 +41,7 @@ from tests.bench.pixel4_measures import decibels, in_even_light, in_even_light_d
 from tests.bench.pixel4_page import write_pixel4_page
 from tests.bench.pixel4_set import COLUMNS, KERNEL_PX, ROWS, SIZE, Scene, bank_of_kernels, centred, published_kernels, read_scene, scenes
 from tests.bench.process_cost import mrbokeh
+from tests.support.blur_pair_files import write_blur_pair
 
 BAR_DB, FITTED_BAR_DB, CORRELATION_BAR = 35.0, 0.5, 0.97
 METHODS = ("no blur", "Gaussian", "disc", "exact", "published", "ours", "network")

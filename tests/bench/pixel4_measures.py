@@ -10,7 +10,7 @@ import numpy as np
 from skimage.metrics import structural_similarity
 
 from mrbokeh.images.color import linear_to_srgb
-from mrbokeh.lens_measuring.fitting.pair_matching import even_light
+from mrbokeh.lens_measuring.fitting.blur_pairs import even_light
 from tests.bench.flip import flip
 from tests.bench.pixel4_set import Scene
 

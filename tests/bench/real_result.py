@@ -168,8 +168,8 @@ def _focus(stack: RealStack, made: FocalStack) -> Focus | None:
 
 
 def _left_out(made: FocalStack) -> LeaveOneOut:
-    from mrbokeh.refocus import leave_one_out
     from mrbokeh.renderers.choose import lens_and_renderer
+    from tests.support.left_out_slices import leave_one_out
 
     started = time.process_time()
     try:

@@ -12,8 +12,7 @@ from scipy.ndimage import gaussian_filter
 from mrbokeh.compositing.over import OverPhotograph, behind
 from mrbokeh.compositing.plate import Inserted, Plate, plate_of
 from mrbokeh.compositing.plate_look.colour_match import ColourMatch
-from mrbokeh.compositing.plate_look.compression import JpegCompression
-from mrbokeh.compositing.plate_look.finishing import Finishing, LightWrap, LookOptions, finished, matched_finishing
+from mrbokeh.compositing.plate_look.finishing import Finishing, JpegCompression, LightWrap, LookOptions, finished, matched_finishing
 from mrbokeh.compositing.plate_look.grain import Grain, GrainDraw, add_grain_to, measured_grain
 from mrbokeh.compositing.plate_look.noise_measurement import NoiseLevel
 from mrbokeh.compositing.plate_look.vignetting import RadialFalloff

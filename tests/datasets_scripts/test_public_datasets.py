@@ -17,9 +17,9 @@ from mrbokeh.stacks.focal_stack import read_focal_stack
 from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset, read_focal_stack_dataset
 from tests.support.command_line import printed_by
 from tests.support.refusals import refused
+from tests.support.scattered_pictures import scatter_reference
 from training.data.dataset import read_pair
 from training.data.training_data import training_data
-from training.evaluation.methods import scatter_reference
 
 WIDTH, HEIGHT = 96, 64
 NEAR_M, FAR_M = 1.0, 4.0

@@ -10,9 +10,8 @@ from datasets_scripts.made_sets.truth_set import SHAPE_NAMES, TruthPlan, lens_sh
 from datasets_scripts.render_truth import main, render_truth
 from datasets_scripts.scenes.truth_scenes import SCENES, make_scene
 from datasets_scripts.tracers.pupil import pupil_table
-from datasets_scripts.tracers.sobol import owen_scrambled, scramble_seed, sobol_table
 from datasets_scripts.tracers.traced_scene import Vector, plain_texture
-from datasets_scripts.tracers.truth import Opening, Part, TruthTracer, lamp_flux
+from datasets_scripts.tracers.truth import Opening, Part, TruthTracer, lamp_flux, owen_scrambled, scramble_seed, sobol_table
 from datasets_scripts.tracers.truth_layer import make_tracer, sharp_layer
 from datasets_scripts.tracers.truth_scene import Body, Lamp, TruthScene, pack, quad
 from mrbokeh.images.exr_io import read_exr

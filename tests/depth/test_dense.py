@@ -9,7 +9,7 @@ import pytest
 
 from capture.dense.scene_depth import on_original_pixels, patch_match_obstacle, patch_match_prior
 from mrbokeh.depth.depth_filters import interpolate, smooth
-from mrbokeh.depth.views._guided_numba import aggregate
+from mrbokeh.depth.views._views_numba import aggregate
 from mrbokeh.depth.views.dense_depth import (
     FILLED,
     FOCUS,

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from datasets_scripts.tracers.thin_lens import trace_pinhole
-from mrbokeh.depth.camera_movement import Movement
-from mrbokeh.depth.stereo_depth import _filled, _Matched, _rows, stereo_depth
+from mrbokeh.depth.stereo_depth import Movement, _filled, _Matched, _rows, stereo_depth
 from mrbokeh.images.color import srgb_to_linear
 from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.optics.camera import Camera

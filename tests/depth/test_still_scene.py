@@ -5,10 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mrbokeh.depth.views._fused_numba import carry
+from mrbokeh.depth.views._views_numba import carry
 from mrbokeh.depth.views.depth_priors import ViewDepth
-from mrbokeh.depth.views.fused_depth import fused, vouched
-from mrbokeh.depth.views.still_scene import PosedPicture, StillScene, apart_in_widths
+from mrbokeh.depth.views.still_scene import PosedPicture, StillScene, apart_in_widths, fused, vouched
 from mrbokeh.depth.views.sweep_view import SweepView, neighbour_from_reference, packed_view, rays_of
 from mrbokeh.depth.views.view_points import best_neighbours, common_points, dioptre_range
 from mrbokeh.distortion import LensDistortion

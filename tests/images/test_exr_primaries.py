@@ -13,11 +13,11 @@ from mrbokeh.images.camera_rgb import chromaticities, matrix3x3, read_camera_rgb
 from mrbokeh.images.color import convert
 from mrbokeh.images.exr_io import ExrPart, read_exr, rec709_from_chromaticities, write_exr
 from mrbokeh.images.image_io import read_image, read_layer, read_linear, write_image
-from mrbokeh.layering.light_field_samples import LightFieldSamples
+from mrbokeh.layering.light_field_samples import LightFieldSamples, read_samples
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.stacks.focal_stack import FocalStack, write_merged
-from mrbokeh.stacks.light_field_samples_file import read_samples, write_samples
+from tests.support.light_field_files import write_samples
 from tests.support.refusals import refused
 
 # Primaries and white of the Academy's documents S-2014-004 (ACEScg) and SMPTE ST 2065-1 (ACES), of ITU-R BT.2020 and BT.709.

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.layering.light_field_samples import LightFieldSamples, joined
+from mrbokeh.layering.light_field_samples import CHANNELS, LightFieldSamples, joined, read_samples
 from mrbokeh.optics.lens import Lens
-from mrbokeh.stacks.light_field_samples_file import CHANNELS, read_samples, write_samples
 from mrbokeh.system.errors import InputError
+from tests.support.light_field_files import write_samples
 from tests.support.refusals import refused
 from tests.support.sampled_planes import LENS, Plane, even, fence_scene, sample_planes, waves
 
@@ -83,7 +83,7 @@ def test_an_archive_and_exr_keep_every_bit_whatever_the_order(samples: LightFiel
 
 def test_files_that_hold_no_samples_are_cut_short_or_of_the_future_say_so(samples: LightFieldSamples, tmp_path: Path) -> None:
     refused("no such file", read_samples, tmp_path / "none.npz")
-    refused(r"\.npz or \.exr", write_samples, tmp_path / "samples.csv", samples)
+    refused(r"\.npz or \.exr", read_samples, tmp_path / "samples.csv")
     (tmp_path / "bad.npz").write_bytes(b"no archive")
     refused("cannot be read", read_samples, tmp_path / "bad.npz")
     np.savez(tmp_path / "other.npz", picture=np.zeros(3))

@@ -11,15 +11,26 @@ from typer.testing import CliRunner
 from mrbokeh.commands import lens_fit
 from mrbokeh.commands.lens_fit import fit as fit_command
 from mrbokeh.images.exr_io import ExrPart, write_exr
-from mrbokeh.lens_measuring.fitting.blur_pairs import BLURRED, COC, SHARP, BlurPair, find_blur_pairs, read_blur_pair, write_blur_pair
+from mrbokeh.lens_measuring.fitting.blur_pairs import (
+    BLURRED,
+    COC,
+    SHARP,
+    BlurPair,
+    Match,
+    blurred_by_disc,
+    even_light,
+    find_blur_pairs,
+    match,
+    read_blur_pair,
+)
 from mrbokeh.lens_measuring.fitting.lens_fit import FitSettings, fit_lens
-from mrbokeh.lens_measuring.fitting.pair_matching import Match, blurred_by_disc, even_light, match
 from mrbokeh.lens_measuring.fitting.stack_equations import usable_pixels
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.psf_bank_file import read_bank
 from mrbokeh.renderers.scatter_reference import scatter
 from mrbokeh.system.errors import InputError
 from tests.lens_measuring.test_lens_fitting import kernels_are_like
+from tests.support.blur_pair_files import write_blur_pair
 from tests.support.refusals import refused
 
 SIZE = (110, 150)

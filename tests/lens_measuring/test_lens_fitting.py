@@ -15,13 +15,13 @@ from mrbokeh.images.image_io import write_image
 from mrbokeh.images.layer import opaque
 from mrbokeh.layering.layering import Layering
 from mrbokeh.lens_measuring.fitting._pupil_rows_numba import gather_rows
+from mrbokeh.lens_measuring.fitting.blur_pairs import StackSlices
 from mrbokeh.lens_measuring.fitting.evidence import Evidence, Knots, Sharing, simplest_of
 from mrbokeh.lens_measuring.fitting.fit_results import bank_of, picture_at
 from mrbokeh.lens_measuring.fitting.lens_fit import FitSettings, LensFit, fit_lens, on_simplex
 from mrbokeh.lens_measuring.fitting.point_lights import PointLight, find_lights
 from mrbokeh.lens_measuring.fitting.pupil_picture import PupilGrid, kernel_of
 from mrbokeh.lens_measuring.fitting.stack_equations import SliceView, drawn_pixels, equations_of, smoothed_coc, usable_pixels
-from mrbokeh.lens_measuring.fitting.stack_slices import StackSlices
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.psf_bank import Axis, PsfBank

@@ -12,9 +12,8 @@ from capture.poses.lens_calibration import write_calibrated
 from mrbokeh.images.exr_io import read_exr, write_exr
 from mrbokeh.images.image_io import read_image, write_layer
 from mrbokeh.images.layer import Layer
-from mrbokeh.lens_measuring.fitting.stack_slices import StackSlices
+from mrbokeh.lens_measuring.fitting.blur_pairs import StackSlices
 from mrbokeh.optics.lens_file import lens_to_json, write_lens
-from mrbokeh.refocus import leave_one_out
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack, write_focal_stack
 from mrbokeh.stacks.focal_stack_dataset import read_focal_stack_dataset
@@ -33,6 +32,7 @@ from tests.compositing.test_composite_command import CAKE
 from tests.house.test_user_mistakes import said
 from tests.support.card_stack import CARD_PX, LENS, SIZE, make_card_stack
 from tests.support.guessed_stack import guessed_twin
+from tests.support.left_out_slices import leave_one_out
 from tests.support.refusals import refused
 from training.export.onnx_export import network_facts_of
 from training.fitting.run_folder import load_run

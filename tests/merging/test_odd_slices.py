@@ -13,8 +13,8 @@ from capture.photos.photo_metadata import PhotoMetadata
 from capture.photos.sidecar import Sidecar
 from capture.stacks.grouping import Grouping, Photo
 from capture.stacks.ingest import IngestSettings, ingest
-from capture.stacks.odd_slices import Candidate, blown, duplicates, odd_sizes, other_scenes
 from capture.stacks.slice_looks import look_at, look_of, one_scene, same_photograph
+from capture.stacks.stack_ingest import Candidate, blown, duplicates, odd_sizes, other_scenes
 from mrbokeh.images.image_io import write_image
 from tests.support.made_photographs import Picture, defocused, make_shoot, only_stack, scene_rgb, sources
 from tests.support.refusals import refused

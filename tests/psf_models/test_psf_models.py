@@ -154,7 +154,7 @@ def test_the_opening_that_rays_see_is_made_of_its_polygons(aperture: Aperture) -
     """The bands of edges against the library's point-in-polygon for each outline in turn."""
     from shapely import Polygon, contains_xy
 
-    from mrbokeh.psf_models._lens_points_numba import opening_at
+    from mrbokeh.psf_models._rays_numba import opening_at
 
     extent = aperture.unit_radius
     places = extent * (2.0 * np.random.default_rng(2).random((3000, 2)) - 1.0)

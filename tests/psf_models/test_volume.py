@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 from scipy.integrate import dblquad, quad
 from scipy.stats import kstest
 
-from mrbokeh.psf_models import _volume_numba as compiled
+from mrbokeh.psf_models import _rays_numba as compiled
 from mrbokeh.psf_models.volume import Volume
 from mrbokeh.system.errors import InputError
 

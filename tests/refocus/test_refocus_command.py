@@ -16,7 +16,7 @@ from mrbokeh.images.exr_io import read_exr
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import Layer
 from mrbokeh.optics.lens_file import write_lens
-from mrbokeh.refocus import Refocusing, leave_one_out, lens_at
+from mrbokeh.refocus import Refocusing, lens_at
 from mrbokeh.renderers.onnx_network import OnnxNetwork
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.renderers.scatter_reference import ScatterReference
@@ -24,6 +24,7 @@ from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, writ
 from mrbokeh.stacks.focus_places import FocusLookup, parse_focus
 from tests.support.card_stack import CARD_PX, LENS, SIZE, make_card_stack
 from tests.support.command_line import printed_by
+from tests.support.left_out_slices import leave_one_out
 from tests.support.refusals import refused
 from tests.support.renderer_banks import bank_folder
 

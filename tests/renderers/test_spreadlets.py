@@ -6,7 +6,7 @@ import pytest
 
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.renderers.bank.kernel_files import fingerprint, read_spreadlets, write_spreadlets
-from mrbokeh.renderers.kernels._spreadlets_numba import cell_sums, nearest, solve, throw_darts
+from mrbokeh.renderers.kernels._laplacian_numba import cell_sums, nearest, solve, throw_darts
 from mrbokeh.renderers.kernels.laplacian_integration import integrate
 from mrbokeh.renderers.kernels.spreadlets import (
     Sparsification,

@@ -11,16 +11,15 @@ import numpy as np
 import pytest
 
 from mrbokeh.images.image_metrics import psnr
-from mrbokeh.layering.light_field_samples import LightFieldSamples
+from mrbokeh.layering.light_field_samples import LightFieldSamples, read_samples
 from mrbokeh.optics.lens_file import read_lens
 from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction, Settings
-from mrbokeh.stacks.light_field_samples_file import read_samples
 from mrbokeh.system.errors import InputError, MissingExtraError
 from tests.support.sampled_planes import LENS, fence_scene, sample_planes
 
 torch = pytest.importorskip("torch")
 
-from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import TorchReconstruction, _picture  # noqa: E402
+from mrbokeh.renderers.layered_reconstruction.torch_reconstruction import AT_ONCE, TorchReconstruction  # noqa: E402
 from tests.support.torch_device import DEVICE, KERNELS_ON, NAME, printed_with_kernels  # noqa: E402
 
 SIZE_PX = 45
@@ -138,7 +137,7 @@ def test_a_gpu_gives_the_same_picture(screen_filter: str) -> None:
 
 def test_how_much_is_done_at_a_time_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = by_torch(fence_samples())
-    monkeypatch.setitem(_picture.AT_ONCE, DEVICE.type, (3000, 6000, 2000))
+    monkeypatch.setitem(AT_ONCE, DEVICE.type, (3000, 6000, 2000))
     np.testing.assert_allclose(by_torch(fence_samples()), whole, atol=2e-6)
 
 

@@ -6,8 +6,7 @@ from typing import Any
 
 import pytest
 
-from mrbokeh.solving.magnetic_north import declination_deg
-from mrbokeh.solving.sun_of_photograph import sun_by_tags, sun_of_photograph, sun_position_deg
+from mrbokeh.solving.sun_of_photograph import declination_deg, sun_by_tags, sun_of_photograph, sun_position_deg
 from tests.support.sunny_photographs import GPS, TAKEN, write_sunny
 
 

@@ -23,7 +23,7 @@ from viewfinder.app.running import Viewfinder
 from viewfinder.app.running import running as parts_running
 from viewfinder.options import ViewfinderOptions
 from viewfinder.server.endpoint import serving_site
-from viewfinder.stage.static_layer import StaticLayer
+from viewfinder.stage.overlay_source import StaticLayer
 
 WIDTH, HEIGHT = 160, 90
 # Half a dioptre out of focus blurs over 13.7 px here: 160 / 6 px per mm, 20 mm aperture, 51.3 mm to the sensor.

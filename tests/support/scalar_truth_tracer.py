@@ -5,7 +5,6 @@ import pytest
 from jaxtyping import Bool, Float, Float32, Int, UInt32
 
 from datasets_scripts.tracers.pupil import PupilTable, pupil_table
-from datasets_scripts.tracers.sobol import owen_scrambled, scramble_seed, sobol_table
 from datasets_scripts.tracers.truth import (
     LAMP_STREAM,
     OWN_LAMP,
@@ -18,6 +17,9 @@ from datasets_scripts.tracers.truth import (
     field_scale,
     lamp_flux,
     lamps_of,
+    owen_scrambled,
+    scramble_seed,
+    sobol_table,
     triangles_of,
 )
 from datasets_scripts.tracers.truth_scene import PackedScene

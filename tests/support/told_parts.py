@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterator
 from threading import Event
-from time import monotonic
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.tracking.charuco.detector import Grey
@@ -46,8 +45,7 @@ class ImmediateDetections:
     def offer(self, sequence: int, grey: Grey, hurry: bool) -> None:
         self._offered += 1
         if hurry or (self._offered - 1) % self._every == 0:
-            started_s = monotonic()
-            self._found = Detection(sequence, self._detector.detect(grey), monotonic() - started_s)
+            self._found = Detection(sequence, self._detector.detect(grey))
 
     def take(self) -> Detection | None:
         found, self._found = self._found, None

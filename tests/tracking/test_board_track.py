@@ -16,8 +16,17 @@ from mrbokeh.commands.track import app
 from mrbokeh.images.color import display_rgb8
 from mrbokeh.optics.camera import Camera, camera_to_json
 from mrbokeh.tracking.camera_track.board_calibration import calibrated
-from mrbokeh.tracking.camera_track.board_smoothing import Observation, steadied, steady_poses, whittaker
-from mrbokeh.tracking.camera_track.board_track import RollingCorners, TrackSettings, Undistorting, poses_of, track_board
+from mrbokeh.tracking.camera_track.board_track import (
+    Observation,
+    RollingCorners,
+    TrackSettings,
+    Undistorting,
+    poses_of,
+    steadied,
+    steady_poses,
+    track_board,
+    whittaker,
+)
 from mrbokeh.tracking.camera_track.formats import read_track
 from mrbokeh.tracking.camera_track.track import CameraTrack
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, write_board

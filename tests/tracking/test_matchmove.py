@@ -12,10 +12,9 @@ from capture.cli import app
 from capture.matchmove import clip_matchmove
 from capture.matchmove.clip_matchmove import MatchmoveSettings, matchmove_clip
 from capture.matchmove.clip_solve import FLAT, TURNING
-from capture.matchmove.frame_poses import poses_between
 from capture.matchmove.ground import GroundPicks, Ruler, on_ground, parse_frame_distance, parse_ground, parse_ruler, ruler_scale
 from capture.matchmove.keyframes import chosen_keyframes, motion_of_clip
-from capture.matchmove.space_solve import off_px, rotation_only_residual_px
+from capture.matchmove.space_solve import off_px, poses_between, rotation_only_residual_px
 from capture.poses.sparse_model import SparseModel, SparseView
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError

@@ -17,6 +17,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from tests.support.command_line import mrbokeh, printed_by
 from tests.support.refusals import refused
+from tests.support.scattered_pictures import scatter_reference
 from training.cli import app
 from training.data.batches import draw_batch
 from training.data.dataset import PairSet, read_pair
@@ -31,7 +32,6 @@ from training.evaluation.methods import (
     gaussian_scatter,
     network_method,
     plain_methods,
-    scatter_reference,
     sigma_per_coc,
 )
 from training.fitting import train

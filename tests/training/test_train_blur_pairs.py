@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 import pytest
 
-from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair, write_blur_pair
-from mrbokeh.lens_measuring.fitting.pair_matching import blurred_by_disc
+from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair, blurred_by_disc
 from mrbokeh.system.errors import InputError
 from tests.lens_measuring.test_blur_pairs import DIAMETER_PX, SIZE, pair
+from tests.support.blur_pair_files import write_blur_pair
 from tests.support.command_line import printed_by
 from tests.support.refusals import refused
 from tests.training.test_train import DEMO_LIKE, make_stack

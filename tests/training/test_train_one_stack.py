@@ -17,13 +17,14 @@ from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, wri
 from mrbokeh.stacks.focal_stack_dataset import slices_to_hold_out
 from tests.support.command_line import printed_by
 from tests.support.refusals import refused
+from tests.support.scattered_pictures import scatter_reference
 from tests.training.test_train import DEMO_LIKE, LENS
 from training.cli import app
 from training.data.dataset import PairSet
 from training.data.stacks import Seen, stack_name
 from training.data.training_data import training_data
 from training.evaluation.comparison import unseen_of
-from training.evaluation.methods import blur_of, scatter_reference
+from training.evaluation.methods import blur_of
 from training.export.onnx_export import network_facts_of
 from training.fitting import record, train
 from training.fitting.run import LEAST_STEPS, Run, is_rate_known, steps_within, too_few_words

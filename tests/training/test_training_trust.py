@@ -41,9 +41,8 @@ from training.evaluation.diagnosis import (
 from training.evaluation.methods import DISC, NETWORK, NO_BLUR, blur_of
 from training.evaluation.run_data import RunData
 from training.evaluation.scores import Evaluation, Score
-from training.export import model_card
-from training.export.model_card import write_card
-from training.export.onnx_export import network_facts_of
+from training.export import onnx_export
+from training.export.onnx_export import network_facts_of, write_card
 from training.fitting import run as run_module
 from training.fitting import train
 from training.fitting.checkpoint import FAR_ABOVE_STEPS, CurvePoint, Learner, Progress
@@ -149,7 +148,7 @@ def test_the_card_measures_what_is_held_out_or_says_that_it_cannot(
     """Figures are the means of the three slices, computed here. The run stands for the exported file, which computes the same."""
     network, settings, facts = load_run(run)
     exported, blur = network_facts_of(network, settings.network, facts), blur_of(run)[0]
-    monkeypatch.setattr(model_card, "blur_of", lambda _: (blur, None))
+    monkeypatch.setattr(onnx_export, "blur_of", lambda _: (blur, None))
     write_card(run, tmp_path / "lens.onnx", exported, "fast, loses 0.1 dB")
     card = (tmp_path / "lens.md").read_text(encoding="utf-8")
     pairs = [read_pair(read_focal_stack(scene / "view_2"), index) for index in range(3)]

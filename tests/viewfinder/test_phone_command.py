@@ -39,9 +39,8 @@ from viewfinder.server.endpoint import serving_site
 from viewfinder.server.sessions import Role
 from viewfinder.sources.browser_camera import BrowserCameraSource
 from viewfinder.sources.playback import PatternSource
-from viewfinder.tracking.phone_calibration import Calibration, StillPairs
 from viewfinder.tracking.phone_rig import PhoneRig, PosePair, angle_deg, calibrate_rig, read_phone_rig, rigid_of, write_phone_rig
-from viewfinder.tracking.phone_tracker import PhoneTracker
+from viewfinder.tracking.phone_tracker import Calibration, PhoneTracker, StillPairs
 from viewfinder.tracking.tracker import TrackedPose
 
 

@@ -22,7 +22,7 @@ from mrbokeh.system.errors import InputError
 from tests.scene.test_scene_gltf import GlbWriter
 from tests.support.refusals import refused
 from tests.support.stage_scenes import FOCAL_PX, HEIGHT, LENS, ONE_CARD, WIDTH, backend, camera, centroid, scene_file
-from viewfinder.stage.out_of_sight import preparing
+from viewfinder.stage.shown_scene import preparing
 from viewfinder.stage.stage import FADE_S, AdaptiveResolution, Fade, Stage
 from viewfinder.stage.stage_setup import live_renderer
 from viewfinder.tracking.tracker import TrackedPose
@@ -97,7 +97,7 @@ def test_the_object_appears_where_it_stands_and_moves_with_every_frame(stage: St
 
 
 def test_it_says_why_nothing_is_seen_and_where_the_object_is(stage: Stage, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("viewfinder.stage.out_of_sight.kernels_compiled", lambda: 3)
+    monkeypatch.setattr("viewfinder.stage.shown_scene.kernels_compiled", lambda: 3)
     assert preparing(busy=True).startswith("preparing the scene; compiling for this machine, kernel 3: ")
     stream = Stream(stage, camera())
     while stage.seen is None:

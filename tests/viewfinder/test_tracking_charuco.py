@@ -1,6 +1,7 @@
 """Tracking by a printed board against traced frames whose poses are exact, and on a real, dark, hand-held clip; poses from a plane. The
 traced clip itself: geometry, blur and print are those of the formulas; and the whole print laid over its pictures."""
 
+import json
 import time
 from dataclasses import replace
 from functools import cache
@@ -18,14 +19,13 @@ from datasets_scripts.charuco_clip import (
     HandHeld,
     Sheet,
     pack_table,
-    read_clip_cameras,
     read_sheet,
     trace_sheet,
     with_noise,
     write_clip,
 )
 from datasets_scripts.tracers._sheet_numba import is_black
-from mrbokeh.optics.camera import Camera
+from mrbokeh.optics.camera import Camera, camera_from_json
 from mrbokeh.optics.lens import Lens
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, black_rectangles_mm, write_board
 from mrbokeh.tracking.charuco.board_alignment import AlignedDetector, aligned_corners
@@ -377,7 +377,7 @@ def test_a_clip_is_written_with_its_cameras_and_kept(tmp_path: Path) -> None:
     np.testing.assert_allclose(sheet.black_mm, black_rectangles_mm(BOARD), atol=1e-6)
     clip = BoardClip(sheet, HandHeld((0.092, 0.12, 0.0)), Lens(22.0, 8.0, 0.6, 24.0), 64, 36, 3, samples=2)
     write_clip(tmp_path / "clip.mkv", clip)
-    cameras = read_clip_cameras(tmp_path / "clip.json")
+    cameras = [camera_from_json(each, "clip.json") for each in json.loads((tmp_path / "clip.json").read_text())["cameras"]]
     for number, (frame, rgb) in enumerate(zip(read_frames(tmp_path / "clip.mkv"), clip.pictures(), strict=True)):
         np.testing.assert_allclose(frame.rgb, np.clip(rgb, 0.0, 1.0), atol=2e-3)
         np.testing.assert_allclose(cameras[number].camera_from_world, clip.camera(number).camera_from_world)

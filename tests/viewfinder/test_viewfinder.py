@@ -46,8 +46,8 @@ from viewfinder.server.endpoint import serving_site
 from viewfinder.sources.choose import open_source
 from viewfinder.sources.frame_source import ExactSize, SizeLimit
 from viewfinder.sources.playback import PatternSource, VideoFileSource
+from viewfinder.stage.overlay_source import StaticLayer
 from viewfinder.stage.stage import Stage
-from viewfinder.stage.static_layer import StaticLayer
 from viewfinder.streaming.recording import Recorder
 from viewfinder.streaming.take_file import playable_bytes
 from viewfinder.tracking.tracker import TrackedPose

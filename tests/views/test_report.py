@@ -17,10 +17,9 @@ from capture.report.findings import SliceFindings, StackFindings, focus_curve, f
 from capture.report.gates import Verdict, verdict_line
 from capture.report.picture_sharpness import PictureFindings
 from capture.report.registration_check import drift_of
-from capture.report.scene_gates import Reconstruction, scales_in, scene_gates
 from capture.report.scene_report import SceneReport, poses_view, report_scene, scene_of
 from capture.report.slice_fit import low_frequency_gain
-from capture.report.stack_gates import stack_gates
+from capture.report.stack_gates import Reconstruction, scales_in, scene_gates, stack_gates
 from capture.report.stack_section import Axes, chart
 from capture.report.stack_view import Reblur
 from mrbokeh.images.camera_rgb import write_camera_rgb

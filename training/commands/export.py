@@ -36,7 +36,7 @@ def export_command(
     from mrbokeh.images.image_io import require_suffix
     from mrbokeh.system.atomic_files import require_safe_outputs
     from training.data.training_data import focal_stacks, training_data
-    from training.export.model_card import card_path, write_card
+    from training.export.onnx_export import card_path, write_card
 
     require_suffix(out, (".onnx",), "--out")
     require_safe_outputs((out, card_path(out)), (run, *(data or ())), overwrite)

@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Float32
 
 from mrbokeh.images.exr_io import read_exr
+from mrbokeh.stacks.exr_layers._exr_numba import without_prediction
 from mrbokeh.system.errors import InputError
-from training.data._exr_blocks_numba import without_prediction
 
 Rows = Float32[np.ndarray, "rows width"]
 

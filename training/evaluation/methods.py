@@ -189,23 +189,3 @@ def _levels(sigma_px: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
     count = int(np.ceil(position.max(initial=0.0))) + 1
     shares = [np.clip(1.0 - np.abs(position - level), 0.0, 1.0).astype(np.float32) for level in range(count)]
     return np.arange(count) * SIGMA_STEP_PX, shares
-
-
-def scatter_reference(
-    rgb: Float32[np.ndarray, "height width 3"],
-    coc_px: Float32[np.ndarray, "height width"],
-    aperture: Aperture,
-) -> Float32[np.ndarray, "height width 3"]:
-    """Run the reference renderer with the aperture of the lens, as one opaque layer, at exactly these circles of confusion.
-
-    The picture is extended beyond its border, from where light enters it.
-    """
-    from mrbokeh.images.layer import opaque
-    from mrbokeh.renderers.scatter_reference import blur_layer
-
-    margin = int(np.ceil(np.abs(coc_px).max(initial=0.0) / 2.0)) + 1
-    around = ((margin, margin), (margin, margin))
-    wide = opaque(np.pad(rgb, (*around, (0, 0)), mode="edge"), np.ones(np.array(coc_px.shape) + 2 * margin, np.float32))
-    blurred = blur_layer(wide, np.pad(coc_px, around, mode="edge"), aperture)
-    inside = np.s_[margin:-margin, margin:-margin]
-    return (blurred.rgb[inside] / np.maximum(blurred.alpha[inside], 1e-6)[..., None]).astype(np.float32)

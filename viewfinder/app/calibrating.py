@@ -22,9 +22,8 @@ from viewfinder.server.site import Part, Site, page_routes
 from viewfinder.sources.choose import open_source
 from viewfinder.sources.frame_source import SizeLimit
 from viewfinder.tracking.charuco_tracker import CharucoTracker
-from viewfinder.tracking.phone_calibration import Calibration
 from viewfinder.tracking.phone_rig import PhoneRig, write_phone_rig
-from viewfinder.tracking.phone_tracker import PhoneTracker
+from viewfinder.tracking.phone_tracker import Calibration, PhoneTracker
 from viewfinder.tracking.tracker import read_fixed_pose
 
 

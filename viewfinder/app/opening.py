@@ -25,10 +25,9 @@ from viewfinder.server.site import Part
 from viewfinder.sources.browser_camera import BrowserCameraSource
 from viewfinder.sources.choose import open_source
 from viewfinder.sources.frame_source import ExactSize, FrameSource, SizeLimit
-from viewfinder.stage.overlay_source import OverlaySource
+from viewfinder.stage.overlay_source import OverlaySource, StaticLayer
 from viewfinder.stage.stage import Stage
 from viewfinder.stage.stage_setup import LIVE_LAYERING, live_renderer
-from viewfinder.stage.static_layer import StaticLayer
 from viewfinder.streaming.other_programs import VirtualWebcam
 from viewfinder.tracking.charuco_tracker import CharucoTracker
 from viewfinder.tracking.freed import FreeDReading, read_encoder_table

@@ -25,9 +25,8 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.world_axes import upright_camera
 from viewfinder.frames import Bgr, Newest, Remark
 from viewfinder.stage.drawing import Drawing, DrawRequest, blur_changed, draw, is_outdated, sharp_layers
-from viewfinder.stage.out_of_sight import preparing, reason_unseen
 from viewfinder.stage.overlay_source import StageStatus
-from viewfinder.stage.shown_scene import VIEWS, ShownScene, depth_at_m, view_picture
+from viewfinder.stage.shown_scene import VIEWS, ShownScene, depth_at_m, preparing, reason_unseen, view_picture
 from viewfinder.stage.stage_setup import SceneWatch, SetupLoader, StageSetup
 from viewfinder.tracking.tracker import TrackedPose
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Int64, UInt8
 
+from mrbokeh.video._frames_numba import SHIFT, i420_from_bgr
 from mrbokeh.video.color import LIMITED, VideoColor
 from viewfinder.frames import Bgr
-from viewfinder.streaming._i420_numba import SHIFT, i420_from_bgr
 
 # The clock of video over RTP (RFC 3551).
 TICKS_PER_S = 90_000

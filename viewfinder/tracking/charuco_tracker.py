@@ -31,11 +31,10 @@ class Detector(Protocol):
 
 @dataclass(frozen=True)
 class Detection:
-    """Corners of the frame of that number; took_s: how long the search took."""
+    """Corners of the frame of that number."""
 
     sequence: int
     corners: Corners
-    took_s: float = 0.0
 
 
 @runtime_checkable
@@ -77,14 +76,13 @@ class DetectionThread:
             frame = self._frames.take(_POLL_S)
             if frame is None:
                 continue
-            started_s = monotonic()
             try:
                 corners = self._detector.detect(frame[1])
             except Exception:
                 # One odd picture must not end tracking for good.
                 log.exception("searching a frame for the board failed")
                 continue
-            self._found.put(Detection(frame[0], corners, monotonic() - started_s))
+            self._found.put(Detection(frame[0], corners))
 
 
 GRACE_S = 0.25
@@ -108,7 +106,6 @@ class CharucoTracker:
         self._branches = PoseBranches()
         self._last: TrackedPose | None = None
         self.corners = NO_CORNERS
-        self.detection_s = 0.0
 
     def track(self, frame: CameraFrame, intrinsics: Camera) -> TrackedPose | None:
         grey = cv2.cvtColor(frame.bgr, cv2.COLOR_BGR2GRAY)
@@ -142,7 +139,6 @@ class CharucoTracker:
         detection = self._detections.take()
         if detection is None:
             return flowed
-        self.detection_s = detection.took_s
         detected = self._history.carry(detection.corners, detection.sequence)
         return flowed if detected is None else detected.with_more(flowed)
 

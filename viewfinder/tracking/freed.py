@@ -115,7 +115,6 @@ def _monotone(axis: str, values: Mapping[float, float], path: Path) -> Axis:
     return counts, interpolated
 
 
-PORT = 40000
 MESSAGE_BYTES = 29
 
 _TYPE = 0xD1

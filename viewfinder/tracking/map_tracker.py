@@ -204,7 +204,6 @@ class MapTracker:
         self._pose_in_map: Pose | None = None
         self._last: TrackedPose | None = None
         self.points = NO_CORNERS
-        self.localisation_s = 0.0
 
     def track(self, frame: CameraFrame, intrinsics: Camera) -> TrackedPose | None:
         self._localiser.camera = intrinsics
@@ -241,7 +240,6 @@ class MapTracker:
         detection = self._detections.take()
         if detection is None:
             return flowed
-        self.localisation_s = detection.took_s
         found = self._history.carry(_spread(detection.corners), detection.sequence)
         return flowed if found is None or len(found) < len(flowed) // 2 else _spread(found.with_more(flowed))
 

@@ -38,7 +38,6 @@ from viewfinder.tracking.pose_history import STAGE_FROM_BOARD, MalformedMessageE
 from viewfinder.tracking.tracker import TrackedPose
 
 JSON, CBOR = 1, 2
-PORT = 55555
 
 _HEADER = struct.Struct(">4sBBHIH")
 _IDENTIFIER = b"OTrk"

@@ -10,6 +10,5 @@ exposure_match     exposure and white balance from stated metadata and colour te
 noise_measurement  level and correlation of noise, measured in blocks of a picture
 grain              Grain: measured, written, read, and added to virtual light as the sensor would have done
 vignetting         falloff towards the corners: RadialFalloff (also from lensfun), FlatField
-compression        JpegCompression: what a JPEG's blocks and tables do to virtual light
 finishing          Finishing, finished: all of it in the order of a camera; LookOptions, finishing_of: from a user's texts
 """

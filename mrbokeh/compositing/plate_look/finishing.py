@@ -6,9 +6,10 @@
 3. Black: glare and offset lie over everything evenly, so they do not fall off towards the corners.
 4. Light wrap: light of the photograph, which has 1 to 3 in it already.
 5. Grain: made by the sensor from all light that arrives.
-6. Compression: made of the finished picture, so last.
+6. Compression: made of the finished picture, so last, with the same blocks, tables and halved colour as a JPEG photograph's.
 """
 
+import io
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -27,17 +28,19 @@ from mrbokeh.compositing.plate_look.colour_match import (
     patch_colour,
     triple_of,
 )
-from mrbokeh.compositing.plate_look.compression import JpegCompression
 from mrbokeh.compositing.plate_look.exposure_match import Exposure, matched_exposure, stated_exposure, white_balance_gain
 from mrbokeh.compositing.plate_look.grain import Grain, GrainDraw, add_grain_to, measured_grain, measured_grain_of_pair, read_grain
 from mrbokeh.compositing.plate_look.noise_measurement import NoiseLevel
 from mrbokeh.compositing.plate_look.vignetting import RadialFalloff, Vignetting, darkened, falloff_at, falloff_of_photo, read_flat_field
-from mrbokeh.images.color import srgb_to_linear
+from mrbokeh.images.color import srgb_codes, srgb_to_linear
+from mrbokeh.images.exif import header_of, oriented_as_stored, stored_orientation
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.pixel_box import Box, lit_box
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.typed_numbers import numbers_in
 
+_BLOCK_PX = 16
+"""Sides of the blocks whose colour is halved in both directions; all others fit into them."""
 _SIGMAS = 3
 _LEAST_PX, _SURELY_BLACK, _MOST_GRAIN, _SHOWN = 64, 0.02, 0.015, np.linspace(0.1, 0.8, 8, dtype=np.float32)
 """Sides of a picture that tells its black; the lightest black that is surely one; standard deviation of strong grain on a screen of 0 to 1,
@@ -47,6 +50,51 @@ and the levels there at which it is looked at.
 Picture = Float32[np.ndarray, "height width 3"]
 AUTO, OFF = "auto", "off"
 NO_BLACK: Triple = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class JpegCompression:
+    """How a photograph was compressed. tables: of quantization, 64 numbers each. subsampling: of colour, as Pillow counts it."""
+
+    tables: dict[int, list[int]]
+    subsampling: int
+    orientation: int
+
+    @classmethod
+    def of(cls, photo: Path) -> "JpegCompression | None":
+        """Return how a file was compressed; None if it is no JPEG in colours, or of a kind that Pillow does not write."""
+        from PIL import JpegImagePlugin, UnidentifiedImageError
+
+        try:
+            with header_of(photo) as picture:
+                if not isinstance(picture, JpegImagePlugin.JpegImageFile) or picture.mode != "RGB":
+                    return None
+                subsampling = JpegImagePlugin.get_sampling(picture)
+                tables = {number: list(table) for number, table in picture.quantization.items()}
+        except (UnidentifiedImageError, OSError, SyntaxError, ValueError):
+            return None
+        return cls(tables, subsampling, stored_orientation(photo)) if subsampling in (0, 1, 2) else None
+
+    def compressed(self, inserted: Inserted) -> Inserted:
+        """Return the picture with its virtual part compressed together with the photograph around it; what no code stands for stays.
+
+        The photograph's own pixels stay too: they were compressed already.
+        """
+        from PIL import Image
+
+        changed = inserted.virtual.rgb.copy()
+        alpha, light, photo = (oriented_as_stored(each, self.orientation) for each in (inserted.virtual.alpha, changed, inserted.photo_rgb))
+        rows, columns = np.flatnonzero(alpha.any(axis=1)), np.flatnonzero(alpha.any(axis=0))
+        if not len(rows):
+            return inserted
+        part = tuple(slice(each[0] // _BLOCK_PX * _BLOCK_PX, (each[-1] // _BLOCK_PX + 1) * _BLOCK_PX) for each in (rows, columns))
+        whole = np.ascontiguousarray(photo[part] + light[part])
+        stream = io.BytesIO()
+        Image.fromarray(srgb_codes(whole, np.uint8)).save(stream, "JPEG", qtables=self.tables, subsampling=self.subsampling)
+        decoded = srgb_to_linear(np.asarray(Image.open(stream), np.float32) / np.float32(255.0))
+        virtual = (alpha[part] > 0.0)[..., None] & (whole >= 0.0) & (whole <= 1.0)
+        light[part] = np.where(virtual, decoded - photo[part], light[part])
+        return replace(inserted, virtual=replace(inserted.virtual, rgb=changed))
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ def weighted_medians(values: Plane, weights: Plane, guide: Guide, where: Mask, r
 
     contrast: a colour that differs by this much weighs 1/e.
     """
-    from mrbokeh.depth.views import _guided_numba as compiled
+    from mrbokeh.depth.views import _views_numba as compiled
 
     out = values.copy()
     height, width = values.shape
@@ -68,7 +68,7 @@ class Labels:
 
 def label_planes(costs: Costs, guide: Plane, penalties: Penalties | None = None) -> Labels:
     """Label all pixels together. Memory: 2 bytes per cell beside the costs."""
-    from mrbokeh.depth.views._guided_numba import aggregate, winners
+    from mrbokeh.depth.views._views_numba import aggregate, winners
 
     rules = penalties or Penalties()
     total = aggregate(costs, guide, rules.small, rules.large, rules.contrast)

@@ -103,7 +103,7 @@ class PlaneScores:
 
     def of_rows(self, first: int, end: int, offset: float) -> Float32[np.ndarray, "rows width"]:
         """Return the mean correlation with the best neighbours of rows first <= y < end; `UNSEEN` where none sees the point."""
-        from mrbokeh.depth.views._plane_sweep_numba import Reference, mean_of_best, score_neighbour
+        from mrbokeh.depth.views._views_numba import Reference, mean_of_best, score_neighbour
 
         matching = self._matching
         each = np.empty((len(self._views), end - first, self._structure.shape[1]), np.float32)

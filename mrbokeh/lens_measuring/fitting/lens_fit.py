@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 
-from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair
+from mrbokeh.lens_measuring.fitting.blur_pairs import BlurPair, StackSlices, largest_diameter_px
 from mrbokeh.lens_measuring.fitting.evidence import NOTHING, SIMPLEST_FIRST, Equations, Evidence, Knots, Pictures, Sharing, simplest_of
 from mrbokeh.lens_measuring.fitting.point_lights import PointLight, best_scale, equations_of_light, light_count
 from mrbokeh.lens_measuring.fitting.pupil_picture import PupilGrid
@@ -27,7 +27,6 @@ from mrbokeh.lens_measuring.fitting.stack_equations import (
     drawn_pixels,
     equations_of,
 )
-from mrbokeh.lens_measuring.fitting.stack_slices import StackSlices, largest_diameter_px
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.system.console import track

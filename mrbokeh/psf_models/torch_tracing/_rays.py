@@ -59,7 +59,7 @@ def trace_lens(
     edges: Float64[np.ndarray, "edges 5"],
     starts: Int64[np.ndarray, " bands_and_end"],
 ) -> float:
-    """Trace rays as `_lens_points_numba.trace_lens` does."""
+    """Trace rays as `_rays_numba.trace_lens` does."""
     where = device_named(device)
     first, second, third = on(where, shares.T)
     u, v = (2.0 * first - 1.0) * extent, (2.0 * second - 1.0) * extent
@@ -85,7 +85,7 @@ def _opening_at(
 
 
 def trace_capsule(device: str, kernel: Kernel, box: Float64[np.ndarray, "2 2"], shares: Float64[np.ndarray, "rays 5"]) -> float:
-    """Trace rays as `_lens_points_numba.trace_capsule` does."""
+    """Trace rays as `_rays_numba.trace_capsule` does."""
     first, second, third, fourth, fifth = on(device_named(device), shares.T)
     radius, angle = torch.sqrt(first), 2.0 * math.pi * second
     (low_px, high_px), (shortest_px, longest_px) = box.tolist()
@@ -107,7 +107,7 @@ def trace_picture(
     rows: Float64[np.ndarray, " height_and_end"],
     columns: Float64[np.ndarray, "height width_and_end"],
 ) -> float:
-    """Trace rays as `_lens_points_numba.trace_picture` does."""
+    """Trace rays as `_rays_numba.trace_picture` does."""
     where = device_named(device)
     first, second, third = on(where, shares.T)
     y = _inverted(on(where, rows[None]), torch.zeros_like(first, dtype=torch.int64), first)

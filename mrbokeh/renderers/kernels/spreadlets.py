@@ -109,7 +109,7 @@ def whole_laplacian(kernel: Float[np.ndarray, "height width *channels"]) -> Spre
 
 def sparsify(kernel: Float[np.ndarray, "height width *channels"], settings: Sparsification | None = None) -> Spreadlet:
     """Return a kernel (K, K) or (K, K, C), K odd, as few points. A kernel that has few pixels anyway comes back whole."""
-    from mrbokeh.renderers.kernels._spreadlets_numba import anneal, cell_sums, cost, relax, throw_darts
+    from mrbokeh.renderers.kernels._laplacian_numba import anneal, cell_sums, cost, relax, throw_darts
 
     settings = settings or Sparsification()
     xy, charges, dense = _charges(kernel)
@@ -241,7 +241,7 @@ def _solved(
     Moments up to degree 3 are kept with at least 30 points; fewer points keep fewer moments, at least the charge. Points in few
     rows, as those of a line, cannot have all of them on their own (y^3 = y in rows -1, 0 and 1): `_independent`.
     """
-    from mrbokeh.renderers.kernels._spreadlets_numba import solve
+    from mrbokeh.renderers.kernels._laplacian_numba import solve
 
     scale_px = float(max(np.abs(xy).max(), 1.0))
     degree = max(d for d in range(4) if d == 0 or (d + 1) * (d + 2) // 2 * _POINTS_PER_MOMENT <= len(points))

@@ -153,9 +153,6 @@ def evened_out(planes: np.ndarray, enough: float) -> np.ndarray:
 SUMS = 8
 """Columns of a row of sums: count, r, r^2, m_x, m_y, m_x^2, m_x m_y, m_y^2, with r half the signed circle of confusion."""
 
-WINDOW = 4
-"""Second moments of the pupil (uu, uv, vv) and of the shutter (tt)."""
-
 PIXEL_VARIANCE = 1.0 / 12.0
 """What a pixel as a bin adds to the spread of the samples in it: the variance of a box of 1 px."""
 

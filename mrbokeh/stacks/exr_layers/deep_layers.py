@@ -173,7 +173,7 @@ class DeepSurfaces:
 
 def peeled(samples: DeepSamples, surfaces: int, apart: float) -> list[Layer]:
     """Return one layer for the first, second, ... surface of every pixel, front first, also if it is empty; see SURFACES and APART."""
-    from mrbokeh.stacks.exr_layers._deep_numba import flatten_layers
+    from mrbokeh.stacks.exr_layers._exr_numba import flatten_layers
 
     size = (samples.height_px, samples.width_px)
     out, dioptres = np.zeros((surfaces, size[0] * size[1], 4)), np.zeros((surfaces, size[0] * size[1]))

@@ -8,6 +8,6 @@ What lies where:
     track               CameraTrack, TrackedFrame: cameras by frame number or by time, and interpolated; TrackOptions of files
     formats             read_track, write_track; our own JSON, .chan, nerfstudio; colmap_file, opentrackio_file the others
     focus_pull          FocusPull: the focus distance by frame, from keys or from what cine cameras wrote, smoothed
-    board_track         the track of a clip in which a printed board is seen; board_calibration finds the camera, board_smoothing
-                        keeps the poses from trembling more than the camera did
+    board_track         the track of a clip in which a printed board is seen; its poses tremble no more than the camera did;
+                        board_calibration finds the camera
 """

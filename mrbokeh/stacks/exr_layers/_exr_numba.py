@@ -1,4 +1,4 @@
-"""The loop over pixels of mrbokeh.stacks.exr_layers.deep_layers."""
+"""Compiled loops over EXR files: the pixels of deep layers, and the bytes of a ZIP block."""
 
 import math
 
@@ -133,3 +133,17 @@ def _put(piece: tuple, depth_m: float, pixel: int, index: int, out: np.ndarray, 
     weight = free * alpha + _PRESENT
     dioptres[index, pixel] += weight / depth_m
     weights[index] += weight
+
+
+@njit(cache=True, nogil=True)
+def without_prediction(packed: np.ndarray) -> np.ndarray:
+    """Undo the prediction of OpenEXR's ZIP blocks: bytes are stored as differences from the last, plus 128, even ones before odd ones."""
+    result = np.empty(packed.size, np.uint8)
+    half, value = (packed.size + 1) // 2, 128
+    for i in range(half):
+        value = (value + packed[i] + 128) & 255
+        result[2 * i] = value
+    for i in range(half, packed.size):
+        value = (value + packed[i] + 128) & 255
+        result[2 * (i - half) + 1] = value
+    return result
