@@ -109,6 +109,7 @@ def _key(clip: Path, settings: MatchmoveSettings) -> dict[str, object]:
 
 
 def _solved(clip: Path, info: VideoInfo, work: Path, settings: MatchmoveSettings, *, fresh: bool) -> ClipSolve:
+    poses = PoseSettings(settings.mapper, settings.camera_model, "shared", settings.max_image_size_px, overwrite=fresh)
     motion = motion_of_clip(clip, info)
     if motion[-1] < _STILL_SHARE:
         raise InputError(
@@ -123,7 +124,6 @@ def _solved(clip: Path, info: VideoInfo, work: Path, settings: MatchmoveSettings
         write_keyframes(clip, info, keyframes, work / "images", fresh=fresh)
         return simple.solve
     write_keyframes(clip, info, chosen_keyframes(motion, settings.keyframes), work / "images", fresh=fresh)
-    poses = PoseSettings(settings.mapper, settings.camera_model, "shared", settings.max_image_size_px, overwrite=fresh)
     try:
         return space_solve(clip, info, work, poses)
     except InputError as error:
