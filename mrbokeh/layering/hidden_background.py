@@ -7,8 +7,10 @@ for it, or a single lamp beside an edge would shine twice. `layer_from_view` mov
 so that what lies behind the edges need not be guessed.
 """
 
+from collections.abc import Callable
 from concurrent.futures import Executor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, Int64
@@ -28,7 +30,9 @@ RIM_PX = 3
 _DIRECTIONS = 8
 _BAND_ROWS = 32
 _BAND_PIXELS = 256
+_OUTLINE_SIZES_PX = (4.0, 12.0, 40.0)
 Values = Float32[np.ndarray, "height width channels"]
+Plane = Float32[np.ndarray, "height width"]
 Mask = Bool[np.ndarray, "height width"]
 Places = Int32[np.ndarray, " _"]
 
@@ -50,6 +54,61 @@ def split_edges(layer: PaddedLayer, pool: Executor) -> tuple[Pixels, Pixels]:
     behind = _filled(layer.values, edges, places, seeds, pool)
     _unmix(layer.values, edges, rims, behind)
     return Pixels.of(PaddedLayer(layer.values, edges.coc_px, False)), behind
+
+
+def hidden_within(layer: PaddedLayer, pool: Executor) -> list[Pixels]:
+    """Return what a layer with holes hides behind its own near parts: nothing, or pixels behind the edges between two of its surfaces.
+
+    Without it what is behind the layer shines through such edges. Only what is covered whole hides or is continued: outlines stay soft.
+    """
+    from mrbokeh.layering._hidden_background_numba import find_rims
+
+    whole = layer.values[..., 3] >= 1.0
+    if not whole.any():
+        return []
+    box = _box_of(whole)
+    values, coc_px, whole = layer.values[box], continued(layer.coc_px[box], whole[box]), whole[box]
+    rim = np.empty(whole.shape, np.bool_)
+    in_bands(pool, len(rim), _BAND_ROWS, lambda top, bottom: find_rims(rim, coc_px, STEP_PX, top, bottom))
+    rim &= whole
+    if not rim.any():
+        return []
+    edges = _Edges(coc_px, np.flatnonzero(rim).astype(np.int32), whole & ~rim, np.zeros_like(rim))
+    _, places, seeds = _sources(edges)
+    is_behind = whole.reshape(-1)[places] & (coc_px.reshape(-1)[seeds] > coc_px.reshape(-1)[places] + STEP_PX)
+    filled = _filled(values, edges, places[is_behind], seeds[is_behind], pool)
+    top, left = box[0].start, box[1].start
+    rows, columns = np.divmod(filled.places, whole.shape[1])
+    return [replace(filled, places=((rows + top) * layer.coc_px.shape[1] + columns + left).astype(np.int32))]
+
+
+def enclosed_by(whole: Mask, coc_px: Plane, reach_px: Callable[[float], int]) -> Mask:
+    """Return the pixels from which every ray ends on what is whole: those farther from its outline than the outline's own blur reaches.
+
+    coc_px: signed diameters. reach_px: how far light of a diameter travels.
+    """
+    from cv2 import DIST_L2, DIST_MASK_5, distanceTransform, erode
+
+    found = np.zeros_like(whole)
+    box = _box_of(whole)
+    inner = whole[box]
+    beside = np.pad(inner, 1).astype(np.uint8)
+    outline = inner & (erode(beside, np.ones((3, 3), np.uint8))[1:-1, 1:-1] == 0)
+    sizes_px, enclosed = np.abs(coc_px[box]), inner.copy()
+    bounds_px = [-1.0, *_OUTLINE_SIZES_PX, np.inf]
+    for low_px, high_px in pairwise(bounds_px):
+        of_size = outline & (sizes_px > low_px) & (sizes_px <= high_px)
+        if of_size.any():
+            reach = reach_px(float(sizes_px[of_size].max())) + 1
+            enclosed &= distanceTransform((~of_size).astype(np.uint8), DIST_L2, DIST_MASK_5) > reach
+    found[box] = enclosed
+    return found
+
+
+def _box_of(mask: Mask) -> tuple[slice, slice]:
+    """Return rows and columns of the smallest box around what is there."""
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
 
 
 def _edges(layer: PaddedLayer, pool: Executor) -> _Edges:

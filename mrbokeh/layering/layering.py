@@ -24,11 +24,12 @@ Circles of confusion are diameters at which kernels are drawn (mrbokeh.optics.dr
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor, ThreadPoolExecutor
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from mrbokeh.images.layer import Layer
-from mrbokeh.layering.hidden_background import Mask, continued, split_edges
+from mrbokeh.layering.hidden_background import Mask, continued, enclosed_by, hidden_within, split_edges
 from mrbokeh.layering.highlights import find_highlights
 from mrbokeh.layering.padded_layers import PaddedLayer, Pixels, coc_px_of, pad_layer
 from mrbokeh.layering.psf_over_field import FIELD_CELLS, AperturePsf, Frame, KernelSum, PsfField
@@ -40,6 +41,8 @@ from mrbokeh.system.resources import ZeroedMemory, cores
 
 _ONE_SURFACE_PX = 1.0
 NOTHING_TAKEN = np.float32(1e-6)
+_FULL = 1e-4
+"""Less of the pupil unclaimed is rounding."""
 _KEPT = ZeroedMemory(most_bytes=64 << 20)
 """From frame to frame, as long as these are not larger than about 1920x1080: fresh memory takes a tenth of a small frame's time."""
 
@@ -78,7 +81,7 @@ def render_layers(layers: Sequence[Layer], lens: Lens, kernel_sum: KernelSum | P
         found: tuple[Channels, Channels] | None = None
         for cut in reversed(cuts):
             front = composited(cut.surfaces, slicing, by_depth=not cut.is_opaque)
-            front = _shared_out(*front) if any(layer.is_opaque for layer in cut.layers) else front
+            front = _shared_out(*front) if any(layer.is_opaque for layer in cut.layers) else _closed(*front, cut.layers, slicing)
             found = front if found is None else _over(*front, *found)
         if rims and found is not None:
             rims.correct(found[0], pool)
@@ -95,7 +98,8 @@ def _cuts(group: Sequence[PaddedLayer], layering: Layering, pool: Executor) -> I
     elif layering.fill and layering.sees_rims and len(group) == 2 and group[1].is_opaque:
         yield from _parted(group, lights, pool)
     else:
-        yield Cut(group, [Pixels.covered(layer) for layer in group], lights)
+        hidden = [each for layer in group if layering.fill for each in hidden_within(layer, pool)]
+        yield Cut(group, [*(Pixels.covered(layer) for layer in group), *hidden], lights)
 
 
 def _parted(group: Sequence[PaddedLayer], lights: Sequence[Mask], pool: Executor) -> Iterator[Cut]:
@@ -170,6 +174,28 @@ def _shared_out(colour: Channels, taken: Channels) -> tuple[Channels, Channels]:
     from mrbokeh.layering._slices_numba import share_out
 
     share_out(colour, taken, NOTHING_TAKEN)
+    return colour, taken
+
+
+def _closed(colour: Channels, taken: Channels, layers: Sequence[PaddedLayer], slicing: Slicing) -> tuple[Channels, Channels]:
+    """Return the colour of layers with holes: where nothing gets past their outlines, the unclaimed pupil belongs to those who claimed.
+
+    Steps of depth too small to be edges, and specks, would be lines and dots of what is behind.
+    """
+    frame = slicing.frame
+    inside = np.s_[-frame.top_px : frame.height_px - frame.top_px, -frame.left_px : frame.width_px - frame.left_px]
+    whole = np.logical_or.reduce([layer.values[..., 3] >= 1.0 for layer in layers])
+    open_to = np.flatnonzero((whole[inside] & (taken.min(axis=2) < 1.0 - _FULL)).reshape(-1))
+    if len(open_to) == 0:
+        return colour, taken
+    largest_px = np.maximum.reduce([np.abs(layer.coc_px) for layer in layers])
+    # A bank tells how far light travels from the pixels themselves; none of them sends it farther than the margin.
+    reach_px = partial(slicing.psf.reach_px, (), frame=frame) if isinstance(slicing.psf, AperturePsf) else lambda _: -frame.top_px
+    enclosed = open_to[enclosed_by(whole, largest_px, reach_px)[inside].reshape(-1)[open_to]]
+    flat, shares = colour.reshape(-1, colour.shape[2]), taken.reshape(-1, taken.shape[2])
+    claimed = np.maximum(shares[enclosed], NOTHING_TAKEN)
+    flat[enclosed] /= claimed[:, _kinds(colour, taken)]
+    shares[enclosed] = np.where(shares[enclosed] > NOTHING_TAKEN, np.float32(1.0), shares[enclosed])
     return colour, taken
 
 

@@ -65,7 +65,7 @@ class Cut(NamedTuple):
         """Each layer with a pixel at every place, an opaque one as its front is, then its surface and its lights."""
         first, front = self.layers[0], self.surfaces[0]
         if not self.is_opaque:
-            return list(zip(self.layers, self.surfaces, self.lights, strict=True))
+            return list(zip(self.layers, self.surfaces[: len(self.layers)], self.lights, strict=True))
         split = PaddedLayer(front.values.reshape(first.values.shape), front.coc_px.reshape(first.coc_px.shape), True)
         behind = zip(self.layers[1:], self.surfaces[2:-1], self.lights[1:], strict=True)
         return [(split, front, self.lights[0]), *behind]

@@ -141,3 +141,35 @@ def test_field_cells_meet_their_limit_and_those_of_a_part_are_those_of_the_whole
 )
 def test_what_cannot_be_rendered_is_said(layers: list[Layer], said: str) -> None:
     refused(said, rendered, layers)
+
+
+# Layers with holes: nothing shines through what is whole.
+
+
+@pytest.mark.parametrize(("near_m", "far_m"), [(0.5, 0.78), (0.7, 0.78), (1.0, 1.5), (0.8, 1.3), (1.3, 1.9)])
+def test_nothing_shines_through_between_two_surfaces_of_a_layer_with_holes(near_m: float, far_m: float) -> None:
+    """An arm before a body: every ray ends on one of them, wherever the focus lies, up to the outline, which is as without the arm."""
+    lens, size = Lens(50.0, 2.0, 1.0, 36.0), (64, 160)
+    alpha, depth_m = np.ones(size, np.float32), np.full(size, far_m, np.float32)
+    alpha[:, 110:] = 0.0
+    body = Layer(np.repeat(0.5 * alpha[..., None], 3, axis=2), alpha, depth_m)
+    arm = replace(body, depth_m=np.where(np.arange(160) < 60, np.float32(near_m), depth_m))
+    found, alone = (ScatterReference().render([each], lens).alpha[32] for each in (arm, body))
+    np.testing.assert_allclose(found[20:100], 1.0, atol=2e-4)
+    np.testing.assert_allclose(found[100:], alone[100:], atol=2e-4)
+
+
+def test_steps_and_specks_of_depth_leave_no_lines_and_dots_in_a_ball() -> None:
+    """Depth in half floats has steps, and a stray pixel; files of renderers hold both. The same ball without holes is the truth."""
+    lens, rows_columns = Lens(50.0, 0.8, 9.0, 24.0), np.indices((120, 120)) - 60.0
+    radius_px = np.hypot(*rows_columns)
+    depth_m = (10.0 - np.sqrt(np.maximum(0.0, 1.0 - (radius_px / 50.0) ** 2))).astype(np.float16).astype(np.float32)
+    depth_m[50, 62] = 10.9
+    alpha = (radius_px < 50.0).astype(np.float32)
+    rgb = np.repeat((alpha * (0.5 + 0.004 * rows_columns[1]).astype(np.float32))[..., None], 3, axis=2)
+    found = ScatterReference().render([Layer(rgb, alpha, depth_m)], lens)
+    reach_px = 0.5 * float(np.abs(lens.coc_px(depth_m[alpha > 0], 120)).max()) + 2.0
+    inside = radius_px < 50.0 - reach_px
+    assert inside.sum() > 2000
+    np.testing.assert_allclose(found.alpha[inside], 1.0, atol=2e-4)
+    np.testing.assert_allclose(found.rgb[inside], rgb[inside], atol=0.02)
