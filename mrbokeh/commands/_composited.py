@@ -14,7 +14,7 @@ from mrbokeh.commands._level_ground import focused_on_foot, held_as_told, held_t
 from mrbokeh.compositing.choose import best_mode, insertion_of, without_what_touches_the_lens
 from mrbokeh.compositing.ground import with_ground_behind, without_specks
 from mrbokeh.compositing.near_and_far import nearer_than
-from mrbokeh.compositing.plate import LEAST_CONFIDENCE, Inserted, Insertion, Plate
+from mrbokeh.compositing.plate import LEAST_CONFIDENCE, Inserted, Insertion, Plate, same_size
 from mrbokeh.compositing.plate_look.finishing import Finishing, finished
 from mrbokeh.images.color import luminance
 from mrbokeh.images.layer import Layer
@@ -82,7 +82,7 @@ def composited(
     mode, insertion = insertion_by(options, plate)
     # What the ground catches is made of the photograph, whose light has its colour already.
     given_back = finishing.light_before(plate.rgb if plate.sharp_rgb is None else plate.sharp_rgb)
-    drawn = layers_by(options, plate, bundle, kept)(replace(plate, sharp_rgb=given_back))
+    drawn = same_size(plate, layers_by(options, plate, bundle, kept)(replace(plate, sharp_rgb=given_back)))
     sharp = [without_what_touches_the_lens(layer, plate) for layer in drawn]
     if asked is not None and not any((layer.alpha > 0).any() for layer in drawn):
         _nothing_seen(asked, options.virtual)

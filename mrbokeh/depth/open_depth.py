@@ -18,7 +18,7 @@ from mrbokeh.depth.depth_map import DepthMap, DepthSettings, StereoCalibration, 
 from mrbokeh.depth.mended_depth import mended_aloud
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.color import linear_to_srgb
-from mrbokeh.images.image_io import read_depth
+from mrbokeh.images.image_io import read_depth, stored_depth
 from mrbokeh.images.picture_codec import stored_pixels
 from mrbokeh.optics.camera import have_same_shape
 from mrbokeh.system.atomic_files import read_json
@@ -184,6 +184,8 @@ def read_number_map(path: Path, settings: DepthSettings) -> DepthMap:
         numbers, name = _array_of(path)
         if name == _METRES and settings.near_far_m is None and settings.metres_per_unit is None:
             settings = replace(settings, metres_per_unit=1.0)
+    elif path.suffix.lower() == ".exr":
+        numbers = stored_depth(path)
     else:
         pixels = stored_pixels(path)
         numbers = pixels if pixels.ndim == 2 else pixels[..., 0]

@@ -147,16 +147,30 @@ def read_depth(path: Path | str, *, with_holes: bool = False) -> Float32[np.ndar
 
     with_holes: NaN stays, as a hole; else it is refused.
     """
+    depth_m = stored_depth(path)
+    if np.isnan(depth_m).any() and not (with_holes and (depth_m > 0).any()):
+        raise InputError(f"{path}: {int(np.isnan(depth_m).sum())} pixels of depth are NaN: write inf (or 0) where there is background")
+    if not (depth_m > 0).any():
+        raise InputError(f"{path}: expected metres above 0 in its depth, but the largest is {depth_m.max():g}: is it depth along the axis?")
+    return np.where((depth_m > 0) | np.isnan(depth_m), depth_m, np.float32(np.inf))
+
+
+def stored_depth(path: Path | str) -> Float32[np.ndarray, "height width"]:
+    """Return the numbers of an EXR's channel of depth: Z, depth.Z or Y, that of a renderer's only layer (ViewLayer.Depth.Z), or R of
+    three that are alike. Raises InputError where there is none, or several."""
     channels = {name: pixels for part in reversed(read_exr(path)) for name, pixels in part.channels.items()}
-    name = next((name for name in _LONE_DEPTH_NAMES if name in channels), None)
+    of_layers = [name for name in channels if name.lower().endswith("depth.z")]
+    names = [*_LONE_DEPTH_NAMES, *(of_layers if len(of_layers) == 1 else ())]
+    name = next((name for name in names if name in channels), None)
+    if (
+        name is None
+        and set("RGB") <= channels.keys() <= set("RGBA")
+        and all(np.array_equal(channels["R"], channels[each]) for each in "GB")
+    ):
+        name = "R"
     if name is None:
         raise InputError(f"{path}: expected depth in a channel {', '.join(_LONE_DEPTH_NAMES)}, but it has {', '.join(sorted(channels))}")
-    depth_m = channels[name].astype(np.float32)
-    if np.isnan(depth_m).any() and not (with_holes and (depth_m > 0).any()):
-        raise InputError(f"{path}: {int(np.isnan(depth_m).sum())} pixels of {name} are NaN: write inf (or 0) where there is background")
-    if not (depth_m > 0).any():
-        raise InputError(f"{path}: expected metres above 0 in {name}, but the largest is {depth_m.max():g}: is it depth along the axis?")
-    return np.where((depth_m > 0) | np.isnan(depth_m), depth_m, np.float32(np.inf))
+    return channels[name].astype(np.float32)
 
 
 LARGEST_ALPHA_ERROR = 0.1
@@ -180,6 +194,12 @@ def read_layer(path: Path | str, *, extra: bool = False) -> Layer:
     colour = next((part for part in parts if set("RGB") <= part.channels.keys()), parts[0])
     of_one_view = [part for part in parts if part.attributes.get("view") == colour.attributes.get("view")]
     channels = {name: pixels for part in [*reversed(of_one_view), colour] for name, pixels in part.channels.items()}
+    if not set("RGB") <= channels.keys():
+        of_layers = any(name.endswith(".R") for name in channels)
+        raise InputError(
+            f"{path}: expected channels R, G and B, but it has {', '.join(sorted(channels))}"
+            + (": a renderer's file of several layers is taken by --layer" if of_layers else ": write the picture with these names")
+        )
     rgb = in_rec709(ExrPart(channels).stacked("RGB"), stated_primaries(colour, parts), path)
     alpha = channels.get("A", np.ones(rgb.shape[:2])).astype(np.float32)
     require_alpha(path, alpha)

@@ -41,6 +41,7 @@ from mrbokeh.system.resources import ZeroedMemory, cores
 
 _ONE_SURFACE_PX = 1.0
 NOTHING_TAKEN = np.float32(1e-6)
+_FARTHEST_PICTURES, _FARTHEST_PX = 1.5, 1000
 _FULL = 1e-4
 """Less of the pupil unclaimed is rounding."""
 _KEPT = ZeroedMemory(most_bytes=64 << 20)
@@ -71,6 +72,7 @@ def render_layers(layers: Sequence[Layer], lens: Lens, kernel_sum: KernelSum | P
     psf = kernel_sum if isinstance(kernel_sum, PsfField) else AperturePsf.of(layers, lens.aperture, kernel_sum, layering.field_cells)
     coc_px = [psf.drawn_px(coc_px_of(layer, lens)) for layer in layers]
     margin = psf.margin_px(layers, coc_px)
+    _check_blur(layers, margin)
     frame = Frame(layers[0].width_px, layers[0].height_px, -margin, -margin)
     with ThreadPoolExecutor(cores()) as pool:
         slicing = Slicing(psf=psf, slices=layering.slices, frame=frame, pool=pool, memory=_KEPT)
@@ -136,6 +138,17 @@ def _check(layers: Sequence[Layer]) -> None:
     names = {tuple((name, values.shape[2]) for name, values in layer.extra.items()) for layer in layers}
     if len(names) > 1:
         raise InputError(f"layers must have the same extra channels in the same order, but came with {sorted(names)}")
+
+
+def _check_blur(layers: Sequence[Layer], margin_px: int) -> None:
+    """Raise InputError where light travels so far that its memory would be many pictures: depth that near is hardly in metres."""
+    longest_px = max(layers[0].width_px, layers[0].height_px)
+    if margin_px > max(_FARTHEST_PICTURES * longest_px, _FARTHEST_PX):
+        nearest_m = min(float(layer.depth_m[layer.alpha > 0].min()) for layer in layers if (layer.alpha > 0).any())
+        raise InputError(
+            f"depth from {nearest_m:.3g} m is blurred over {2 * margin_px} px, {2 * margin_px / longest_px:.0f} times the picture: "
+            f"expected metres from the lens; numbers from 0 to 1 become metres by --disparity NEAR:FAR, others by a factor"
+        )
 
 
 def _groups(layers: Sequence[PaddedLayer]) -> list[list[PaddedLayer]]:

@@ -311,3 +311,12 @@ def test_a_slope_in_8_bit_has_no_terraces_and_an_edge_stays() -> None:
     assert np.abs(np.diff(found, axis=1))[away].max() * 255.0 < 0.15
     assert (np.diff(found[25, 199:201]) * 255.0).min() > 97.0, "the edge loses a step on each side at most"
     assert without_steps(stored, 65536) is stored
+
+
+@pytest.mark.parametrize("names", ["Z", "Y", "RGB"])
+def test_an_exr_of_plain_numbers_is_put_in_metres_by_its_range(tmp_path: Path, names: str) -> None:
+    """Renderers normalise Z, and node trees invert it: the largest number is NEAR, even steps of 1/distance."""
+    numbers = np.linspace(0.0, 1.0, 12, dtype=np.float32).reshape(3, 4)
+    write_exr(tmp_path / "z.exr", ExrPart(dict.fromkeys(names, numbers)))
+    expected = 1.0 / (1.0 / 8.0 + numbers * (1.0 / 0.5 - 1.0 / 8.0))
+    np.testing.assert_allclose(depth_of_file(tmp_path / "z.exr", (0.5, 8.0)), expected, rtol=1e-5)

@@ -28,6 +28,7 @@ def there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     rgb, ones = np.full((24, 32, 3), 0.3, np.float32), np.ones((24, 32), np.float32)
     write_layer("sharp.exr", opaque(rgb, ones))
     write_layer("layer.exr", Layer(0.5 * rgb, 0.5 * ones, 2 * ones))
+    write_layer("large.exr", Layer(np.tile(0.5 * rgb, (2, 2, 1)), np.tile(0.5 * ones, (2, 2)), np.tile(2 * ones, (2, 2))))
     write_image("photo.png", rgb)
     write_lens("lens.json", Lens(50.0, 2.0, 1.0, 36.0))
     write_exr("no_depth.exr", ExrPart({"Z": np.zeros((24, 32), np.float32)}))
@@ -54,10 +55,11 @@ def replaced(words: tuple[str, ...], option: str, value: str) -> tuple[str, ...]
         ),
         (replaced(RENDER, "--rgb", "."), "expected a picture at ., but it is a folder"),
         (replaced(RENDER, "--lens", "deep.json"), "brackets lie too deep"),
-        (replaced(RENDER, "--depth", "no_depth.exr"), "expected metres above 0 in Z, but the largest is 0"),
+        (replaced(RENDER, "--depth", "no_depth.exr"), "expected metres above 0 in its depth, but the largest is 0"),
         (replaced(RENDER, "--out", "file/out.exr"), "file"),
         (replaced(RENDER, "--out", "/proc/out.exr"), "cannot write /proc/out.exr"),
         (("render", "--layer", "alpha_7.exr", "--lens", "lens.json", "--out", "out.exr"), "expected alpha from 0 to 1, but A goes from 7"),
+        (replaced(COMPOSITE, "--layer", "large.exr"), "the virtual layer is 64x48 px but the photograph is 32x24 px"),
         ((*COMPOSITE, "--save-layer", "/proc/layer.exr"), "cannot write /proc/layer.exr"),
         ((*COMPOSITE, "--ocio", "file"), "--ocio file has no use by itself"),
         ((*COMPOSITE[:-2], "--object", "cake.glb", "--at", "0,0,0"), "in front of the lens, with Z above 0 m"),

@@ -173,3 +173,8 @@ def test_steps_and_specks_of_depth_leave_no_lines_and_dots_in_a_ball() -> None:
     assert inside.sum() > 2000
     np.testing.assert_allclose(found.alpha[inside], 1.0, atol=2e-4)
     np.testing.assert_allclose(found.rgb[inside], rgb[inside], atol=0.02)
+
+
+def test_depth_that_is_hardly_in_metres_is_refused_before_it_takes_all_memory() -> None:
+    layer = opaque(np.full((60, 80, 3), 0.5, np.float32), np.full((60, 80), 1e-4, np.float32))
+    refused("times the picture: expected metres from the lens", ScatterReference().render, [layer], Lens(50.0, 1.8, 1.2, 36.0))

@@ -180,7 +180,10 @@ def test_a_budget_without_time_for_200_steps_is_refused_and_nothing_changes(
 
 @pytest.mark.slow
 def test_the_bar_counts_what_is_done(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two epochs of five slices, one picture a step: 10 steps of 10, and one by one on the way. Of minutes it counts seconds."""
+    """Two epochs of five slices, one picture a step: 10 steps of 10, and one by one on the way.
+
+    Of minutes the whole is what the rate so far makes of them.
+    """
     bars: list[tuple[float, float]] = []
     told = Run._bar
 
@@ -197,7 +200,7 @@ def test_the_bar_counts_what_is_done(scene: Path, tmp_path: Path, monkeypatch: p
     monkeypatch.setattr(Run, "_now_s", lambda _: 0.05 * next(clock))
     settings = dataclasses.replace(SHORT, epochs=None, minutes=0.01)
     progress = train.fit(training_data([scene]), tmp_path / "minutes", settings, least_steps=1)
-    assert {total for _, total in bars} == {60.0 * 0.01} and bars[-1][0] == min(60.0 * 0.01, progress.elapsed_s)
+    assert bars[-1] == (progress.step, progress.step) and all(done <= total <= 1.2 * progress.step for done, total in bars[2:])
     assert LEAST_STEPS == 200
 
 
