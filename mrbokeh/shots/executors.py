@@ -240,13 +240,17 @@ class ProcessExecutor:
 
 
 class _Worker:
-    """Worker process and this end of its pipe: what it tells comes in, and the end of the pipe or a word tells it to stop."""
+    """Worker process and this end of its pipe: what it tells comes in, and the end of the pipe or a word tells it to stop.
+
+    begun: it has said that it is at work; before, while it imports, nothing is lost when it is ended.
+    """
 
     def __init__(self, tasks: Sequence[SegmentTask]) -> None:
         context = get_context("spawn")
         self.pipe, theirs = context.Pipe()
-        self.process = context.Process(target=_work, args=(theirs, tasks), daemon=True)
-        self.process.start()
+        self.process, self.begun = context.Process(target=_work, args=(theirs, tasks), daemon=True), False
+        with _ctrl_c_later():
+            self.process.start()
         theirs.close()
 
     def heard(self, tell: Tell) -> bool:
@@ -256,15 +260,36 @@ class _Worker:
                 heard = self.pipe.recv()
                 if isinstance(heard, BaseException):
                     raise heard
-                tell(*heard)
+                if heard == _BEGUN:
+                    self.begun = True
+                else:
+                    tell(*heard)
         except (EOFError, ConnectionError):
             self.process.join()
         return self.process.is_alive()
 
     def stop(self) -> None:
         """Let the worker leave after its frame, without half files."""
+        if not self.begun and not self.pipe.poll():
+            self.process.terminate()
         with suppress(OSError):
             self.pipe.send(None)
+
+
+@contextmanager
+def _ctrl_c_later() -> Iterator[None]:
+    """Hold Ctrl-C back: processes started meanwhile never get it, so that they print no traces of their imports."""
+    if not hasattr(signal, "pthread_sigmask"):  # Windows
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+_BEGUN = "begun"
 
 
 class _StopWorkingError(Exception):
@@ -290,6 +315,7 @@ def _work(pipe: Any, tasks: Sequence[SegmentTask]) -> None:
             raise _StopWorkingError
 
     try:
+        pipe.send(_BEGUN)
         work_off(tasks, tell)
     except _StopWorkingError:
         os._exit(0)  # nothing is left to do, and Ctrl-C waits for it
