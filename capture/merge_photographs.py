@@ -44,6 +44,8 @@ def merge(photographs: str | Path | Sequence[str | Path | np.ndarray], out: str 
     >>> merged = mrbokeh.merge("desk/")
     """
     given = [photographs] if isinstance(photographs, (str, Path)) else list(photographs)
+    if isinstance(photographs, (list, tuple)) and len(given) < 2:
+        raise InputError(f"photographs: expected two or more of one scene at several focus distances, or a folder, got {len(given)}")
     with TemporaryDirectory() as temporary, nullcontext(temporary) if out is None else nullcontext(str(out)) as scene:
         files = [_file_of(each, Path(temporary) / "arrays", index) for index, each in enumerate(given)]
         report = ingest(files, Path(scene), IngestSettings(Grouping.none))
@@ -64,7 +66,13 @@ def merge(photographs: str | Path | Sequence[str | Path | np.ndarray], out: str 
 def _file_of(given: str | Path | np.ndarray, folder: Path, index: int) -> Path:
     if isinstance(given, (str, Path)):
         return Path(given)
+    rgb = np.asarray(given)
+    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype.kind != "f":
+        raise InputError(
+            f"photographs: expected linear light as floats of shape (height, width, 3), got {rgb.dtype} {rgb.shape}: read files with "
+            f"mrbokeh.read_picture"
+        )
     folder.mkdir(exist_ok=True)
     path = folder / f"{index:04d}.exr"
-    write_image(path, np.asarray(given, np.float32), half=False)
+    write_image(path, rgb.astype(np.float32), half=False)
     return path

@@ -6,6 +6,7 @@ What may be an array may be the path of a file too. Every error a caller can men
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import NoneType
 
 import numpy as np
 from jaxtyping import Float32
@@ -118,6 +119,10 @@ def composite(
             raise InputError("to focus on a pixel the photograph needs depth: give depth_m, or focus in metres")
         plate = replace(plate, lens=_focused(plate.lens, focus, plate.depth_m))
     given = [inserted] if isinstance(inserted, (Layer, str, Path)) else list(inserted)
+    if not given or not all(isinstance(each, (Layer, str, Path)) for each in given):
+        raise InputError(
+            "inserted: expected a GLB file, a layer or several of them; an array becomes one by mrbokeh.Layer(rgb, alpha, depth_m)"
+        )
     glbs = [Path(each) for each in given if not isinstance(each, Layer) and Path(each).suffix.lower() == ".glb"]
     pixels = np.zeros((0, 2)) if at_pixel is None else np.atleast_2d(at_pixel)
     if pixels.ndim != 2 or pixels.shape[1] != 2:
@@ -140,7 +145,7 @@ def composite(
 
 def _rgb(given: np.ndarray | File, name: str) -> Rgb:
     rgb = read_picture(given) if isinstance(given, (str, Path)) else np.asarray(given)
-    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype.kind != "f":
+    if rgb.ndim != 3 or rgb.shape[2] != 3 or rgb.dtype.kind != "f" or not rgb.size:
         raise InputError(
             f"{name}: expected linear light as floats of shape (height, width, 3), got {rgb.dtype} {rgb.shape}: read files with "
             f"mrbokeh.read_picture"
@@ -158,6 +163,8 @@ def _depth_of(given: np.ndarray | File, *, with_holes: bool) -> Plane:
     depth_m = np.asarray(given, np.float32)
     if depth_m.ndim != 2 or (np.isnan(depth_m).any() and not with_holes):
         raise InputError(f"depth_m: expected metres of shape (height, width), inf where nothing is, got shape {depth_m.shape} or NaN in it")
+    if not (depth_m > 0).any():
+        raise InputError("depth_m: expected metres above 0 somewhere, but no pixel has any")
     return np.where((depth_m > 0) | np.isnan(depth_m), depth_m, np.float32(np.inf))
 
 
@@ -165,6 +172,8 @@ def _optics(lens: Lens | File | None, renderer: str | Renderer | None) -> tuple[
     """Return lens and renderer as `lens_and_renderer` does; a Lens that was read brings its renderer too."""
     from mrbokeh.renderers.choose import lens_and_renderer, read_lens
 
+    if not isinstance(lens, (Lens, str, Path, NoneType)):
+        raise InputError(f"lens: expected a mrbokeh.Lens or the path of a lens file or bank, got {type(lens).__name__}")
     path = lens.spread_by if isinstance(lens, Lens) else None if lens is None else Path(lens)
     if renderer is None or isinstance(renderer, str):
         read, spreads = lens_and_renderer(path, renderer)
