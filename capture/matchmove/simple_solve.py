@@ -111,7 +111,8 @@ def _focal_told(camera: SimpleCamera, focal: Focal) -> str:
     if focal.sigma == 0.0:
         return f"; focal length {camera.focal_px:.0f} px, as stated"
     spread = f"{camera.focal_px:.0f} px +- {100 * camera.focal_sigma:.0f} %"
-    return f"; focal length {spread}, {'solved' if camera.focal_sigma < _TOLD_SIGMA else 'hardly told by the clip and in part guessed'}"
+    guessed = "hardly told by the clip and in part guessed (--focal-length MM)"
+    return f"; focal length {spread}, {'solved' if camera.focal_sigma < _TOLD_SIGMA else guessed}"
 
 
 def _warnings(resting: float, lost: int, count: int) -> tuple[str, ...]:

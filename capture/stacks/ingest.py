@@ -149,7 +149,7 @@ def _without_their_raw(skipped: Sequence[SkippedFile], reports: Sequence[StackRe
 def _nothing_usable(given: Sequence[Path], skipped: Sequence[SkippedFile]) -> str:
     where = ", ".join(str(each) for each in given)
     if not skipped:
-        return f"expected photographs (RAW, JPEG, PNG, TIFF, WebP, EXR) in {where}, but found none"
+        return f"expected photographs (RAW, JPEG, HEIC, PNG, TIFF, WebP, EXR, HDR) in {where}, but found none"
     reasons = "; ".join(f"{each.path.name}: {each.reason}" for each in skipped[:5])
     return f"none of the {len(skipped)} files in {where} could be used: {reasons}{' ...' if len(skipped) > 5 else ''}"
 

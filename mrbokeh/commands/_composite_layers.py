@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mrbokeh.commands._composite_options import (
+    NOTHING,
     CompositeOptions,
     ObjectOptions,
     RenderingOptions,
@@ -59,7 +60,7 @@ def layers_by(options: CompositeOptions, first: Plate, bundle: CaptureBundle | N
     if virtual.scene is not None:
         rendered.append(_scene_layers(virtual.scene, virtual.camera, rendering))
     if not still and not rendered and not files.deep:
-        raise InputError("nothing to put into the photograph: give --object OBJ.glb, --scene SCENE.toml or --layer RGBAZ.exr")
+        raise InputError(NOTHING)
     if standing.at_pixel and not rendered:
         standing_there = standing_on_pixel(files.among(still), first, *standing.first_px)
         return lambda _: standing_there

@@ -12,6 +12,8 @@ from mrbokeh.commands import _insertion_options as shared
 from mrbokeh.system.errors import InputError, require_file
 from mrbokeh.system.typed_numbers import numbers_in, pixels_in
 
+NOTHING = "nothing to put into the photograph: give --object OBJ.glb, --scene SCENE.toml or --layer RGBAZ.exr"
+
 PhotoArgument = Annotated[
     Path,
     typer.Argument(
@@ -402,6 +404,10 @@ class CompositeOptions:
 
     def require_meant(self, out: Path) -> None:
         """Raise InputError, before anything is opened, where options contradict one another, or a file that is needed is missing."""
+        from mrbokeh.compositing.choose import insertion_of
+        from mrbokeh.scene.gltf.surfaces import open_gltf
+        from mrbokeh.stacks.capture_bundle import is_bundle
+
         taken, virtual, standing = self.taken, self.virtual, self.standing
         if taken.all_slices:
             self._require_options_of_stacks()
@@ -412,11 +418,15 @@ class CompositeOptions:
             raise InputError(
                 f"--matte says what stands in front, which the mode {virtual.mode} does not look at: leave --mode out, or --matte"
             )
+        if virtual.mode is not None:
+            insertion_of(virtual.mode, taken.near_distance)
         for glb in standing.object_ or ():
-            require_file(glb, "a GLB file")
+            open_gltf(glb)
         self.result.require_meant(out, only_object=bool(standing.object_) and not virtual.layer, all_slices=taken.all_slices)
         if virtual.camera is not None and virtual.scene is None and not standing.object_:
             raise InputError(f"--camera {virtual.camera} is for a --scene or an --object: give one, or leave it out")
+        if not (standing.object_ or virtual.layer or virtual.scene is not None or is_bundle(self.photo)):
+            raise InputError(NOTHING)
 
     def _require_options_of_stacks(self) -> None:
         """Raise InputError if an option is given that is of one picture, and that --all-slices would not follow."""

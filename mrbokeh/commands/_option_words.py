@@ -5,6 +5,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from mrbokeh.optics.lens_library import names
+from mrbokeh.system.typed_numbers import without_f
 
 FEW = 9
 """A command with no more options shows them on one panel."""
@@ -137,10 +138,16 @@ def with_words(command: Any, path: str) -> None:
             parameter.shell_complete = _completing(names)
         if parameter.param_type_name == "option":
             parameter.metavar = metavars.get(name, parameter.metavar)
+            if name == "f-number":
+                parameter.process_value = _of_f_number(parameter.process_value)
             if len(command.params) > FEW and name not in first:
                 parameter.rich_help_panel = panels.get(name, "More")
     order = {name: place for place, name in enumerate(first)}
     command.params.sort(key=lambda each: order.get(each.opts[0].removeprefix("--"), len(order)))
+
+
+def _of_f_number(process: Callable[[Any, Any], Any]) -> Any:
+    return lambda context, value: process(context, without_f(value))
 
 
 def _completing(choices: Callable[[], list[str]]) -> Any:

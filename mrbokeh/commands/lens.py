@@ -38,7 +38,7 @@ class BankOptions:
         float | None, typer.Option("--sensor-height", help="Sensor height in mm (physical; else two thirds of the width).")
     ] = None
     image_width_px: Annotated[
-        int | None, typer.Option("--image-width", help="Width in px of the pictures to blur (physical; else 1024).")
+        int | None, typer.Option("--image-width", min=1, help="Width in px of the pictures to blur (physical; else 1024).")
     ] = None
     nearest_m: Annotated[float | None, typer.Option("--near", help="Nearest depth of the bank in metres (physical; else 0.5).")] = None
     farthest_m: Annotated[
@@ -333,7 +333,7 @@ def describe(
 def coc(
     lens: Annotated[Path, typer.Argument(help="Lens file, or a name of `lens list`.")],
     depths: Annotated[list[float], typer.Argument(help="Depths in metres.")],
-    width: Annotated[int, typer.Option("--image-width", help="Image width in pixels.")] = 1920,
+    width: Annotated[int, typer.Option("--image-width", min=1, help="Image width in pixels.")] = 1920,
 ) -> None:
     """Print the circle of confusion (diameter, pixels; negative in front of the focus) at some depths, on the axis.
 

@@ -20,7 +20,7 @@ from mrbokeh.commands._insertion_options import (
     require_one_focus,
 )
 from mrbokeh.commands._option_groups import grouped
-from mrbokeh.compositing.choose import DEFAULT_MODE
+from mrbokeh.compositing.choose import DEFAULT_MODE, insertion_of
 from mrbokeh.compositing.plate_look.finishing import LookOptions
 from mrbokeh.images.carried_exr import CarriedExr
 from mrbokeh.images.exr_io import ATTRIBUTE, headers_of
@@ -290,6 +290,8 @@ def _numbers(source: PictureSource, taken: ClipOptions) -> "Sequence[int]":
 def _check_virtual(virtual: VirtualOptions, rendering: RenderingOptions, *, finds_depth: bool) -> None:
     if not virtual.layer and virtual.scene is None:
         raise InputError("nothing to put into the clip: give --layer RGBAZ.exr or --scene SCENE.toml")
+    if virtual.mode is not None:
+        insertion_of(virtual.mode)
     for_scenes = (rendering.shutter, rendering.distortion, None if finds_depth else virtual.camera)
     if virtual.scene is None and any(each is not None for each in for_scenes):
         raise InputError("--camera, --shutter and --distortion are for what --scene renders: layers in files have theirs in them")
@@ -366,9 +368,12 @@ def video(
     require_missing_known(taken.missing)
     source = open_source(clip, taken.rate, colour.of_plate, taken.missing)
     recipe = recipe_of(source, lens, facts, taken, virtual, rendering, look, blur, virtual_only=result.virtual_only)
-    if lens_and_renderer(lens, blur.renderer)[0] is None and not {"focal_length_mm", "f_number"} <= facts.given.keys():
+    unfocused, unstated = blur.focus is blur.focus_at is blur.focus_pull is None, lens_and_renderer(lens, blur.renderer)[0] is None
+    if unstated and not {"focal_length_mm", "f_number"} <= facts.given.keys():
         guess(f"no whole lens is stated, so that this one is taken: {recipe.stated_lens.described}")
-    if lens is not None and not lens.exists() and blur.focus is blur.focus_at is blur.focus_pull is None:
+    elif unstated and unfocused:
+        guess(f"nothing tells the focus: it is taken to be at {recipe.stated_lens.focus_described} (--focus METRES)")
+    if lens is not None and not lens.exists() and unfocused:
         guess(f"{lens} is focused at {recipe.stated_lens.focus_distance_m:.3g} m, for nothing tells it (--focus METRES)")
     _tell_layer_spaces(virtual, colour, shot_numbers=_numbers(source, taken))
     scale, whole, plate = parse_proxy(result.proxy), recipe, source
@@ -381,7 +386,8 @@ def video(
         find_depth(plate, virtual.camera, shot.taken, recipe.first_number)
     if blur.focus_at is not None:
         focused = _focus_at_fact(whole, plate, shot.taken[0], blur.focus_at)
-        shot = replace(shot, recipe=replace(recipe, facts=(*recipe.facts, focused)))
+        recipe = replace(recipe, facts=(*recipe.facts, focused))
+        shot = replace(shot, recipe=recipe)
     _try_first_frame(shot)
     if not result.virtual_only and (lost := _alpha_lost(clip, source, target)):
         warn(f"{clip} {lost}")
@@ -390,8 +396,11 @@ def video(
     note = _made(shot, _executor(work, len(shot.segments)), result.overwrite)
     frames = len(shot.taken)
     size = f"{source.info.width_px}x{source.info.height_px} px"
-    told = f"wrote {out} ({size}, {frames} frame{'' if frames == 1 else 's'}, {note}; {recipe.mode})"
-    tell(told, known=recipe.stated_lens.facts, frames=frames, size_px=(source.info.width_px, source.info.height_px))
+    used = recipe.stated_lens
+    focus = "by --focus-pull" if recipe.focus is not None else f"at {used.focus_described}"
+    blurred = f"{used.focal_length_mm:.4g} mm f/{used.f_number:.3g} focused {focus}"
+    told = f"wrote {out} ({size}, {frames} frame{'' if frames == 1 else 's'}, {note}; {recipe.mode}; {blurred})"
+    tell(told, known=used.facts, frames=frames, size_px=(source.info.width_px, source.info.height_px))
 
 
 def _tell_layer_spaces(virtual: VirtualOptions, colour: ColourOptions, shot_numbers: "Sequence[int]") -> None:

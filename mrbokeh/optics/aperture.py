@@ -1,7 +1,7 @@
 """Aperture: the opening of a lens as a weighted sum of polygons, and the PSF that it casts."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import MISSING, dataclass, field, fields, replace
 
 import numpy as np
 from jaxtyping import Float, Float64
@@ -51,6 +51,15 @@ class Aperture:
     rims: tuple[tuple[float, float], ...] = ()
     iris_blades: int = 0
     _seen: dict[tuple[object, ...], "Aperture"] = field(default_factory=dict, init=False, repr=False)
+
+    def __repr__(self) -> str:
+        vertices = sum(map(len, self.outlines))
+        changed = [
+            f", {each.name}={getattr(self, each.name)}"
+            for each in fields(self)
+            if each.repr and each.default is not MISSING and getattr(self, each.name) != each.default
+        ]
+        return f"Aperture({len(self.outlines)} outline{'s' * (len(self.outlines) > 1)} of {vertices} vertices{''.join(changed)})"
 
     def __post_init__(self) -> None:
         if len(self.outlines) != len(self.weights) or not self.outlines:

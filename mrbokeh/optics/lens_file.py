@@ -38,6 +38,7 @@ from mrbokeh.images.picture_codec import stored_pixels
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_library import shipped
+from mrbokeh.optics.psf_bank_file import HEAD
 from mrbokeh.system.atomic_files import read_json, write_json
 from mrbokeh.system.errors import InputError, require_file
 
@@ -282,6 +283,11 @@ def read_lens(path: Path | str) -> Lens:
     Raises InputError where it does not describe a lens.
     """
     path = shipped(path)
+    if (path / HEAD).is_file():
+        raise InputError(
+            f"expected a lens file (LENS.json) at {path}, but it is a bank of PSFs: give the lens file that it was made of, or write what "
+            f"{path / HEAD} states of its lens into one with `mrbokeh lens new`"
+        )
     return lens_from_json(read_json(path, "a lens file (LENS.json)"), str(path), Path(path).parent)
 
 

@@ -272,9 +272,18 @@ def _number(value: float | str | None) -> float | None:
     return None if value is None else float(value)
 
 
+def require_folder(scene: Path) -> None:
+    """Raise InputError unless there is a folder, as it is where focal stacks are."""
+    if not Path(scene).is_dir():
+        raise InputError(
+            f"expected a folder with focal stacks, but there is no folder {scene}: check the name, or run `mrbokeh capture process` first"
+        )
+
+
 def find_focal_stacks(scene: Path) -> list[FocalStack]:
     """Find the stacks of a scene: the folder itself, or the folders under it, by name."""
+    require_folder(scene)
     folders = sorted(path.parent for path in Path(scene).rglob(FILE_NAME))
     if not folders:
-        raise InputError(f"expected a focal stack (a folder with {FILE_NAME}) in {scene}, found none: run `mrbokeh capture ingest` first")
+        raise InputError(f"expected a focal stack (a folder with {FILE_NAME}) in {scene}, found none: run `mrbokeh capture process` first")
     return [read_focal_stack(folder) for folder in folders]

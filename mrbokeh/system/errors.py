@@ -106,6 +106,7 @@ def _of_parser(error: Any) -> str:
     text = str(error.format_message()).rstrip(".")
     for theirs, ours in _PARSERS_WORDS.items():
         text = text.replace(theirs, ours)
+    text += "; a name with spaces needs quotes" if "unexpected extra argument" in text else ""
     words, context = sys.argv[1:], getattr(error, "ctx", None)
     names: list[str] = list(getattr(getattr(error, "param", None), "opts", ()))
     typed = [value for name, value in pairwise(words) if name in names]

@@ -1,11 +1,17 @@
 """Numbers as a user types them into an option; what is none is answered with what was expected."""
 
+import re
 from collections.abc import Callable, Collection
 from typing import TypeVar, overload
 
 from mrbokeh.system.errors import InputError
 
 _Number = TypeVar("_Number")
+
+
+def without_f(text: object) -> object:
+    """Return what is typed for an f-number without the f/ or F before its digits."""
+    return re.sub(r"^\s*f/?(?=[\d.])", "", text, flags=re.IGNORECASE) if isinstance(text, str) else text
 
 
 def pixels_in(text: str, expected: str, count: int) -> tuple[tuple[float, float], ...]:

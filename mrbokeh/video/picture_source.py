@@ -246,6 +246,10 @@ _FRAMES = re.compile(r"(-?\d+)(?:-(-?\d+)(?:x(\d+))?)?")
 def parse_frames(text: str) -> list[range]:
     """Parse frame numbers as studios type them: 1001-1050, the last included, 1001-1050x2 for every second, 1001-1010,1020."""
     found = [_FRAMES.fullmatch(each.strip()) for each in text.split(",")]
+    for each in found:
+        if each and each[2] and int(each[2]) < int(each[1]):
+            told = f"got {each[0]!r}, which runs backwards: give {each[2]}-{each[1]}"
+            raise InputError(f"--frames: expected the first number before the last, {told}")
     ranges = [range(int(each[1]), int(each[2] or each[1]) + 1, int(each[3] or 1) or -1) for each in found if each]
     if len(ranges) < len(found) or not all(ranges):
         gone = " (START:STOP, counted from 0, is no longer taken)" if ":" in text else ""

@@ -229,7 +229,11 @@ def test_the_command_writes_it_and_keeps_what_is_there(tmp_path: Path) -> None:
     assert made.read_text() == written(Program.BLENDER)
     made.write_text("mine")
     again = CliRunner().invoke(app, ["blender", "--out", str(out)])
-    assert isinstance(again.exception, InputError) and "exists already" in str(again.exception) and made.read_text() == "mine"
+    assert (
+        isinstance(again.exception, InputError)
+        and "exists already: give another folder as --out" in str(again.exception)
+        and made.read_text() == "mine"
+    )
     assert CliRunner().invoke(app, ["blender", "--out", str(out), "--overwrite"]).exit_code == 0
     assert made.read_text() == written(Program.BLENDER)
     refused = CliRunner().invoke(app, ["blender", "--out", str(made)])

@@ -24,7 +24,7 @@ from mrbokeh.images.image_io import read_image, read_layer, write_image, write_l
 from mrbokeh.images.layer import Layer
 from mrbokeh.images.picture_codec import quiet_opencv, without_chatter
 from mrbokeh.optics.lens import Lens
-from mrbokeh.optics.lens_file import write_lens
+from mrbokeh.optics.lens_file import read_lens, write_lens
 from mrbokeh.renderers.onnx_sessions import open_session
 from mrbokeh.scene.gltf.gltf_loader import load_glb
 from mrbokeh.system.errors import InputError, mistake_in
@@ -94,6 +94,18 @@ def test_numbers_that_say_nothing_are_refused(card: Path) -> None:
     alone = refusal("composite", photo, "--layer", card, "--lens", card.with_name("lens.json"), "--disparity", "1:9", "--out", out)
     assert "--disparity 1:9 says what the numbers of a --depth file mean" in alone
     assert "--far" in printed_by(board_command, "--far", 0, "--out", card.with_name("board.pdf"), exit_code=2)
+
+
+def test_f_numbers_are_taken_as_they_are_written_on_lenses(tmp_path: Path) -> None:
+    for text in ("f/1.4", "F1.4", "f1.4", "1.4"):
+        words = ("--focal-length", 50, "--f-number", text, "--focus", 2, "--overwrite")
+        assert mrbokeh("lens", "new", tmp_path / "lens.json", *words).returncode == 0
+        assert read_lens(tmp_path / "lens.json").f_number == 1.4
+    assert "expected a number, got 'fast'" in refusal("lens", "new", tmp_path / "no.json", "--f-number", "fast")
+
+
+def test_a_name_with_spaces_wants_quotes() -> None:
+    assert "(iPhone 6.jpg); a name with spaces needs quotes" in refusal("composite", "My", "iPhone", "6.jpg", "--out", "out.png")
 
 
 def test_two_results_need_two_names(card: Path) -> None:
@@ -179,6 +191,8 @@ def test_training_is_not_poured_into_a_folder_of_other_things(card: Path) -> Non
     folder, run = card.parent, card.parent / "run"
     before = sorted(folder.iterdir())
     assert "holds no training run" in refusal("train", "fit", folder, "--out", folder)
+    told = refusal("train", "fit", folder / "nix", "--out", run)
+    assert "there is no folder" in told and "reading" not in told
     told = refusal("train", "export", folder, "--out", folder / "checkpoint.pt", "--overwrite")
     assert "--out: expected a name that ends in .onnx" in told
     for name, value in (("batch", "-3"), ("learning_rate", "nan"), ("learning_rate", "-1"), ("crops_per_picture", "0")):
@@ -278,6 +292,8 @@ def test_a_damaged_glb_is_named_by_its_whole_path(tmp_path: Path) -> None:
     for damaged_glb in (b"not a model at all, but long enough", b"glTF\x02\0\0\0"):
         path.write_bytes(damaged_glb)
         refused(f"{re.escape(str(path))}.*not a readable glTF", load_glb, path)
+    words = ("composite", "none.png", "--object", path, "--at", "0,0,1", "--out", tmp_path / "out.png")
+    assert "not a readable glTF" in refusal(*words), "before the photograph is opened"
 
 
 def test_nothing_is_said_by_a_command_but_our_line(stored: bytes, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from shapely import Polygon, box
@@ -73,6 +75,10 @@ def test_the_diameter_that_is_drawn(unit_radius: float) -> None:
     assert float(shown_diameter_px(1.0 + 1e-9, unit_radius)) * max(unit_radius, 1.0) == pytest.approx(1.0, abs=1e-6)
     above = drawn_px[diameters_px > 1.0]
     assert np.diff(above).min() > 0.0 and np.diff(above).max() < 0.0126, "at most 1.25 times as fast as without"
+
+
+def test_it_is_printed_in_a_line() -> None:
+    assert repr(replace(Aperture.ring(0.5), cat_eye=0.3)) == "Aperture(2 outlines of 128 vertices, cat_eye=0.3)"
 
 
 def test_the_disc_has_its_area_and_malformed_apertures_are_refused() -> None:

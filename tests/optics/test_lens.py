@@ -38,6 +38,9 @@ def test_nothing_but_positive_numbers(field: str) -> None:
 
 
 def test_what_no_lens_can_do_is_refused() -> None:
+    for depth_m, width_px in ((0.0, 1000), (-1.0, 1000), (1.0, 0)):
+        with pytest.raises(InputError, match="expected a depth above 0 m"):
+            NIKKOR.coc_px(depth_m, width_px)
     tilted, far = replace(NIKKOR, tilt_rad=(0.1, 0.0)), np.full((20, 30), 50.0)
     for wrong, said in (
         (lambda: NIKKOR.focused_at(0.02), "is the distance in metres"),

@@ -89,6 +89,14 @@ def test_kernels_in_colour_and_the_sheet_shows_what_the_lens_has() -> None:
     assert "over the frame, -40 px in front" in full and "in focus" in full
 
 
+def test_coc_wants_a_width_and_a_lens_file(tmp_path: Path) -> None:
+    (tmp_path / "bank.json").touch()
+    refused = CliRunner().invoke(app, ["coc", str(tmp_path), "1", "--image-width", "0"], env={"COLUMNS": "200"})
+    assert refused.exit_code == 2 and "greater than or equal to 1" in refused.output
+    with pytest.raises(InputError, match="it is a bank of PSFs: give the lens file that it was made of"):
+        CliRunner().invoke(app, ["coc", str(tmp_path), "1"], catch_exceptions=False)
+
+
 def test_show_writes_a_picture(tmp_path: Path) -> None:
     few = replace(COLOURED, outlines=Aperture.blades(3).outlines)
     write_lens(tmp_path / "lens.json", Lens(50.0, 1.8, float("inf"), 36.0, few, petzval_radius_mm=80.0))

@@ -321,7 +321,7 @@ def test_a_jpeg_beside_a_broken_raw_is_not_dropped_without_a_word(shoot: Path, t
 
 def test_nothing_usable_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "shoot").mkdir()
-    refused("found none", ingest, [tmp_path / "shoot"], tmp_path / "scene")
+    refused("HEIC.* found none", ingest, [tmp_path / "shoot"], tmp_path / "scene")
     (tmp_path / "shoot" / "text.dng").write_text("just a text")
     refused(r"none of the 1 files .* text\.dng: it cannot be decoded", ingest, [tmp_path / "shoot"], tmp_path / "scene")
 

@@ -75,7 +75,8 @@ def test_what_is_unknown_is_said(tmp_path: Path) -> None:
 
 
 def test_folders_that_are_no_stacks_are_named(tmp_path: Path) -> None:
-    refused("capture ingest", find_focal_stacks, tmp_path)
+    refused("capture process", find_focal_stacks, tmp_path)
+    refused("there is no folder .*nix", find_focal_stacks, tmp_path / "nix")
     (tmp_path / "stack.json").write_text('{"format": "mrbokeh-focal-stack", "version": 99}')
     refused("version 99", read_focal_stack, tmp_path)
     (tmp_path / "stack.json").write_text('{"format": "mrbokeh-focal-stack", "version": 2}')

@@ -13,8 +13,8 @@ from capture.matchmove import clip_matchmove
 from capture.matchmove.clip_solve import FLAT, TURNING, ClipSolve
 from capture.matchmove.flow_tracks import FlowTracks
 from capture.matchmove.ground import Horizon, parse_horizon, upright
-from capture.matchmove.simple_cameras import Focal
-from capture.matchmove.simple_solve import simple_solve
+from capture.matchmove.simple_cameras import Focal, SimpleCamera
+from capture.matchmove.simple_solve import _focal_told, simple_solve
 from mrbokeh.optics.camera import Camera
 from mrbokeh.tracking.camera_track.formats import read_track
 from tests.support.command_line import printed_by
@@ -199,3 +199,8 @@ def test_the_focal_length_that_a_phone_writes_is_taken(tmp_path: Path, monkeypat
     monkeypatch.setattr(clip_matchmove, "_focal_in_file_mm", lambda _: 26.0)
     told = clip_matchmove.stated_focal(clip, info, None)
     assert told == replace(known, sigma=0.1)
+
+
+def test_a_guessed_focal_length_names_the_option_that_settles_it() -> None:
+    camera = SimpleCamera(TURNING, 900.0, 0.0, np.eye(4)[None], np.zeros((1, 3)), np.zeros((1, 2, 3)), focal_sigma=0.34)
+    assert _focal_told(camera, Focal(900.0)).endswith("900 px +- 34 %, hardly told by the clip and in part guessed (--focal-length MM)")

@@ -250,7 +250,8 @@ def test_what_evaluate_wants_and_names_of_networks(scene: Path, runs: list[Path]
     assert network_names([Path("runs/a")]) == [NETWORK]
     assert network_names([Path("runs/a"), Path("b.onnx")]) == ["a", "b"]
     assert network_names([Path("x/lens.onnx"), Path("y/lens.onnx")]) == ["x/lens.onnx", "y/lens.onnx"]
-    refused("expected renderers among", renderer_methods, ["gauss"])
+    refused("expected --renderer out of .* got gauss: give one of these", renderer_methods, ["gauss"])
+    refused("got a.onnx: networks are named first", renderer_methods, ["a.onnx"])
     assert mean_known([1.0, float("nan"), 3.0]) == 2.0
     assert np.isnan(mean_known([float("nan")]))
 

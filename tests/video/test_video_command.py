@@ -102,7 +102,8 @@ def test_frames_go_by_the_numbers_of_the_files(clip: Path, settings: list[str], 
     """As studios count: the last is included, x2 takes every second; what is between is neither read nor written."""
     taken = {text: [list(each) for each in parse_frames(text)] for text in ("1001-1003", "1001-1006x2", "1001-1002, 1007", "-2--1")}
     assert list(taken.values()) == [[[1001, 1002, 1003]], [[1001, 1003, 1005]], [[1001, 1002], [1007]], [[-2, -1]]]
-    for text in ("", "7-5", "1-4x0", "a-b", "1-", "1,,2", "10-20x"):
+    refused("which runs backwards: give 5-7", parse_frames, "7-5")
+    for text in ("", "1-4x0", "a-b", "1-", "1,,2", "10-20x"):
         refused("numbers as the files have them, the last included", parse_frames, text)
     pictures = [frame.rgb for frame in read_frames(clip)]
     for i, rgb in enumerate(pictures[:7]):
@@ -148,7 +149,7 @@ def test_mistakes_end_in_a_sentence(clip: Path, settings: list[str], tmp_path: P
         (("--layer", tmp_path / "small.exr", *lens, *out), r"small\.exr is 48x32 px but the clip is 96x64 px"),
         ((*settings, *out, "--frames", "40-50"), r"has the frames 0-11"), ((*settings, "--out", clip), "is read and would be written over"),
         ((*settings, "--out", tmp_path / "there.mkv"), "exists already"), ((*settings, *out, "--renderer", "magic"), "expected a renderer"),
-        ((*lens, *out), "nothing to put into the clip"),
+        ((*lens, *out), "nothing to put into the clip"), ((*settings, *out, "--mode", "infront"), "expected --mode out of front"),
     ):  # fmt: skip
         refused(sentence, run, clip, *words)
     assert not list(tmp_path.glob("out.mov*"))
@@ -201,14 +202,19 @@ def test_ctrl_c_keeps_finished_segments_and_the_same_command_goes_on(clip: Path,
     assert [file.name for file in out.parent.iterdir()] == ["out.mp4"] and len(list(read_frames(out))) == 12
 
 
-def test_facts_of_the_lens_may_stand_in_options(clip: Path, settings: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_facts_of_the_lens_may_stand_in_options(
+    clip: Path, settings: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     """All of them in place of a file; the focus also by a pixel, on depth that is even in 1/distance."""
     facts = ["--focal-length", "50", "--f-number", "2", "--sensor-width", "6", "--layer", tmp_path / "layer.exr", "--renderer", "scatter"]
     write_image(tmp_path / "near.png", np.full((64, 96, 3), 0.5, np.float32), "linear")  # 2 m
     near = ["--depth", tmp_path / "near.png", "--disparity", "1:inf", "--mode", "front"]
     run(clip, *settings, "--renderer", "scatter", "--mode", "front", "--out", tmp_path / "by_file.mkv")
     run(clip, *facts, "--focus", "2", "--mode", "front", "--out", tmp_path / "by_options.mkv")
-    run(clip, *facts, *near, "--focus-at", "48,32", "--out", tmp_path / "by_pixel.mkv")
+    told = run(clip, *facts, *near, "--focus-at", "48,32", "--out", tmp_path / "by_pixel.mkv")
+    assert "50 mm f/2 focused at 2 m" in " ".join(told.split())
+    told = run(clip, *facts, "--frames", "0", "--out", tmp_path / "far.mkv") + capfd.readouterr().err
+    assert "nothing tells the focus: it is taken to be at infinity" in " ".join(told.split())
     by_file, by_options, by_pixel = (list(read_frames(tmp_path / f"by_{way}.mkv")) for way in ("file", "options", "pixel"))
     np.testing.assert_array_equal(by_file[5].rgb, by_options[5].rgb)
     np.testing.assert_allclose(by_pixel[5].rgb, by_file[5].rgb, atol=2e-3)  # the picture of disparity has 65536 steps
@@ -269,7 +275,7 @@ def test_layers_and_depth_of_each_frame(clip: Path, tmp_path: Path) -> None:
         write_exr(tmp_path / f"depth.{1001 + i}.exr", ExrPart({"Z": depth_m}))
     options = ["--lens", tmp_path / "lens.json", "--layer", tmp_path / "moving.%04d.exr", "--first-number", "1001"]
     out = tmp_path / "out.mkv"
-    assert "; between)" in run(clip, *options, "--depth", tmp_path / "depth.%04d.exr", "--renderer", "scatter", "--out", out)
+    assert "; between; " in run(clip, *options, "--depth", tmp_path / "depth.%04d.exr", "--renderer", "scatter", "--out", out)
     for index, (before, after) in enumerate(zip(read_frames(clip), read_frames(out), strict=True)):
         layers = [read_layer(tmp_path / f"moving.{1001 + index}.exr")] if index < 6 else []
         np.testing.assert_allclose(

@@ -177,7 +177,7 @@ def test_mistakes_are_named_and_finished_poses_kept(tmp_path: Path) -> None:
     kept = tmp_path / "kept"
     write_sparse_model(kept / "reconstruction", seen_from([(0.0, 0.0, 0.0)], np.array([[0.0, 0.0, 1.0]])))
     assert find_scene_poses(kept).views[0].name == "v0"
-    refused("capture ingest", find_scene_poses, kept, PoseSettings(overwrite=True))
+    refused("capture process", find_scene_poses, kept, PoseSettings(overwrite=True))
 
 
 @needs_colmap

@@ -90,6 +90,8 @@ def fit_command(
 
     Example: torchrun --nproc-per-node 4 -m training fit lens_50mm --set precision=bfloat16 --out runs/50mm
     """
+    from mrbokeh.stacks.focal_stack import require_folder
+
     # Threads that wait for one another in a busy loop make training many times slower as soon as anything else uses a core.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")  # read by OpenMP when torch is loaded, in the next lines
     budget: dict[str, Any] = {"minutes": minutes, "epochs": epochs} if minutes is not None or epochs is not None else {}
@@ -97,6 +99,8 @@ def fit_command(
     try:
         settings = with_overrides(_begun_with(preset, settings_file, tune, choices or (), out, overwrite), choices or ())
         settings = replace(settings, **budget | {name: value for name, value in given.items() if value is not None})
+        for scene in scenes:
+            require_folder(scene)
         if _number("RANK") == 0:
             _require_run(out)
             say(f"reading {', '.join(str(scene) for scene in scenes)}", err=True)  # loading PyTorch takes seconds

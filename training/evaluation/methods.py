@@ -110,7 +110,8 @@ def renderer_methods(names: Sequence[str]) -> list[Method]:
     """Return the renderers of those names, with the lens of the slice and its depth; raises InputError for other names."""
     unknown = [name for name in names if name not in BY_NAME]
     if unknown:
-        raise InputError(f"expected renderers among {', '.join(BY_NAME)}, got {', '.join(unknown)}: networks go before --data")
+        advice = "networks are named first, before the data" if any(name.endswith(".onnx") for name in unknown) else "give one of these"
+        raise InputError(f"expected --renderer out of {', '.join(BY_NAME)}, got {', '.join(unknown)}: {advice}")
     return [renderer_method(name) for name in names]
 
 
@@ -128,7 +129,7 @@ def lens_methods(names: Sequence[str], lens: Path | None) -> list[Method]:
     if lens is None:
         return []
     if lens.suffix.lower() == ".onnx":
-        raise InputError(f"--lens {lens} is a network: name it before --data, among the networks to compare")
+        raise InputError(f"--lens {lens} is a network: name it first, among the networks to compare")
     known, opening = (WITH_BANKS, None) if is_bank(lens) else (tuple(BY_NAME), read_lens(lens).aperture)
     return [_renderer_method(f"{name}, {lens.stem}", lens_and_renderer(lens, name)[1], opening) for name in names if name in known]
 
