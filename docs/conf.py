@@ -23,7 +23,7 @@ autodoc_typehints_format = "short"
 
 
 def as_fields(_app: Any, _what: str, _name: str, obj: Any, _options: Any, lines: list[str]) -> None:
-    """Turn a docstring of the house (`name: meaning`, `Raises InputError if ...`) into the fields that Sphinx lists with their types."""
+    """Turn a docstring of this project (`name: meaning`, `Raises InputError if ...`) into the fields that Sphinx lists with their types."""
     names = "|".join(getattr(obj, "__annotations__", ())) or "-"
     start = re.compile(rf"(?:^|(?<=\. ))(?=(?:{names})(?:, (?:{names}))*: |Raises \w+ )", re.MULTILINE)
     paragraphs, lines[:] = re.split(r"\n\s*\n", "\n".join(lines).strip()), []

@@ -19,9 +19,9 @@ from typer.main import get_command
 
 from mrbokeh.commands._option_words import with_words
 from mrbokeh.system.atomic_files import writing_alone
-from mrbokeh.system.channel import channel, end_spinner, object_on_stdout, opened, remove_unfinished, write_object
 from mrbokeh.system.console import begin
 from mrbokeh.system.errors import FAULT, INTERRUPTED, InputError, fault_in, mistake_in
+from mrbokeh.system.messages import channel, end_spinner, object_on_stdout, opened, remove_unfinished, write_object
 
 # OpenCV's threads otherwise spin while they wait for work: a tenth of the CPU time of a merge. It is read when OpenCV is imported.
 os.environ.setdefault("OPENCV_THREAD_POOL_ACTIVE_WAIT_WORKER", "0")

@@ -7,8 +7,8 @@ import typer
 
 import mrbokeh
 from mrbokeh.optics.lens import Lens
-from mrbokeh.system.channel import say, tell
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import say, tell
 from viewfinder.options import CalibrationOptions, ListeningOptions, PhoneOptions, TrackingOptions, ViewfinderOptions
 
 app = typer.Typer(add_completion=False)

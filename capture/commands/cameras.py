@@ -2,7 +2,7 @@
 
 import typer
 
-from mrbokeh.system.channel import show, tell
+from mrbokeh.system.messages import show, tell
 
 HELP = "\n\n".join(
     (

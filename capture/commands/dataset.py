@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mrbokeh.system.channel import guess, tell, warn
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import guess, tell, warn
 
 if TYPE_CHECKING:
     from mrbokeh.stacks.focal_stack_dataset import FocalStackDataset

@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.system.channel import say, tell, warn
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import say, tell, warn
 
 HELP = "\n\n".join(
     (

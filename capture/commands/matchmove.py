@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mrbokeh.system.atomic_files import require_safe_outputs
-from mrbokeh.system.channel import guess, say, tell, warn
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import guess, say, tell, warn
 
 if TYPE_CHECKING:
     from capture.matchmove.clip_matchmove import Matchmove

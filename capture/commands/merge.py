@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from mrbokeh.system.channel import guess, say, tell
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import guess, say, tell
 
 if TYPE_CHECKING:
     from mrbokeh.stacks.focal_stack import FocalStack

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mrbokeh.system.channel import tell
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import tell
 from mrbokeh.system.typed_numbers import numbers_in
 
 if TYPE_CHECKING:

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.system.channel import tell, warn
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import tell, warn
 
 HELP = "\n\n".join(
     (

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from mrbokeh.system.channel import say
+from mrbokeh.system.messages import say
 
 if TYPE_CHECKING:
     from mrbokeh.stacks.focal_stack import FocalStack

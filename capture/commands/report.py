@@ -5,8 +5,8 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.system.channel import say
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import say
 
 FEW = 3
 """Of more failed gates only the names are printed: a wall of text hid that the picture was good. The page and --strict tell all."""

@@ -5,8 +5,8 @@ from typing import Annotated, Literal
 
 import typer
 
-from mrbokeh.system.channel import guess, tell
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import guess, tell
 
 _DICTIONARY = "DICT_4X4_50"
 HELP = "\n\n".join(

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mrbokeh.system.channel import say, tell
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import say, tell
 
 if TYPE_CHECKING:
     from capture.tether.camera_driver import CameraDriver, FocusSteps

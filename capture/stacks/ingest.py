@@ -26,9 +26,9 @@ from capture.stacks.stack_description import FEWEST_TO_MERGE, StackReport, finis
 from capture.stacks.stack_ingest import Development, StackWork, stack_work
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.stacks.guessed_metres import is_lens_guessed, stated_distances_m
-from mrbokeh.system.channel import say, show, warn
 from mrbokeh.system.console import progress_bars
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import say, show, warn
 
 
 @dataclass(frozen=True)

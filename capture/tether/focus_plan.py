@@ -31,8 +31,8 @@ from rich.table import Table
 from mrbokeh.optics.lens import MM_PER_M, Lens, film_plane_m, lens_distance_m
 from mrbokeh.optics.lens_file import lens_from_json, lens_to_json
 from mrbokeh.system.atomic_files import atomic_path, read_json, write_json
-from mrbokeh.system.channel import show, tell, warn
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import show, tell, warn
 
 MOST_SLICES = 999
 _ROUNDING = 1e-9

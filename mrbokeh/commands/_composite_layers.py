@@ -25,8 +25,8 @@ from mrbokeh.images.layer import Layer, flatten
 from mrbokeh.optics.camera import Camera
 from mrbokeh.scene.staging.scene_description import SceneDescription, looking_down
 from mrbokeh.stacks.capture_bundle import CaptureBundle
-from mrbokeh.system.channel import guess, warn
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import guess, warn
 
 if TYPE_CHECKING:
     from mrbokeh.commands._composite_kept import KeptParts

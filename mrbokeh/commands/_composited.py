@@ -20,9 +20,9 @@ from mrbokeh.images.color import luminance
 from mrbokeh.images.layer import Layer
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.stacks.capture_bundle import CaptureBundle
-from mrbokeh.system.channel import guess, warn
 from mrbokeh.system.console import working
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import guess, warn
 
 if TYPE_CHECKING:
     from mrbokeh.commands._composite_kept import KeptParts

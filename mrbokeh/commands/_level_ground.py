@@ -12,8 +12,8 @@ from mrbokeh.compositing.plate import Plate
 from mrbokeh.images.color import luminance
 from mrbokeh.scene.staging.scene_description import looking_down
 from mrbokeh.solving.solved_camera import GUESSED, KNOWN, LOW, SolvedCamera, read_solved_camera
-from mrbokeh.system.channel import guess, say, warn
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import guess, say, warn
 
 HIGH_SHARE = 0.25
 """Share of the picture's height that an object takes whose size is neither told nor known."""

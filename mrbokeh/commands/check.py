@@ -10,8 +10,8 @@ from mrbokeh.checks.check_shot import CheckSettings, Taken, check_shot
 from mrbokeh.checks.checked_picture import open_shot
 from mrbokeh.checks.picture_checks import CheckReport
 from mrbokeh.commands._option_groups import grouped
-from mrbokeh.system.channel import show, tell
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import show, tell
 
 app = typer.Typer(add_completion=False)
 

@@ -9,7 +9,7 @@ import typer
 from mrbokeh.commands._composite_options import CompositeOptions, OutOption
 from mrbokeh.commands._insertion_options import focused_at_pixel
 from mrbokeh.commands._option_groups import grouped
-from mrbokeh.system.channel import guess, say, tell, warn
+from mrbokeh.system.messages import guess, say, tell, warn
 
 if TYPE_CHECKING:
     from mrbokeh.compositing.plate import Plate
@@ -36,8 +36,8 @@ def composite(options: CompositeOptions, out: OutOption) -> None:
 
     Example: mrbokeh composite captures/20261122-101500 --out captured.png
     """
+    from mrbokeh.commands._composite_files import alpha_lost, blur_told, check_outputs, write_results
     from mrbokeh.commands._composite_layers import objects_apart, objects_of
-    from mrbokeh.commands._composite_parts import alpha_lost, blur_told, check_outputs, write_results
     from mrbokeh.commands._composited import composited, placed
     from mrbokeh.commands._level_ground import with_camera_of_file
     from mrbokeh.commands._preview import smaller, write_preview_of
@@ -84,7 +84,7 @@ def composite(options: CompositeOptions, out: OutOption) -> None:
 
 def _opened(options: CompositeOptions, bundle: "CaptureBundle | None", lens: "Lens | None") -> "Plate":
     """Return the plate of the options, with its focus where they say."""
-    from mrbokeh.commands._composite_parts import plate_by
+    from mrbokeh.commands._composite_files import plate_by
 
     focus_at = options.optics.focus_at
     # With --focus-at only its depth is asked for at first.

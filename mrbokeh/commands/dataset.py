@@ -8,8 +8,8 @@ import typer
 
 from mrbokeh.commands._insertion_options import ANY_LENS, ANY_RENDERER, DisparityOption, ExactDepthOption, LensFacts, OverwriteOption
 from mrbokeh.commands._option_groups import grouped
-from mrbokeh.system.channel import tell, warn
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import tell, warn
 
 app = typer.Typer(no_args_is_help=True, help="Data sets for research: focal stacks from pictures with depth.")
 

@@ -20,9 +20,9 @@ from rich.table import Table
 
 from mrbokeh import __version__
 from mrbokeh.demo.plan import DATA
-from mrbokeh.system.channel import show, tell
 from mrbokeh.system.console import progress_bars
 from mrbokeh.system.errors import InputError, install_command
+from mrbokeh.system.messages import show, tell
 
 app = typer.Typer(add_completion=False)
 

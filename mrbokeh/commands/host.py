@@ -7,7 +7,7 @@ from typing import Annotated, NamedTuple
 
 import typer
 
-from mrbokeh.system.channel import tell
+from mrbokeh.system.messages import tell
 
 app = typer.Typer(add_completion=False)
 

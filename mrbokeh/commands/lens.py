@@ -8,8 +8,8 @@ import typer
 
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.commands.lens_fit import fit, match
-from mrbokeh.system.channel import tell
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import tell
 from mrbokeh.system.typed_numbers import numbers_in
 
 if TYPE_CHECKING:

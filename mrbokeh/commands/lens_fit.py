@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mrbokeh.commands._option_groups import grouped
-from mrbokeh.system.channel import guess, tell
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import guess, tell
 from mrbokeh.system.typed_numbers import numbers_in
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from mrbokeh.commands._option_groups import grouped
 from mrbokeh.refocus import Refocusing
 from mrbokeh.stacks.focal_stack import FocalStack, Slice
 from mrbokeh.stacks.guessed_metres import unit_of
-from mrbokeh.system.channel import guess, tell, warn
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import guess, tell, warn
 
 app = typer.Typer(add_completion=False)
 

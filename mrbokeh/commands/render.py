@@ -25,8 +25,8 @@ from mrbokeh.images.layer import Layer, flatten
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import DEFAULT
-from mrbokeh.system.channel import tell
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import tell
 
 app = typer.Typer(add_completion=False)
 

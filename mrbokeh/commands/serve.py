@@ -23,8 +23,8 @@ import numpy as np
 import typer
 
 from mrbokeh.hosts.client import Refused, ask, connection_file
-from mrbokeh.system.channel import apart, channel, finished, say, tell, unfinished
 from mrbokeh.system.errors import InputError, fault_in, mistake_in
+from mrbokeh.system.messages import apart, channel, finished, say, tell, unfinished
 
 if TYPE_CHECKING:
     from mrbokeh.commands._insertion_options import LensFacts

@@ -8,9 +8,9 @@ import numpy as np
 import typer
 from jaxtyping import Float32
 
-from mrbokeh.system.channel import guess, tell, warn
 from mrbokeh.system.console import working
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import guess, tell, warn
 from mrbokeh.system.typed_numbers import pixels_in
 
 _USUAL_SHARE, _WIDEST_SHARE = 0.03, 0.5

@@ -8,8 +8,8 @@ import typer
 
 from mrbokeh.commands._option_groups import grouped
 from mrbokeh.system.atomic_files import refuse_existing, require_safe_outputs
-from mrbokeh.system.channel import say, tell, warn
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import say, tell, warn
 
 if TYPE_CHECKING:
     from mrbokeh.optics.camera import Camera

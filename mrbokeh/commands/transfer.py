@@ -28,9 +28,9 @@ from mrbokeh.commands._option_groups import grouped
 from mrbokeh.depth.depth_map import DepthSettings, parse_known, parse_near_far, parse_stereo
 from mrbokeh.optics.lens import Lens
 from mrbokeh.refocus import SharpPhotograph
-from mrbokeh.system.channel import tell, warn
 from mrbokeh.system.console import track
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import tell, warn
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Blurred = Callable[[float], Rgb]

@@ -35,9 +35,9 @@ from mrbokeh.shots.render_shot import SequenceTarget, VideoTarget, render_shot
 from mrbokeh.shots.shot import SEGMENT_S, Shot, Target
 from mrbokeh.stacks.photograph import SensorOrientation, lens_for_orientation
 from mrbokeh.system.atomic_files import require_safe_outputs
-from mrbokeh.system.channel import guess, say, tell, warn
 from mrbokeh.system.console import kept_when_interrupted, progress_bars
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import guess, say, tell, warn
 from mrbokeh.system.resources import cores
 from mrbokeh.video.clip import has_alpha_apart
 from mrbokeh.video.encodings import with_alpha

@@ -29,8 +29,8 @@ from mrbokeh.stacks.capture_bundle import CaptureBundle
 from mrbokeh.stacks.focal_stack import DEPTH_SOURCE, FILE_NAME, FROM_FOCUS, FocalStack, read_focal_stack
 from mrbokeh.stacks.guessed_metres import is_lens_guessed
 from mrbokeh.stacks.photograph import Photograph, lens_for_photograph, read_photograph
-from mrbokeh.system.channel import guess, say
 from mrbokeh.system.errors import InputError, require_file
+from mrbokeh.system.messages import guess, say
 
 _log = logging.getLogger(__name__)
 

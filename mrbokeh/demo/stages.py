@@ -11,8 +11,8 @@ from pathlib import Path
 from uuid import uuid4
 
 from mrbokeh.system.atomic_files import read_json, write_json
-from mrbokeh.system.channel import say
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import say
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import numpy as np
 
 from mrbokeh.depth.edge_votes import Guide, Mask, Picture, Plane, moved_by_colour
 from mrbokeh.depth.soft_edges import LEAST_SOFT_PX, sharpened, softness
-from mrbokeh.system.channel import say
+from mrbokeh.system.messages import say
 
 LEAST_JUMP = 0.04
 """Least jump between two surfaces, as a share of the map's range."""

@@ -15,8 +15,8 @@ import numpy as np
 
 from mrbokeh.optics.psf_bank import Axis, Grid, PsfBank, check_kernel, check_space, grid_over
 from mrbokeh.system.atomic_files import atomic_path, read_json, write_json
-from mrbokeh.system.channel import channel
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import channel
 
 FORMAT = "mrbokeh-psf-bank"
 VERSION = 1

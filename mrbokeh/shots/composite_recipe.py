@@ -26,7 +26,7 @@ from mrbokeh.renderers.choose import BY_NAME, DEFAULT, files_of, lens_and_render
 from mrbokeh.shots.inputs import CameraSource, DepthSource, Description, Finisher, FocusSource, Kept, LayerSource, MatteSource, Moment
 from mrbokeh.shots.shot import Picture, Rgba
 from mrbokeh.stacks.photograph import SensorOrientation, lens_for_orientation
-from mrbokeh.system.channel import say
+from mrbokeh.system.messages import say
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]

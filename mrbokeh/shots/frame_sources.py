@@ -24,9 +24,9 @@ from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.optics.camera import Camera, have_same_shape
 from mrbokeh.shots.inputs import CameraSource, DepthSource, Finisher, FocusSource, Kept, MatteSource, Moment
 from mrbokeh.system.atomic_files import read_json, writing_alone
-from mrbokeh.system.channel import say
 from mrbokeh.system.console import kept_when_interrupted
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import say
 from mrbokeh.tracking.camera_track.focus_pull import FocusPull, parse_focus_keys, read_focus_pull
 from mrbokeh.tracking.camera_track.formats import format_of_file, read_track
 from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame, TrackOptions

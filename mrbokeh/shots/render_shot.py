@@ -40,8 +40,8 @@ from mrbokeh.shots.shot import MANIFEST, PartSink, Picture, Rgba, Segment, Shot
 from mrbokeh.stacks.exr_layers.cryptomatte import cryptomatte_among
 from mrbokeh.stacks.exr_layers.sequence import ExrSequence
 from mrbokeh.system.atomic_files import read_json, refuse_existing, write_json
-from mrbokeh.system.channel import channel
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import channel
 from mrbokeh.video.encodings import encoding_for, encoding_name, with_alpha
 from mrbokeh.video.image_sequence import NumberedFiles, is_pattern, numbered, written_frames
 from mrbokeh.video.picture_source import PictureSource

@@ -10,7 +10,7 @@ from typing import Any
 
 from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FILE_NAME, METRES, FocalStack, read_focal_stack
-from mrbokeh.system.channel import guess
+from mrbokeh.system.messages import guess
 
 GUESSED = "guessed metres"
 STATED_BEFORE = "stated_before_guessing"

@@ -10,8 +10,8 @@ from pathlib import Path
 from tempfile import TemporaryFile
 from typing import Any
 
-from mrbokeh.system.channel import finished, unfinished
 from mrbokeh.system.errors import InputError, require_file
+from mrbokeh.system.messages import finished, unfinished
 
 
 @contextmanager

@@ -31,8 +31,8 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.runtime import rtsys
 from numba.misc.appdirs import AppDirs
 
-from mrbokeh.system.channel import say
 from mrbokeh.system.compiled_libraries import link_once
+from mrbokeh.system.messages import say
 
 _config: Any = numba.config
 

@@ -24,7 +24,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from mrbokeh.system.channel import OF_NO_COMMAND, channel, resting, say_in_between
+from mrbokeh.system.messages import OF_NO_COMMAND, channel, resting, say_in_between
 
 Item = TypeVar("Item")
 

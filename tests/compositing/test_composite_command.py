@@ -21,7 +21,7 @@ from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
-from tests.house.test_user_mistakes import said
+from tests.project.test_user_mistakes import said
 from tests.support.renderer_banks import bank_folder
 
 HEIGHT, WIDTH = 96, 144

@@ -10,8 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from mrbokeh import composite
+from mrbokeh.commands._composite_files import plate_by
 from mrbokeh.commands._composite_options import CompositeOptions, PlateOptions
-from mrbokeh.commands._composite_parts import plate_by
 from mrbokeh.commands._composited import placing_warning
 from mrbokeh.commands.composite import app
 from mrbokeh.compositing.choose import best_mode, insertion_of
@@ -31,7 +31,7 @@ from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.exr_layers.composite_exr import write_deep_exr
 from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
-from tests.house.test_user_mistakes import said
+from tests.project.test_user_mistakes import said
 from tests.support.card_stack import SIZE, make_card_stack
 from tests.support.command_line import mrbokeh
 from tests.support.composite_exr_reader import read_composite_exr

@@ -29,7 +29,7 @@ from mrbokeh.stacks.guessed_metres import (
     metres_notes,
 )
 from tests.compositing.test_composite_command import CAKE
-from tests.house.test_user_mistakes import said
+from tests.project.test_user_mistakes import said
 from tests.support.card_stack import CARD_PX, LENS, SIZE, make_card_stack
 from tests.support.guessed_stack import guessed_twin
 from tests.support.left_out_slices import leave_one_out

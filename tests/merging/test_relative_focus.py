@@ -21,7 +21,7 @@ from mrbokeh.optics.drawn_diameters import drawn_diameters_px
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack
-from tests.house.test_user_mistakes import said
+from tests.project.test_user_mistakes import said
 from tests.support.blended_slices import all_in_focus
 
 SIZE = (200, 280)

@@ -14,7 +14,7 @@ import torch
 
 from mrbokeh.images.image_metrics import psnr, ssim
 from mrbokeh.stacks.focal_stack import read_focal_stack
-from mrbokeh.system.channel import channel
+from mrbokeh.system.messages import channel
 from tests.support.command_line import mrbokeh, printed_by
 from tests.support.drawn_curves import drawn_curves
 from tests.support.refusals import refused

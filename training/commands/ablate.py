@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mrbokeh.system.channel import say, tell, warn
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import say, tell, warn
 
 if TYPE_CHECKING:
     from training.ablation.plan import Ablation, PlannedRun, Row, TableName

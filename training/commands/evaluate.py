@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from mrbokeh.system.atomic_files import refuse_existing
-from mrbokeh.system.channel import guess, tell
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import guess, tell
 
 
 def evaluate_command(

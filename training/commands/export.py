@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mrbokeh.system.channel import tell
+from mrbokeh.system.messages import tell
 
 if TYPE_CHECKING:
     from mrbokeh.renderers.onnx_network import NetworkFacts

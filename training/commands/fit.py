@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mrbokeh.system.channel import channel, guess, say, tell
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import channel, guess, say, tell
 from training.fitting.settings import with_overrides
 
 Scenes = Annotated[

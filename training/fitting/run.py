@@ -18,9 +18,9 @@ import numpy as np
 import torch
 from rich.progress import Progress as Bars
 
-from mrbokeh.system.channel import say, warn
 from mrbokeh.system.console import progress_bars
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import say, warn
 from training.data.batches import Batch, Drawing, draw_share, joined_by_size
 from training.fitting.checkpoint import FAR_ABOVE, FAR_ABOVE_STEPS, Learner, Progress, read_checkpoint, restore_checkpoint
 from training.fitting.checkpoint import FILE_NAME as CHECKPOINT_NAME

@@ -11,8 +11,8 @@ from aiohttp import web
 from mrbokeh.optics.camera import Camera, camera_of_lens
 from mrbokeh.renderers.choose import read_lens
 from mrbokeh.system.atomic_files import refuse_existing
-from mrbokeh.system.channel import say, tell
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import say, tell
 from mrbokeh.tracking.charuco.board import read_board
 from viewfinder.app.opening import browser_cameras, open_phone
 from viewfinder.options import CalibrationOptions

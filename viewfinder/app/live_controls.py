@@ -14,8 +14,8 @@ from jaxtyping import UInt8, UInt16
 from mrbokeh.compositing.overlay import code_tables
 from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.stacks.capture_bundle import write_bundle
-from mrbokeh.system.channel import say
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import say
 from mrbokeh.tracking.world_axes import turned, turned_back
 from viewfinder.app.live_compositor import CompositedFrame, LiveCompositor
 from viewfinder.app.opening import Parts

@@ -18,8 +18,8 @@ from jaxtyping import UInt8
 from mrbokeh.compositing.overlay import Overlay
 from mrbokeh.optics.camera import Camera
 from mrbokeh.optics.lens import Lens
-from mrbokeh.system.channel import say
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import say
 from mrbokeh.system.resources import keep_few_arenas
 from viewfinder.app.live_compositor import CompositedFrame, LiveCompositor
 from viewfinder.app.live_controls import LiveControls, Notices, Takes

@@ -15,8 +15,8 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 from aiohttp import web
 
-from mrbokeh.system.channel import tell
 from mrbokeh.system.errors import InputError, MissingExtraError
+from mrbokeh.system.messages import tell
 from viewfinder.options import ListeningOptions
 from viewfinder.server.access import LOOPBACK_NAMES, Access, is_loopback
 from viewfinder.server.door import PATIENCE_S, Door, quiet_log

@@ -21,8 +21,8 @@ from mrbokeh.images.color import srgb_codes
 from mrbokeh.stacks.focal_stack import FocalStack
 from mrbokeh.stacks.photograph import read_photograph
 from mrbokeh.system.atomic_files import atomic_path
-from mrbokeh.system.channel import apart
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import apart
 from viewfinder.studio.state import Stroke
 
 Plane = Float32[np.ndarray, "height width"]

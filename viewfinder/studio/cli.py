@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from mrbokeh.system.channel import say
+from mrbokeh.system.messages import say
 from viewfinder.cli import InterfaceOption, LanOption, PortOption, QrOption, TlsKeyOption, TlsOption
 from viewfinder.options import ListeningOptions
 

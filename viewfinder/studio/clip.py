@@ -22,8 +22,8 @@ from mrbokeh.scene.staging.staged_scene import modified_s
 from mrbokeh.shots.frame_sources import scene_track
 from mrbokeh.solving.solved_camera import HIGH, KNOWN, SolvedCamera, write_solved_camera
 from mrbokeh.system.atomic_files import atomic_path
-from mrbokeh.system.channel import apart
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import apart
 from mrbokeh.tracking.camera_track.formats import read_track
 from mrbokeh.tracking.camera_track.track import CameraTrack
 from mrbokeh.tracking.world_axes import turned_back, upright_camera

@@ -10,8 +10,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mrbokeh.system.channel import apart, say
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import apart, say
 from viewfinder.studio.project import Project
 from viewfinder.studio.saving import Saves
 from viewfinder.studio.state import DrawnLine, Pair, Stroke, StudioState, state_of

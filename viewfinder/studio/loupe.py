@@ -17,7 +17,7 @@ from mrbokeh.layering.pixel_box import Box, is_same_everywhere
 from mrbokeh.optics.camera import camera_of_lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.stacks.photograph import read_photograph
-from mrbokeh.system.channel import apart
+from mrbokeh.system.messages import apart
 from viewfinder.studio.photograph import OpenedPhotograph, whole_plate
 
 _MOST_MARGIN_PX, _SPARE_PX = 300, 8

@@ -36,8 +36,8 @@ from mrbokeh.solving.solve_camera import Line, solve_camera
 from mrbokeh.solving.solved_camera import KNOWN, SolvedCamera
 from mrbokeh.stacks.focal_stack import FILE_NAME, FocalStack, read_focal_stack
 from mrbokeh.stacks.photograph import Photograph, read_photograph
-from mrbokeh.system.channel import apart
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import apart
 from viewfinder.studio.command_line import options_of, preview_scale
 from viewfinder.studio.state import DrawnLine, Pair, StudioState
 

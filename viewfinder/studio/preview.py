@@ -11,18 +11,18 @@ import cv2
 import numpy as np
 from jaxtyping import Float32
 
+from mrbokeh.commands._composite_files import blur_told
 from mrbokeh.commands._composite_kept import KeptParts
 from mrbokeh.commands._composite_layers import objects_of
 from mrbokeh.commands._composite_options import CompositeOptions
-from mrbokeh.commands._composite_parts import blur_told
 from mrbokeh.commands._composited import composited, placed
 from mrbokeh.compositing.plate import Plate
 from mrbokeh.compositing.plate_look.finishing import Finishing, finishing_of, matched_finishing, white_balanced
 from mrbokeh.images.color import srgb_codes
 from mrbokeh.images.layer import Layer
 from mrbokeh.scene.staging.staged_scene import StagedObject
-from mrbokeh.system.channel import apart
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import apart
 from viewfinder.studio.loupe import Region, WholePhotograph, photographed, region_of
 from viewfinder.studio.photograph import MOST_PX, OpenedPhotograph
 

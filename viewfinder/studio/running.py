@@ -9,8 +9,8 @@ import mrbokeh
 from mrbokeh.optics.lens_library import shipped
 from mrbokeh.renderers.choose import read_lens
 from mrbokeh.stacks.focal_stack import FILE_NAME
-from mrbokeh.system.channel import say
 from mrbokeh.system.errors import InputError, require_file
+from mrbokeh.system.messages import say
 from viewfinder.options import ListeningOptions
 from viewfinder.server.endpoint import on_stop, open_endpoint, serving_site
 from viewfinder.server.sessions import Role

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from aiohttp import web
 
-from mrbokeh.system.channel import apart
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import apart
 from viewfinder.server.access import Access, error, json_value, message_body
 from viewfinder.server.site import page_routes
 from viewfinder.studio.command_line import command_line, options_of

@@ -20,9 +20,9 @@ from mrbokeh.distortion import LensDistortion
 from mrbokeh.images.exr_io import ExrPart, write_exr
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.atomic_files import read_json, write_json
-from mrbokeh.system.channel import say
 from mrbokeh.system.console import track as with_progress
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import say
 from mrbokeh.tracking.camera_track.track import CameraTrack, TrackedFrame
 from mrbokeh.video.image_sequence import numbered, written_frames
 from mrbokeh.video.picture_source import PictureSource

@@ -26,8 +26,8 @@ from mrbokeh.images.exr_io import ExrPart
 from mrbokeh.images.layer import Layer
 from mrbokeh.stacks.exr_layers.deep_layers import is_deep
 from mrbokeh.stacks.exr_layers.render_channels import RenderChannels, layer_of, nearest_depth
-from mrbokeh.system.channel import say
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import say
 
 _MASK = 0xFFFFFFFF
 

@@ -23,9 +23,9 @@ from mrbokeh.stacks.capture_bundle import CaptureBundle
 from mrbokeh.stacks.guessed_metres import GUESSED
 from mrbokeh.stacks.photograph import read_photograph
 from mrbokeh.system.atomic_files import require_safe_outputs
-from mrbokeh.system.channel import say
 from mrbokeh.system.console import flag
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import say
 from mrbokeh.video.image_sequence import read_numbers
 
 

@@ -185,7 +185,7 @@ def try_all(folder: Path) -> None:
 @pytest.mark.skipif(os.name == "nt", reason="no SIGALRM there")
 def test_no_value_of_any_option_makes_a_command_stumble(tmp_path: Path) -> None:
     """In a process of its own, where annotations are not checked and warnings are no errors, as for users."""
-    script = "import sys; from pathlib import Path; from tests.house.test_bad_options import try_all; try_all(Path(sys.argv[1]))"
+    script = "import sys; from pathlib import Path; from tests.project.test_bad_options import try_all; try_all(Path(sys.argv[1]))"
     done = subprocess.run([sys.executable, "-c", script, tmp_path], cwd=LIVE.parents[2], capture_output=True, text=True)
     count, *wrong = done.stdout.splitlines()
     assert done.returncode == 0 and int(count) >= 1500, done.stderr

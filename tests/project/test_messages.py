@@ -16,8 +16,8 @@ from mrbokeh.cli import SUB_COMMANDS, command_of
 from mrbokeh.optics.lens import Lens
 from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.system.atomic_files import atomic_folder, writing_alone
-from mrbokeh.system.channel import opened, write_object
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import opened, write_object
 from tests.support.command_line import mrbokeh
 from tests.support.refusals import refused
 
@@ -38,7 +38,7 @@ SLEEPING = (
 
 SPEAKING = (
     "import sys; import mrbokeh.optics.lens_file as file\n"
-    "from mrbokeh import cli; from mrbokeh.system import channel; from rich.table import Table\n"
+    "from mrbokeh import cli; from mrbokeh.system import messages as channel; from rich.table import Table\n"
     "def speak(path, lens):\n"
     "    channel.say('a hint'); channel.warn('careful'); print('noise', file=sys.stderr); channel.tell('the result')\n"
     "    table = Table('of two', box=None); channel.show(table); sys.exit()\n"
@@ -174,7 +174,7 @@ def test_an_interrupt_ends_within_two_seconds_with_one_line(tmp_path: Path, opti
 def test_nobody_speaks_past_the_channel() -> None:
     """A program of its own and the compiler's listener, which kernels depend on, print; tables and bars go to the consoles here."""
     root = Path(__file__).resolve().parents[2]
-    speaking = {root / "mrbokeh/system" / name for name in ("channel.py", "compiled.py")} | {root / "mrbokeh/cli.py"}
+    speaking = {root / "mrbokeh/system" / name for name in ("messages.py", "compiled.py")} | {root / "mrbokeh/cli.py"}
     speaking.add(root / "capture/poses/colmap_worker.py")
     for package in ("mrbokeh", "capture", "training", "viewfinder"):
         for path in sorted((root / package).rglob("*.py")):

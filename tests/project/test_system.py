@@ -10,10 +10,10 @@ import pytest
 from rich.console import Console
 
 from mrbokeh.system import console
-from mrbokeh.system.channel import opened
 from mrbokeh.system.console import PlainLines, track
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.gphoto2_library import NoCameraError, chosen_of, explanation, library
+from mrbokeh.system.messages import opened
 from mrbokeh.system.resources import ZeroedMemory
 
 

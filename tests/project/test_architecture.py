@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.house.test_style import FILES, PACKAGES, ROOT, nodes
+from tests.project.test_style import FILES, PACKAGES, ROOT, nodes
 
 # The levels of mrbokeh/, top first: a room imports from lower levels only; inside a room anything without a cycle.
 LEVELS = (
@@ -66,7 +66,7 @@ def level_of(module: str, levels: tuple[set[str], ...], folder: str) -> tuple[in
     for level, rooms in enumerate(levels):
         if room in rooms:
             return level, room
-    raise AssertionError(f"{module} lies in no room of {folder}: say where in the house {room!r} belongs")
+    raise AssertionError(f"{module} lies in no room of {folder}: say in which folder {room!r} belongs")
 
 
 @cache

@@ -115,7 +115,6 @@ def test_merge_takes_arrays_and_keeps_the_stack_where_asked(tmp_path: Path) -> N
         (lambda rgb, _: mb.composite(rgb[:30], ball(), LENS), "60x30"),
         (lambda rgb, z: mb.render(rgb, np.nan * z, LENS), "no pixel has any"),
         (lambda rgb, z: mb.render(rgb, 1e-4 * z, LENS), "times the picture"),
-        (lambda rgb, z: mb.render(rgb, z, {"f_number": 2}), "got dict"),
         (lambda rgb, _: mb.composite(rgb, [], LENS), "expected a GLB file, a layer"),
         (lambda rgb, _: mb.merge([rgb]), "two or more"),
         (lambda rgb, _: mb.merge([rgb, (255 * rgb).astype(np.uint8)]), "got uint8"),

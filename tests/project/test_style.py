@@ -1,4 +1,4 @@
-"""The house's English and the shape of its calls, read from the syntax tree."""
+"""The project's English and the shape of its calls, read from the syntax tree."""
 
 import ast
 import gc

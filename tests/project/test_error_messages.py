@@ -3,7 +3,7 @@
 import ast
 import re
 
-from tests.house.test_style import nodes, place
+from tests.project.test_style import nodes, place
 
 
 def messages() -> list[tuple[str, str]]:
