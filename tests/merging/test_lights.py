@@ -244,15 +244,18 @@ def card() -> Card:
 
 @pytest.mark.slow
 def test_the_dark_card_has_no_ghost_rings(card: Card) -> None:
-    """The best focus-stacking tools leave 21 to 26 dB on such a card; 33 dB is what the project wants of it."""
+    """The best focus-stacking tools leave 21 to 26 dB on such a card; 33 dB is what the project wants of it.
+
+    It has 35.5 dB; 36.5 before slices of a place were compared by one noise, which real pictures near white need.
+    """
     assert len(restored_lights(lambda: card.slices, card.slices[5])[0]) == 6
     first = card.merged()
     guided = all_in_focus_from_depth(lambda: card.slices, card.depth_m, card.optics, first)
     second = with_restored_lights(guided, restored_lights(lambda: card.slices, guided, guided=True)[1])
     best_single_db = max(card.psnr_db(each) for each in card.slices)
     assert best_single_db < 35.0, "even the slice that is focused on the card has lost the light in it"
-    assert card.psnr_db(first) > 36.0
-    assert card.psnr_db(second) > 36.0
+    assert card.psnr_db(first) > 35.0
+    assert card.psnr_db(second) > 35.0
 
 
 @pytest.mark.slow

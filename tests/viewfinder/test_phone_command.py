@@ -15,13 +15,13 @@ import av
 import cv2
 import numpy as np
 import pytest
-import typer
 from scipy.spatial.transform import Rotation
 
 from mrbokeh.images.image_io import write_layer
 from mrbokeh.images.layer import clear
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
+from mrbokeh.system.messages import Channel
 from tests.support.browser_sender import Canvas, sending
 from tests.support.command_line import printed_by
 from tests.support.phone_on_camera import CAMERA_FROM_PHONE, PHONE, VIEWS, camera_at, phone_at, picture, rig_error, view, write_files
@@ -85,8 +85,8 @@ class Hands:
 def test_calibration_by_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Traced pictures of both, detected and solved in real threads; the issue's bounds for a pose are 0.3 degrees and 3 mm."""
     write_files(tmp_path)
-    said, echo = list[str](), typer.echo
-    monkeypatch.setattr(typer, "echo", lambda text: (said.append(text), echo(text)))
+    said, log = list[str](), Channel.said
+    monkeypatch.setattr(Channel, "said", lambda channel, text: (said.append(text), log(channel, text)))
     hands, before = Hands(tmp_path, said), set(threads())
     person = Thread(target=hands.work)
     person.start()
