@@ -53,8 +53,8 @@ def test_each_slice_is_the_picture_of_its_command_line(folder: Path, tmp_path: P
     kept.holds_light = True
     shown = region_of(WholePhotograph(opened), options, kept, Region(36.0, 24.0, 24))
     # Rims are moved by what a part shows, which differs from the whole in a few pixels.
-    np.testing.assert_allclose(shown, preview.rgb[12:36, 24:48], atol=0.04)
-    assert np.abs(shown - preview.rgb[12:36, 24:48]).mean() < 0.002
+    off = np.abs(shown - preview.rgb[12:36, 24:48]).max(axis=2)
+    assert off.mean() < 0.002 and (off > 0.04).sum() <= 3 and off.max() < 0.08
 
 
 def test_the_object_is_blurred_as_its_surroundings_in_every_slice(folder: Path) -> None:
