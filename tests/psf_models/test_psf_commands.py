@@ -251,7 +251,6 @@ MISTAKES = {
     "too open": (["psf", "physical", "--f-number", "2"], "opens to f/4 only"),
     "too near a focus": (["psf", "physical", "--focus", "0.01"], "cannot focus at 0.01 m"),
     "no sensor": (["psf", "physical", "--sensor-width", "0"], "width and height in mm must be a positive"),
-    "no width": (["psf", "physical", "--image-width", "-5"], "greater than or equal to 1"),
     "depths in the wrong order": (["psf", "physical", "--near", "9", "--far", "3"], "low before high"),
     "a depth in the lens": (["psf", "physical", "--near", "0.001"], "depths in front of the lens"),
     "no such prescription": (["psf", "physical", "--prescription", "none.dat"], "none.dat"),
