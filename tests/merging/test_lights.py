@@ -242,20 +242,21 @@ def card() -> Card:
     return traced_card(_texture(np.random.default_rng(3), 0.02, 0.01), lamps())
 
 
-@pytest.mark.slow
-def test_the_dark_card_has_no_ghost_rings(card: Card) -> None:
-    """The best focus-stacking tools leave 21 to 26 dB on such a card; 33 dB is what the project wants of it.
+_ONE_NOISE = "35.5 dB since slices of a place are compared by one noise, which real pictures near white need; 36.5 before"
 
-    It has 35.5 dB; 36.5 before slices of a place were compared by one noise, which real pictures near white need.
-    """
+
+@pytest.mark.slow
+@pytest.mark.parametrize("least_db", [35.0, pytest.param(36.0, marks=pytest.mark.xfail(strict=True, reason=_ONE_NOISE))])
+def test_the_dark_card_has_no_ghost_rings(card: Card, least_db: float) -> None:
+    """The best focus-stacking tools leave 21 to 26 dB on such a card; 33 dB is what the project wants of it."""
     assert len(restored_lights(lambda: card.slices, card.slices[5])[0]) == 6
     first = card.merged()
     guided = all_in_focus_from_depth(lambda: card.slices, card.depth_m, card.optics, first)
     second = with_restored_lights(guided, restored_lights(lambda: card.slices, guided, guided=True)[1])
     best_single_db = max(card.psnr_db(each) for each in card.slices)
     assert best_single_db < 35.0, "even the slice that is focused on the card has lost the light in it"
-    assert card.psnr_db(first) > 35.0
-    assert card.psnr_db(second) > 35.0
+    assert card.psnr_db(first) > least_db
+    assert card.psnr_db(second) > least_db
 
 
 @pytest.mark.slow
