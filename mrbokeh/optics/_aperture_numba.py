@@ -6,6 +6,9 @@ import numpy as np
 
 from mrbokeh.system.compiled import njit
 
+ROUNDING = 1e-15
+"""Part of a kernel's light below which a pixel's is what running sums leave of rounding, another on other processors: none."""
+
 
 @njit(cache=True, nogil=True)
 def _mean_ramp(t: float, low: float, high: float) -> float:
@@ -90,7 +93,10 @@ def fill_psf(kernel: np.ndarray, steps: np.ndarray, vertices: np.ndarray, starts
         return
     for i in range(weights.shape[0]):
         add_polygon_coverage(kernel, steps, vertices[starts[i] : starts[i + 1]], radius_px, weights[i])
-    kernel /= kernel.sum()
+    light = kernel.sum()
+    for y in range(kernel.shape[0]):
+        for x in range(kernel.shape[1]):
+            kernel[y, x] = kernel[y, x] / light if abs(kernel[y, x]) > ROUNDING * abs(light) else 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
