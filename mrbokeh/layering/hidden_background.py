@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Int32, Int64
 
 from mrbokeh.images.layer import Layer
-from mrbokeh.layering.highlights import mark_highlights
+from mrbokeh.layering.highlights import find_highlights, mark_highlights
 from mrbokeh.layering.padded_layers import PaddedLayer, Pixels
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
@@ -67,13 +67,15 @@ def hidden_within(layer: PaddedLayer, pool: Executor) -> list[Pixels]:
     if not whole.any():
         return []
     box = _box_of(whole)
-    values, coc_px, whole = layer.values[box], continued(layer.coc_px[box], whole[box]), whole[box]
-    rim = np.empty(whole.shape, np.bool_)
+    whole = whole[box]
+    coc_px, rim = np.ascontiguousarray(continued(layer.coc_px[box], whole)), np.empty(whole.shape, np.bool_)
     in_bands(pool, len(rim), _BAND_ROWS, lambda top, bottom: find_rims(rim, coc_px, STEP_PX, top, bottom))
     rim &= whole
     if not rim.any():
         return []
-    edges = _Edges(coc_px, np.flatnonzero(rim).astype(np.int32), whole & ~rim, np.zeros_like(rim))
+    values = np.ascontiguousarray(layer.values[box])
+    lit = find_highlights(values)
+    edges = _Edges(coc_px, np.flatnonzero(rim).astype(np.int32), whole & ~(rim | lit), lit)
     _, places, seeds = _sources(edges)
     is_behind = whole.reshape(-1)[places] & (coc_px.reshape(-1)[seeds] > coc_px.reshape(-1)[places] + STEP_PX)
     filled = _filled(values, edges, places[is_behind], seeds[is_behind], pool)
@@ -223,7 +225,7 @@ def layer_from_view(
     target, nearest = _nearest((row * camera.width_px + column)[inside], z_m[inside])
     colours[target], depths_m[target] = rgb[usable][inside][nearest], z_m[inside][nearest]
     size = camera.height_px, camera.width_px
-    return _closed(colours.reshape(*size, 3), depths_m.reshape(size))
+    return _without_pinholes(colours.reshape(*size, 3), depths_m.reshape(size))
 
 
 def _nearest(target: Int[np.ndarray, " points"], z_m: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -233,7 +235,7 @@ def _nearest(target: Int[np.ndarray, " points"], z_m: np.ndarray) -> tuple[np.nd
     return target[order][first], order[first]
 
 
-def _closed(rgb: Float32[np.ndarray, "height width 3"], depth_m: Float32[np.ndarray, "height width"]) -> Layer:
+def _without_pinholes(rgb: Float32[np.ndarray, "height width 3"], depth_m: Float32[np.ndarray, "height width"]) -> Layer:
     """Fill holes that have at least 5 of 8 neighbours about as deep as the nearest of them with the mean of these."""
     around = np.stack([np.roll(depth_m, (dy, dx), (0, 1)) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)])
     colours = np.stack([np.roll(rgb, (dy, dx), (0, 1)) for dy in (-1, 0, 1) for dx in (-1, 0, 1) if (dy, dx) != (0, 0)])

@@ -16,9 +16,10 @@ Circles of confusion are diameters at which kernels are drawn (mrbokeh.optics.dr
    kernels are mirrored at the focus: there what hides goes right before the rest of its slice.
 5. What moves while the shutter is open is drawn out along its path, slice by slice, before it is spread (mrbokeh.layering.motion),
    unless the kernels hold motion themselves.
-6. If the scene is opaque, what is left unclaimed in the end is shared out by dividing by the coverage. Coverage counts shares of
-   the pupil as the place sees it: light that a lens or a medium loses darkens the colour once and leaves coverage alone
-   (mrbokeh.layering.psf_over_field), so it is not made up for here, and what is behind does not shine through.
+6. What is left unclaimed in the end is shared out by dividing by the coverage: everywhere if the scene is opaque, else where no ray
+   gets past the outline of a layer. Coverage counts shares of the pupil as the place sees it: light that a lens or a medium loses
+   darkens the colour once and leaves coverage alone (mrbokeh.layering.psf_over_field), so it is not made up for here, and what is
+   behind does not shine through.
 """
 
 from collections.abc import Iterator, Sequence
@@ -31,7 +32,7 @@ import numpy as np
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.hidden_background import Mask, continued, enclosed_by, hidden_within, split_edges
 from mrbokeh.layering.highlights import find_highlights
-from mrbokeh.layering.padded_layers import PaddedLayer, Pixels, coc_px_of, pad_layer
+from mrbokeh.layering.padded_layers import PaddedLayer, Pixels, check_reach, coc_px_of, pad_layer
 from mrbokeh.layering.psf_over_field import FIELD_CELLS, AperturePsf, Frame, KernelSum, PsfField
 from mrbokeh.layering.pupil_views import Cut, Rims
 from mrbokeh.layering.slices import Channels, Slicing, composited
@@ -41,7 +42,6 @@ from mrbokeh.system.resources import ZeroedMemory, cores
 
 _ONE_SURFACE_PX = 1.0
 NOTHING_TAKEN = np.float32(1e-6)
-_FARTHEST_PICTURES, _FARTHEST_PX = 1.5, 1000
 _FULL = 1e-4
 """Less of the pupil unclaimed is rounding."""
 _KEPT = ZeroedMemory(most_bytes=64 << 20)
@@ -52,9 +52,9 @@ _KEPT = ZeroedMemory(most_bytes=64 << 20)
 class Layering:
     """Settings of how layers are cut and put together.
 
-    slices: how many at most over the whole range of circles of confusion. fill: whether an opaque layer is continued
-    behind what is near. field_cells: columns and rows in which the aperture is taken as the same (cat-eyes). sees_rims: whether rims are
-    seen from points of the pupil (mrbokeh.layering.pupil_views).
+    slices: how many at most over the whole range of circles of confusion. fill: whether surfaces are continued behind what is nearer in
+    their layer. field_cells: columns and rows in which the aperture is taken as the same (cat-eyes). sees_rims: whether rims are seen from
+    points of the pupil (mrbokeh.layering.pupil_views).
     """
 
     slices: int = 16
@@ -72,7 +72,7 @@ def render_layers(layers: Sequence[Layer], lens: Lens, kernel_sum: KernelSum | P
     psf = kernel_sum if isinstance(kernel_sum, PsfField) else AperturePsf.of(layers, lens.aperture, kernel_sum, layering.field_cells)
     coc_px = [psf.drawn_px(coc_px_of(layer, lens)) for layer in layers]
     margin = psf.margin_px(layers, coc_px)
-    _check_blur(layers, margin)
+    check_reach(layers, coc_px, margin)
     frame = Frame(layers[0].width_px, layers[0].height_px, -margin, -margin)
     with ThreadPoolExecutor(cores()) as pool:
         slicing = Slicing(psf=psf, slices=layering.slices, frame=frame, pool=pool, memory=_KEPT)
@@ -83,7 +83,7 @@ def render_layers(layers: Sequence[Layer], lens: Lens, kernel_sum: KernelSum | P
         found: tuple[Channels, Channels] | None = None
         for cut in reversed(cuts):
             front = composited(cut.surfaces, slicing, by_depth=not cut.is_opaque)
-            front = _shared_out(*front) if any(layer.is_opaque for layer in cut.layers) else _closed(*front, cut.layers, slicing)
+            front = _shared_out(*front) if any(layer.is_opaque for layer in cut.layers) else _shared_out_inside(*front, cut.layers, slicing)
             found = front if found is None else _over(*front, *found)
         if rims and found is not None:
             rims.correct(found[0], pool)
@@ -114,8 +114,10 @@ def _parted(group: Sequence[PaddedLayer], lights: Sequence[Mask], pool: Executor
     is_near = coc_px < virtual_px - _ONE_SURFACE_PX
     if is_near.any():
         near = PaddedLayer(np.where(is_near[..., None], values, np.float32(0.0)), coc_px, False)
-        yield Cut([near], [Pixels.covered(near)], [lights[-1] & is_near])
-    yield Cut([before], [Pixels.covered(before)], lights[:1])
+        behind_is_near = behind.coc_px < virtual_px.reshape(-1)[behind.places] - _ONE_SURFACE_PX
+        yield Cut([near], [Pixels.covered(near), behind.only(behind_is_near)], [lights[-1] & is_near])
+        behind = behind.only(~behind_is_near)
+    yield Cut([before], [Pixels.covered(before), *hidden_within(before, pool)], lights[:1])
     far = PaddedLayer(np.where(is_near[..., None], np.float32(0.0), values), coc_px, True)
     yield Cut([far], [Pixels.of(far), behind], [lights[-1] & ~is_near])
 
@@ -138,17 +140,6 @@ def _check(layers: Sequence[Layer]) -> None:
     names = {tuple((name, values.shape[2]) for name, values in layer.extra.items()) for layer in layers}
     if len(names) > 1:
         raise InputError(f"layers must have the same extra channels in the same order, but came with {sorted(names)}")
-
-
-def _check_blur(layers: Sequence[Layer], margin_px: int) -> None:
-    """Raise InputError where light travels so far that its memory would be many pictures: depth that near is hardly in metres."""
-    longest_px = max(layers[0].width_px, layers[0].height_px)
-    if margin_px > max(_FARTHEST_PICTURES * longest_px, _FARTHEST_PX):
-        nearest_m = min(float(layer.depth_m[layer.alpha > 0].min()) for layer in layers if (layer.alpha > 0).any())
-        raise InputError(
-            f"depth from {nearest_m:.3g} m is blurred over {2 * margin_px} px, {2 * margin_px / longest_px:.0f} times the picture: "
-            f"expected metres from the lens; numbers from 0 to 1 become metres by --disparity NEAR:FAR, others by a factor"
-        )
 
 
 def _groups(layers: Sequence[PaddedLayer]) -> list[list[PaddedLayer]]:
@@ -190,21 +181,22 @@ def _shared_out(colour: Channels, taken: Channels) -> tuple[Channels, Channels]:
     return colour, taken
 
 
-def _closed(colour: Channels, taken: Channels, layers: Sequence[PaddedLayer], slicing: Slicing) -> tuple[Channels, Channels]:
+def _shared_out_inside(colour: Channels, taken: Channels, layers: Sequence[PaddedLayer], slicing: Slicing) -> tuple[Channels, Channels]:
     """Return the colour of layers with holes: where nothing gets past their outlines, the unclaimed pupil belongs to those who claimed.
 
     Steps of depth too small to be edges, and specks, would be lines and dots of what is behind.
     """
     frame = slicing.frame
     inside = np.s_[-frame.top_px : frame.height_px - frame.top_px, -frame.left_px : frame.width_px - frame.left_px]
-    whole = np.logical_or.reduce([layer.values[..., 3] >= 1.0 for layer in layers])
-    open_to = np.flatnonzero((whole[inside] & (taken.min(axis=2) < 1.0 - _FULL)).reshape(-1))
-    if len(open_to) == 0:
+    is_open = taken.min(axis=2) < 1.0 - _FULL
+    wholes = [(layer.values[..., 3] >= 1.0, layer.coc_px) for layer in layers]
+    wholes = [(whole, coc_px) for whole, coc_px in wholes if (whole[inside] & is_open).any()]
+    if not wholes:
         return colour, taken
-    largest_px = np.maximum.reduce([np.abs(layer.coc_px) for layer in layers])
     # A bank tells how far light travels from the pixels themselves; none of them sends it farther than the margin.
     reach_px = partial(slicing.psf.reach_px, (), frame=frame) if isinstance(slicing.psf, AperturePsf) else lambda _: -frame.top_px
-    enclosed = open_to[enclosed_by(whole, largest_px, reach_px)[inside].reshape(-1)[open_to]]
+    # By one of them alone: the outline of one that another hides is still an outline.
+    enclosed = np.flatnonzero(is_open & np.logical_or.reduce([enclosed_by(*each, reach_px)[inside] for each in wholes]))
     flat, shares = colour.reshape(-1, colour.shape[2]), taken.reshape(-1, taken.shape[2])
     claimed = np.maximum(shares[enclosed], NOTHING_TAKEN)
     flat[enclosed] /= claimed[:, _kinds(colour, taken)]

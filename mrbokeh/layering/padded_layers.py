@@ -1,5 +1,6 @@
 """Padded layers: what slices are cut from, with a circle of confusion for every pixel and continued beyond the frame."""
 
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
@@ -13,6 +14,8 @@ from mrbokeh.system.errors import InputError
 from mrbokeh.system.resources import in_bands
 
 BORDER_PX = 5
+_MOST_MARGIN, _MOST_MARGIN_PX = 1.5, 1000
+"""How far light may travel beyond the frame: so many pictures, or so many pixels where that is more."""
 _BAND_ROWS = 32
 
 Plane = Float32[np.ndarray, "height width"]
@@ -77,6 +80,21 @@ def coc_px_of(layer: Layer, lens: Lens) -> Plane:
     if covered.all():
         return np.asarray(lens.coc_px(layer.depth_m, layer.width_px), np.float32)
     return np.where(covered, lens.coc_px(np.where(covered, layer.depth_m, np.inf), layer.width_px), 0.0).astype(np.float32)
+
+
+def check_reach(layers: Sequence[Layer], coc_px: Sequence[Plane], margin_px: int) -> None:
+    """Raise InputError where light travels so far beyond the frame that this would take all memory: depth is hardly in metres then.
+
+    coc_px: of each layer. margin_px: how far the light of any of them travels.
+    """
+    longest_px = max(layers[0].width_px, layers[0].height_px)
+    if margin_px > max(_MOST_MARGIN * longest_px, _MOST_MARGIN_PX):
+        layer, sizes_px = max(zip(layers, map(np.abs, coc_px), strict=True), key=lambda pair: float(pair[1].max()))
+        raise InputError(
+            f"what lies {layer.depth_m.flat[sizes_px.argmax()]:.3g} m away is blurred over {2 * margin_px} px, "
+            f"{2 * margin_px / longest_px:.0f} times the picture: expected depth in metres from the lens, not parts of 1, disparity or "
+            f"millimetres, and a focus and an f-number that go with it"
+        )
 
 
 def pad_layer(layer: Layer, coc_px: Plane, margin_px: int, pool: Executor) -> PaddedLayer:

@@ -10,6 +10,8 @@ from mrbokeh.layering.layering import Layering, render_layers
 from mrbokeh.layering.psf_over_field import Frame, blur_colours
 from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.lens import Lens
+from mrbokeh.renderers.base import Renderer
+from mrbokeh.renderers.layered_reconstruction import LayeredReconstruction
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from tests.support.refusals import refused
 
@@ -146,25 +148,74 @@ def test_what_cannot_be_rendered_is_said(layers: list[Layer], said: str) -> None
 # Layers with holes: nothing shines through what is whole.
 
 
-@pytest.mark.parametrize(("near_m", "far_m"), [(0.5, 0.78), (0.7, 0.78), (1.0, 1.5), (0.8, 1.3), (1.3, 1.9)])
-def test_nothing_shines_through_between_two_surfaces_of_a_layer_with_holes(near_m: float, far_m: float) -> None:
-    """An arm before a body: every ray ends on one of them, wherever the focus lies, up to the outline, which is as without the arm."""
-    lens, size = Lens(50.0, 2.0, 1.0, 36.0), (64, 160)
-    alpha, depth_m = np.ones(size, np.float32), np.full(size, far_m, np.float32)
-    alpha[:, 110:] = 0.0
-    body = Layer(np.repeat(0.5 * alpha[..., None], 3, axis=2), alpha, depth_m)
-    arm = replace(body, depth_m=np.where(np.arange(160) < 60, np.float32(near_m), depth_m))
-    found, alone = (ScatterReference().render([each], lens).alpha[32] for each in (arm, body))
-    np.testing.assert_allclose(found[20:100], 1.0, atol=2e-4)
-    np.testing.assert_allclose(found[100:], alone[100:], atol=2e-4)
+Strip = tuple[int, int, float, tuple[float, float, float]]
+"""First and last column + 1, depth in metres, colour: an upright strip as high as the picture; EDGE is beyond every ray."""
+RED, GREEN, BLUE, EDGE = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), 10**6
+ARM_AND_BODY: list[Strip] = [(-EDGE, 60, 0.8, RED), (-EDGE, 72, 2.0, GREEN)]
+NEAR_PARTS: list[Strip] = [(-EDGE, 60, 0.85, RED), (-EDGE, 72, 1.8, GREEN)]
+NEAR_AND_HIDDEN: list[Strip] = [(-EDGE, 60, 0.5, RED), (80, 90, 2.0, BLUE)]
+FAR: Strip = (-EDGE, EDGE, 20.0, BLUE)
+
+
+def of_strips(strips: list[Strip]) -> Layer:
+    rgb, depth = np.zeros((64, 160, 3), np.float32), np.full((64, 160), np.inf, np.float32)
+    for first, end, strip_m, colour in sorted(strips, key=lambda strip: -strip[2]):
+        rgb[:, max(first, 0) : end], depth[:, max(first, 0) : end] = colour, strip_m
+    return Layer(rgb, np.isfinite(depth).astype(np.float32), depth)
+
+
+def by_rays(strips: list[Strip], lens: Lens) -> np.ndarray:
+    """Red, green, blue and coverage of each column: which strip each of 2001 rays through the round pupil meets first."""
+    across = np.linspace(-1.0, 1.0, 2001)
+    chord = np.sqrt(1.0 - across**2)
+    seen, free = np.zeros((160, 4)), np.ones((160, len(across)))
+    for first, end, strip_m, colour in sorted(strips, key=lambda strip: strip[2]):
+        met = np.arange(160)[:, None] + 0.5 - across * 0.5 * float(lens.coc_px(strip_m, 160))
+        hit = free * ((met >= first) & (met < end))
+        seen += (hit @ (chord / chord.sum()))[:, None] * np.array([*colour, 1.0])
+        free -= hit
+    return seen
+
+
+@pytest.mark.parametrize("sensor_width_mm", [6.0, 9.0])
+@pytest.mark.parametrize(
+    "layers",
+    [
+        pytest.param([ARM_AND_BODY], id="an arm before a body, within the blur of its outline"),
+        pytest.param([NEAR_AND_HIDDEN, [(59, 130, 1.0, GREEN)]], id="two layers one behind the other, each in part"),
+        pytest.param([[(20, 140, 5.0, RED)], [*NEAR_PARTS, FAR]], id="an object behind two near parts of a photograph"),
+        pytest.param([ARM_AND_BODY, [(24, 30, 0.6, BLUE), FAR]], id="an arm before a body in a photograph with something nearer"),
+    ],
+)
+def test_what_shines_through_layers_with_inner_edges_is_what_rays_meet(layers: list[list[Strip]], sensor_width_mm: float) -> None:
+    """Blurs of 6 to 35 px on both sides of the focus. Left of column 48 stands the nearer thing that makes two layers interleave."""
+    lens = Lens(50.0, 2.0, 1.0, sensor_width_mm)
+    found = ScatterReference().render([of_strips(strips) for strips in layers], lens)
+    truth = by_rays([strip for strips in layers for strip in strips], lens)
+    np.testing.assert_allclose(np.column_stack([found.rgb[32], found.alpha[32]])[48:], truth[48:], atol=0.01)
+
+
+def test_a_lamp_beside_an_inner_edge_shines_once() -> None:
+    """A lamp one pixel beside the arm: the rays that pass the arm bring its light, 58 % of them; what continues behind the arm brings none.
+
+    Its light is claimed with that of its slice, not ray by ray: a quarter too little.
+    """
+    lens, body = Lens(50.0, 2.0, 1.0, 9.0), of_strips([(-EDGE, 60, 0.6, RED), (-EDGE, 130, 1.6, (0.1, 0.1, 0.1))])
+    lit = replace(body, rgb=body.rgb.copy())
+    lit.rgb[32, 61] = 200.0
+    with_lamp, without = (float(ScatterReference().render([layer], lens).rgb[..., 1].sum()) for layer in (lit, body))
+    past_px = (60.0 - 61.5) / (0.5 * float(lens.coc_px(1.6, 160) - lens.coc_px(0.6, 160)))
+    across = np.linspace(-1.0, 1.0, 2001)
+    passing = float(np.sqrt(1.0 - across**2)[across > past_px].sum() / np.sqrt(1.0 - across**2).sum())
+    assert 0.7 * passing < (with_lamp - without) / 200.0 < 1.02 * passing
 
 
 def test_steps_and_specks_of_depth_leave_no_lines_and_dots_in_a_ball() -> None:
-    """Depth in half floats has steps, and a stray pixel; files of renderers hold both. The same ball without holes is the truth."""
-    lens, rows_columns = Lens(50.0, 0.8, 9.0, 24.0), np.indices((120, 120)) - 60.0
+    """Depth in half floats has steps, and a stray pixel; files of renderers hold both. The ball's own colour is the truth."""
+    lens, rows_columns = Lens(85.0, 0.5, 2.2, 24.0), np.indices((120, 120)) - 60.0  # blurs of -3.4 to 7 px, 15 of the stray
     radius_px = np.hypot(*rows_columns)
-    depth_m = (10.0 - np.sqrt(np.maximum(0.0, 1.0 - (radius_px / 50.0) ** 2))).astype(np.float16).astype(np.float32)
-    depth_m[50, 62] = 10.9
+    depth_m = (3.0 - np.sqrt(np.maximum(0.0, 1.0 - (radius_px / 50.0) ** 2))).astype(np.float16).astype(np.float32)
+    depth_m[50, 62] = 3.9
     alpha = (radius_px < 50.0).astype(np.float32)
     rgb = np.repeat((alpha * (0.5 + 0.004 * rows_columns[1]).astype(np.float32))[..., None], 3, axis=2)
     found = ScatterReference().render([Layer(rgb, alpha, depth_m)], lens)
@@ -175,6 +226,10 @@ def test_steps_and_specks_of_depth_leave_no_lines_and_dots_in_a_ball() -> None:
     np.testing.assert_allclose(found.rgb[inside], rgb[inside], atol=0.02)
 
 
-def test_depth_that_is_hardly_in_metres_is_refused_before_it_takes_all_memory() -> None:
-    layer = opaque(np.full((60, 80, 3), 0.5, np.float32), np.full((60, 80), 1e-4, np.float32))
-    refused("times the picture: expected metres from the lens", ScatterReference().render, [layer], Lens(50.0, 1.8, 1.2, 36.0))
+@pytest.mark.parametrize("renderer", [ScatterReference(), LayeredReconstruction()])
+def test_depth_that_is_hardly_in_metres_is_refused_before_it_takes_all_memory(renderer: Renderer) -> None:
+    """The sentence names what is blurred, which need not be what is nearest."""
+    near, far = (opaque(np.full((60, 80, 3), 0.5, np.float32), np.full((60, 80), each, np.float32)) for each in (1e-4, np.inf))
+    refused("what lies 0.0001 m away", renderer.render, [near], Lens(50.0, 1.8, 1.2, 36.0))
+    far.depth_m[:, :40] = 0.34
+    refused("what lies inf m away", renderer.render, [far], Lens(200.0, 0.5, 0.34, 22.3))

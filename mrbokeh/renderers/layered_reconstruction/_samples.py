@@ -14,6 +14,7 @@ from jaxtyping import Float32, Float64, Int32
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.light_field_samples import LightFieldSamples
 from mrbokeh.layering.motion import MOTION
+from mrbokeh.layering.padded_layers import check_reach
 from mrbokeh.layering.psf_over_field import reach_px
 from mrbokeh.optics.drawn_diameters import drawn_diameters_px
 from mrbokeh.optics.lens import Lens
@@ -65,6 +66,7 @@ def sample_layers(
     coc_px, motions = [coc_px_of(layer, lens) for layer in layers], [motion_of(layer) for layer in layers]
     blur_px = reach_px(lens.aperture, max(float(np.abs(each).max()) for each in coc_px))
     margin = blur_px + int(np.ceil(0.5 * max(float(np.abs(motion).max()) for motion in motions)))
+    check_reach(layers, coc_px, margin)
     stacks = [
         np.concatenate(
             [layer.rgb, layer.alpha[..., None], *layer.extra.values(), each[..., None], layer.depth_m[..., None], motion], axis=2
