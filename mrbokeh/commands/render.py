@@ -26,7 +26,7 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.renderers.choose import DEFAULT
 from mrbokeh.system.errors import InputError
-from mrbokeh.system.messages import tell
+from mrbokeh.system.messages import tell, warn
 
 app = typer.Typer(add_completion=False)
 
@@ -141,11 +141,14 @@ def _whole_layer(path: Path) -> Layer:
 def _picture(rgb: Path, depth: Path, near_far_m: tuple[float, float] | None, sources: SharpOptions) -> Layer:
     from mrbokeh.depth.mended_depth import mended_aloud
     from mrbokeh.depth.open_depth import depth_of_file, one_distance_m
+    from mrbokeh.images.alpha_io import read_alpha
     from mrbokeh.images.image_io import read_image, read_linear
     from mrbokeh.images.layer import opaque
 
     linear_or = "develop the RAW file to EXR first, or say with --srgb that it is sRGB if that is all there is"
     colour = read_image(rgb) if sources.srgb else read_linear(rgb, linear_or)
+    if read_alpha(rgb) is not None:
+        warn(f"{rgb} has holes (alpha below 1), which --rgb fills with black: give what has holes by --layer")
     if distance_m := one_distance_m(depth):
         return opaque(colour, np.full(colour.shape[:2], distance_m, np.float32))
     depth_m = depth_of_file(depth, near_far_m, with_holes=not sources.exact_depth)
