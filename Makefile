@@ -39,9 +39,10 @@ check: $(READY)
 	$(RUN)/mypy
 	$(MAKE) test
 
-# Those that bring what they measure; bench_real, bench_pixel4, bench_photographs and bench_views_depth want a folder, bench_device is `make gpu`.
-WANTING := device real pixel4 photographs views_depth
+# Those that bring what they measure; the others want folders, bench_device is `make gpu`.
+WANTING := device real pixel4 photographs views_depth mended_depth
 bench: $(READY)
+	$(RUN)/python -m pip install --quiet --constraint constraints.txt --editable ".[all,dev,mitsuba]"
 	for bench in $(filter-out $(WANTING:%=tests/bench/bench_%.py),$(wildcard tests/bench/bench_*.py)); do \
 		echo "== $$(date +%T) $$bench"; $(RUN)/python -m tests.bench.$$(basename $$bench .py) || exit 1; done
 
