@@ -142,7 +142,7 @@ def progress_bars() -> Iterator[Progress]:
         TimeRemainingColumn(),
     )
     console = Console(stderr=True, emoji=False)
-    with resting(), Progress(*columns, console=console) if console.is_terminal else PlainLines(console) as progress:
+    with resting(), Progress(*columns, console=console) if _can_erase(console) else PlainLines(console) as progress:
         yield progress
 
 
@@ -161,7 +161,7 @@ def working(description: str) -> Iterator[None]:
     """Show a spinner on the terminal while something of unknown length runs."""
     console = Console(stderr=True, emoji=False)
     with ExitStack() as shown:
-        if console.is_terminal:
+        if _can_erase(console):
             shown.enter_context(resting())
             shown.enter_context(_spinner(description, console))
         yield
@@ -172,12 +172,17 @@ def begin(command: str) -> None:
     console, began_s = Console(stderr=True, emoji=False), time.monotonic()
     if channel() is OF_NO_COMMAND:
         return
-    if not console.is_terminal:
+    if not _can_erase(console):
         channel().spinner = Heartbeat(lambda: f"{command}: at work, {timedelta(seconds=round(time.monotonic() - began_s))}")
     elif sys.stdout.isatty():  # not over the page of a pager
         channel().spinner = _spinner(command, console)
     if channel().spinner:
         channel().spinner.start()
+
+
+def _can_erase(console: Console) -> bool:
+    """Return whether a console takes back what it drew: a terminal that is not dumb, and not a log whose colours are forced."""
+    return console.is_interactive and console.file.isatty()
 
 
 def _spinner(description: str, console: Console) -> Progress:

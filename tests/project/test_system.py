@@ -96,6 +96,25 @@ def test_silent_work_says_in_a_log_that_it_goes_on(
     assert capsys.readouterr().err == "", "nothing after the command"
 
 
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(("file", "environment"), [(Terminal(), {"TERM": "dumb"}), (io.StringIO(), {"FORCE_COLOR": "1"})])
+def test_nothing_is_drawn_where_nothing_can_be_erased(
+    file: io.StringIO, environment: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a dumb terminal, and in a log whose colours are forced, as those of CI: a heartbeat, and no line that is not asked for."""
+    monkeypatch.setattr(console, "Console", lambda **_: Console(file=file, _environ=environment))
+    with opened() as channel:
+        console.begin("export")
+        assert isinstance(channel.spinner, console.Heartbeat)
+        with console.working("rendering"):
+            list(track([1, 2], "kernels"))
+    assert file.getvalue() == ""
+
+
 @pytest.mark.parametrize(("total", "lines"), [(0, ["frames: 4, 0:00:08"]), (2, ["frames: 2 of 2, 0:00:04", "frames: 4 of 2, 0:00:08"])])
 def test_a_wrong_total_is_no_flood_of_lines(clock: Clock, said: io.StringIO, total: int, lines: list[str]) -> None:
     """Clips that state no number of frames give 0, others too few: the stated end, where there is one, and the last."""
