@@ -70,9 +70,10 @@ class PlainLines(Progress):
         self._heartbeat = Heartbeat(self._silent_line)
 
     def add_task(self, description: str, *args: Any, **fields: Any) -> TaskID:
-        task = super().add_task(description, *args, **fields)
-        self._told[task] = self.get_time(), -1.0
-        self._begun_with[task] = float(self._tasks[task].completed)  # not 0 where an earlier run is gone on with
+        with self._lock:  # the heartbeat's thread asks too
+            task = super().add_task(description, *args, **fields)
+            self._told[task] = self.get_time(), -1.0
+            self._begun_with[task] = float(self._tasks[task].completed)  # not 0 where an earlier run is gone on with
         return task
 
     def advance(self, task_id: TaskID, advance: int | float = 1) -> None:
