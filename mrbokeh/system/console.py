@@ -42,13 +42,13 @@ class Heartbeat:
     """Line in a log whenever a command has been silent for long. line: what it is at, or "" if that was told lately."""
 
     def __init__(self, line: Callable[[], str]) -> None:
-        self._line, self._ended = line, Event()
+        self._line = line
 
     def start(self) -> None:
         self._ended = Event()
         Thread(target=self._beat, args=(self._ended,), daemon=True).start()
 
-    def stop(self, **_: object) -> None:
+    def stop(self) -> None:
         self._ended.set()
 
     def _beat(self, ended: Event) -> None:
