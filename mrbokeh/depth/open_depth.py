@@ -185,7 +185,7 @@ def read_number_map(path: Path, settings: DepthSettings) -> DepthMap:
         if name == _METRES and settings.near_far_m is None and settings.metres_per_unit is None:
             settings = replace(settings, metres_per_unit=1.0)
     elif path.suffix.lower() == ".exr":
-        numbers = stored_depth(path)
+        numbers = stored_depth(path, or_grey=True)
     else:
         pixels = stored_pixels(path)
         numbers = pixels if pixels.ndim == 2 else pixels[..., 0]
