@@ -320,6 +320,10 @@ def test_an_exr_of_plain_numbers_is_put_in_metres_by_its_range(tmp_path: Path, n
     write_exr(tmp_path / "z.exr", ExrPart(dict.fromkeys(names, numbers)))
     expected = 1.0 / (1.0 / 8.0 + numbers * (1.0 / 0.5 - 1.0 / 8.0))
     np.testing.assert_allclose(depth_of_file(tmp_path / "z.exr", (0.5, 8.0)), expected, rtol=1e-5)
+    found = open_depth(tmp_path / "z.exr", GREY[:3, :4], DepthSettings((0.5, 8.0), exact=True))
+    np.testing.assert_allclose(found.depth_m, expected, rtol=1e-5)
+    found = open_depth(tmp_path / "z.exr", GREY[:3, :4], DepthSettings(metres_per_unit=10.0, exact=True))
+    np.testing.assert_allclose(found.depth_m[found.valid], 10.0 * numbers[numbers > 0])
 
 
 def test_an_exr_without_one_channel_of_depth_is_no_metres(tmp_path: Path) -> None:
