@@ -194,11 +194,8 @@ def read_layer(path: Path | str, *, extra: bool = False) -> Layer:
     of_one_view = [part for part in parts if part.attributes.get("view") == colour.attributes.get("view")]
     channels = {name: pixels for part in [*reversed(of_one_view), colour] for name, pixels in part.channels.items()}
     if not set("RGB") <= channels.keys():
-        of_layers = any(name.endswith(".R") for name in channels)
-        raise InputError(
-            f"{path}: expected channels R, G and B, but it has {', '.join(sorted(channels))}"
-            + (": a renderer's file of several layers is taken by --layer" if of_layers else ": write the picture with these names")
-        )
+        had = ", ".join(sorted(channels))
+        raise InputError(f"{path}: expected channels R, G and B, but it has {had}: write the picture with these names")
     rgb = in_rec709(ExrPart(channels).stacked("RGB"), stated_primaries(colour, parts), path)
     alpha = channels.get("A", np.ones(rgb.shape[:2])).astype(np.float32)
     require_alpha(path, alpha)
