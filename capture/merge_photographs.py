@@ -43,9 +43,11 @@ def merge(photographs: str | Path | Sequence[str | Path | np.ndarray], out: str 
 
     >>> merged = mrbokeh.merge("desk/")
     """
-    given = [photographs] if isinstance(photographs, (str, Path)) else list(photographs)
-    if isinstance(photographs, (list, tuple)) and len(given) < 2:
-        raise InputError(f"photographs: expected two or more of one scene at several focus distances, or a folder, got {len(given)}")
+    is_one = isinstance(photographs, (str, Path))
+    given = [photographs] if is_one else list(photographs) if np.iterable(photographs) else []
+    if len(given) < 2 and not is_one and not any(isinstance(each, (str, Path)) and Path(each).is_dir() for each in given):
+        got = len(given) if np.iterable(photographs) else type(photographs).__name__
+        raise InputError(f"photographs: expected two or more of one scene at several focus distances, or a folder, got {got}")
     with TemporaryDirectory() as temporary, nullcontext(temporary) if out is None else nullcontext(str(out)) as scene:
         files = [_file_of(each, Path(temporary) / "arrays", index) for index, each in enumerate(given)]
         report = ingest(files, Path(scene), IngestSettings(Grouping.none))
