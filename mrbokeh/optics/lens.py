@@ -229,8 +229,10 @@ class Lens:
         taken as the whole picture, image_width_px wide; numbers and arrays of other shapes lie on the axis. (The
         foreshortening of a tilted pupil, 1 % at 8 degrees, is left out.)
         """
-        if (isinstance(depth_m, float | int) and depth_m <= 0) or image_width_px <= 0:
-            raise InputError(f"expected a depth above 0 m and a picture at least 1 px wide, got {depth_m} m and {image_width_px} px")
+        if np.ndim(depth_m) == 0 and depth_m <= 0:
+            raise InputError(f"expected a depth above 0 m, got {depth_m:g} m")
+        if image_width_px <= 0:
+            raise InputError(f"expected a picture at least 1 px wide, got {image_width_px} px")
         dioptres = 1.0 / np.asarray(depth_m)
         in_focus: float | np.ndarray = 1.0 / self.focus_distance_m
         if not self.has_flat_focus and dioptres.ndim == 2:
