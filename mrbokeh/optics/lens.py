@@ -141,7 +141,7 @@ class Lens:
         told_facts = {"sensor_height_mm": height_mm, **facts, "f_number": max(f_number, least)}
         stated = replace(self, **told_facts)  # type: ignore[arg-type]
         wider = width_mm / self.sensor_width_mm * self.focal_length_mm / stated.focal_length_mm
-        return replace(stated, aperture=_closed(self.aperture, stated.f_number / self.f_number, wider))
+        return replace(stated, aperture=_stopped_down(self.aperture, stated.f_number / self.f_number, wider))
 
     def focused_at(self, focus_distance_m: float) -> "Lens":
         """Return the same lens focused at a distance in metres; inf is allowed."""
@@ -247,7 +247,7 @@ class Lens:
 
 
 @lru_cache(maxsize=64)
-def _closed(aperture: Aperture, ratio: float, wider: float) -> Aperture:
+def _stopped_down(aperture: Aperture, ratio: float, wider: float) -> Aperture:
     """Return an opening closed by a ratio, on a sensor so many times as wide; always the same object, which keeps what was `seen` of it."""
     closed = aperture.stopped_down(ratio)
     return closed if wider == 1.0 else replace(closed, rims=tuple((shift * wider, radius) for shift, radius in closed.rims))
