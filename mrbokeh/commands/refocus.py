@@ -98,7 +98,8 @@ def refocus(
     settings = {"stack": str(stack.resolve()), **vars(blur), **facts.given, "lens": str(blur.lens)}
     with kept_when_interrupted(f"finished slices are kept in {out}", result.overwrite):
         slices = _write_slices(way, distances_m, out, settings, result.overwrite)
-    metadata = {"refocused": settings | {"focus": focus}} | inherited_facts(source, with_lens=way.lens is None)
+    asked = {"focus": focus} if focus_at is None else {"focus_at": focus_at}
+    metadata = {"refocused": settings | asked} | inherited_facts(source, with_lens=way.lens is None)
     made = FocalStack(out, slices, way.lens_at(distances_m[0]), source.camera, registered=True, merged=True, metadata=metadata)
     _write_sharp(source, made, distances_m)
     write_focal_stack(made)
