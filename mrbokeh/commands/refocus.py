@@ -139,13 +139,13 @@ def _write_sharp(source: FocalStack, made: FocalStack, distances_m: tuple[float,
 def _make_room(out: Path, overwrite: bool) -> None:
     """Remove a finished result of this command, if --overwrite asks for it; a run that was stopped has no stack.json yet and goes on."""
     from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
+    from mrbokeh.system.atomic_files import refuse_existing
 
     if out.exists() and not (out / _SETTINGS).is_file():
         raise InputError(f"{out} exists and was not made by refocus: give another name")
     if not (out / FILE_NAME).is_file():
         return
-    if not overwrite:
-        raise InputError(f"{out} exists already: give another name, or --overwrite to replace it")
+    refuse_existing(out, overwrite)
     for each in read_focal_stack(out).slices:
         for path in (out / each.path, (out / each.path).with_suffix(".png")):
             path.unlink(missing_ok=True)
