@@ -185,7 +185,7 @@ def _optics(lens: Lens | File | None, renderer: File | Renderer | None) -> tuple
     if isinstance(renderer, Renderer):
         read, spreads = None if path is None or isinstance(lens, Lens) else read_lens(path), renderer
     else:
-        read, spreads = lens_and_renderer(path, renderer and str(renderer))
+        read, spreads = lens_and_renderer(path, None if renderer is None else str(renderer))
     return lens if isinstance(lens, Lens) else read, spreads
 
 
