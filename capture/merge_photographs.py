@@ -43,9 +43,11 @@ def merge(photographs: str | Path | Sequence[str | Path | np.ndarray], out: str 
 
     >>> merged = mrbokeh.merge("desk/")
     """
-    given = [photographs] if isinstance(photographs, (str, Path)) else list(photographs)
-    if isinstance(photographs, (list, tuple)) and len(given) < 2:
-        raise InputError(f"photographs: expected two or more of one scene at several focus distances, or a folder, got {len(given)}")
+    if isinstance(photographs, (str, Path)):
+        given: list[str | Path | np.ndarray] = [photographs]
+    else:
+        given = list(photographs) if np.iterable(photographs) else []
+        _require_several(given, photographs)
     with TemporaryDirectory() as temporary, nullcontext(temporary) if out is None else nullcontext(str(out)) as scene:
         files = [_file_of(each, Path(temporary) / "arrays", index) for index, each in enumerate(given)]
         report = ingest(files, Path(scene), IngestSettings(Grouping.none))
@@ -61,6 +63,13 @@ def merge(photographs: str | Path | Sequence[str | Path | np.ndarray], out: str 
             metres_known=made.metres_known,
             folder=None if out is None else made.folder,
         )
+
+
+def _require_several(given: Sequence[str | Path | np.ndarray], photographs: object) -> None:
+    """Raise InputError unless there are two or more, or one that is a folder. photographs: what they are from."""
+    if len(given) < 2 and not any(isinstance(each, (str, Path)) and Path(each).is_dir() for each in given):
+        got = len(given) if np.iterable(photographs) else type(photographs).__name__
+        raise InputError(f"photographs: expected two or more of one scene at several focus distances, or a folder, got {got}")
 
 
 def _file_of(given: str | Path | np.ndarray, folder: Path, index: int) -> Path:

@@ -83,10 +83,11 @@ def matchmove_clip(clip: Path, work: Path, settings: MatchmoveSettings | None = 
     Raises InputError if the camera rests, or nothing explains the clip.
     """
     settings, info = settings or MatchmoveSettings(), probe(clip)
+    poses = PoseSettings(settings.mapper, settings.camera_model, "shared", settings.max_image_size_px)  # refused before a solve is given up
     same = begin_solving(work, _key(clip, settings))
     solve = read_solve(work) if same else None
     if solve is None:
-        solve = _solved(clip, info, work, settings, fresh=not same)
+        solve = _solved(clip, info, work, settings, replace(poses, overwrite=not same))
         write_solve(work, solve)
     if settings.picked_frames and not 0 <= min(settings.picked_frames) <= max(settings.picked_frames) < len(solve.times_s):
         last = len(solve.times_s) - 1
@@ -108,8 +109,7 @@ def _key(clip: Path, settings: MatchmoveSettings) -> dict[str, object]:
     }
 
 
-def _solved(clip: Path, info: VideoInfo, work: Path, settings: MatchmoveSettings, *, fresh: bool) -> ClipSolve:
-    poses = PoseSettings(settings.mapper, settings.camera_model, "shared", settings.max_image_size_px, overwrite=fresh)
+def _solved(clip: Path, info: VideoInfo, work: Path, settings: MatchmoveSettings, poses: PoseSettings) -> ClipSolve:
     motion = motion_of_clip(clip, info)
     if motion[-1] < _STILL_SHARE:
         raise InputError(
@@ -121,9 +121,9 @@ def _solved(clip: Path, info: VideoInfo, work: Path, settings: MatchmoveSettings
     with working("turning or flat"):
         simple = simple_solve(tracks, keyframes, stated_focal(clip, info, settings.focal_length_35mm), times_s)
     if simple is not None and simple.explains:
-        write_keyframes(clip, info, keyframes, work / "images", fresh=fresh)
+        write_keyframes(clip, info, keyframes, work / "images", fresh=poses.overwrite)
         return simple.solve
-    write_keyframes(clip, info, chosen_keyframes(motion, settings.keyframes), work / "images", fresh=fresh)
+    write_keyframes(clip, info, chosen_keyframes(motion, settings.keyframes), work / "images", fresh=poses.overwrite)
     try:
         return space_solve(clip, info, work, poses)
     except InputError as error:

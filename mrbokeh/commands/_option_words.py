@@ -1,4 +1,7 @@
-"""Words of options in --help and in shell completion, by their names: unit, panel and choices are the same in all commands."""
+"""Words of options in --help and in shell completion, by their names: unit, panel and choices are the same in all commands.
+
+And how `--f-number` is read: as lenses have it written, f/1.4, in all commands.
+"""
 
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -127,7 +130,7 @@ def _by_name(table: dict[str, str]) -> dict[str, str]:
 
 
 def with_words(command: Any, path: str) -> None:
-    """Give the options of a command their words. path: of the command, such as "lens new"."""
+    """Give the options of a command their words, and `--f-number` its way of being read. path: of the command, such as "lens new"."""
     panels, metavars, first = _by_name(PANELS), _by_name(METAVARS), EVERYDAY.get(path, "").split()
     for parameter in command.params:
         name = parameter.opts[0].removeprefix("--") if parameter.param_type_name == "option" else parameter.name

@@ -58,15 +58,14 @@ def host(
 
     Example: mrbokeh host blender --out addons
     """
-    from mrbokeh.system.atomic_files import atomic_path
+    from mrbokeh.system.atomic_files import atomic_path, refuse_existing
     from mrbokeh.system.errors import InputError
 
     name = _FILES[program].target
     if not out.is_dir() and (out.exists() or out.suffix.lower() == Path(name).suffix):
         raise InputError(f"expected a folder, in which {name} is put, got {out}: name a folder")
     target = out / name
-    if target.exists() and not overwrite:
-        raise InputError(f"{target} exists already: give another folder as --out, or --overwrite to replace it")
+    refuse_existing(target, overwrite, "give another folder as --out")
     with atomic_path(target) as temporary:
         temporary.write_text(written(program), encoding="utf-8")
     tell(f"wrote {target}: {_FILES[program].installed}")

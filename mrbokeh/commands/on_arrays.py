@@ -34,7 +34,7 @@ def render(
     lens: Lens | File,
     *,
     focus: float | tuple[float, float] | None = None,
-    renderer: str | Renderer | None = None,
+    renderer: File | Renderer | None = None,
     exact_depth: bool = False,
 ) -> Rgb:
     """Blur an all-in-focus picture with depth as a lens does; return linear Rec.709 (H, W, 3) of float32.
@@ -71,7 +71,7 @@ def composite(
     at_pixel: tuple[float, float] | Sequence[tuple[float, float]] | None = None,
     height: float | str | Sequence[float | str] | None = None,
     mode: str | None = None,
-    renderer: str | Renderer | None = None,
+    renderer: File | Renderer | None = None,
     exact_depth: bool = False,
 ) -> Rgb:
     """Put virtual objects into a photograph, blurred by its lens, before and behind what it shows; return linear Rec.709 (H, W, 3).
@@ -118,7 +118,7 @@ def composite(
         if plate.depth_m is None:
             raise InputError("to focus on a pixel the photograph needs depth: give depth_m, or focus in metres")
         plate = replace(plate, lens=_focused(plate.lens, focus, plate.depth_m))
-    given = [inserted] if isinstance(inserted, (Layer, str, Path)) else list(inserted)
+    given = [inserted] if isinstance(inserted, (Layer, str, Path)) else list(inserted) if np.iterable(inserted) else []
     if not given or not all(isinstance(each, (Layer, str, Path)) for each in given):
         raise InputError(
             "inserted: expected a GLB file, a layer or several of them; an array becomes one by mrbokeh.Layer(rgb, alpha, depth_m)"
@@ -130,6 +130,8 @@ def composite(
     at_pixels = [f"{x_px},{y_px}" for x_px, y_px in pixels.tolist()]
     heights = [] if height is None else np.atleast_1d(height).tolist()
     standing = ObjectOptions(object_=glbs, at_pixel=at_pixels, height=[str(each) for each in heights])
+    if glbs and not at_pixels:
+        raise InputError("at_pixel: on which pixel (x, y) does the object stand? Give one for each GLB")
     standing.require_places()
     if glbs and len(glbs) < len(given):
         raise InputError("inserted: expected GLB files or layers, got some of both: put one into the picture of the other")
@@ -160,7 +162,8 @@ def _depth_of(given: np.ndarray | File, *, with_holes: bool) -> Plane:
 
     if isinstance(given, (str, Path)):
         return read_depth(given, with_holes=with_holes)
-    depth_m = np.asarray(given, np.float32)
+    depth_m = np.asarray(given)
+    depth_m = depth_m.astype(np.float32) if depth_m.dtype.kind in "fiu" else np.zeros(0, np.float32)
     if depth_m.ndim != 2 or (np.isnan(depth_m).any() and not with_holes):
         raise InputError(f"depth_m: expected metres of shape (height, width), inf where nothing is, got shape {depth_m.shape} or NaN in it")
     if not (depth_m > 0).any():
@@ -168,17 +171,21 @@ def _depth_of(given: np.ndarray | File, *, with_holes: bool) -> Plane:
     return np.where((depth_m > 0) | np.isnan(depth_m), depth_m, np.float32(np.inf))
 
 
-def _optics(lens: Lens | File | None, renderer: str | Renderer | None) -> tuple[Lens | None, Renderer]:
+def _optics(lens: Lens | File | None, renderer: File | Renderer | None) -> tuple[Lens | None, Renderer]:
     """Return lens and renderer as `lens_and_renderer` does; a Lens that was read brings its renderer too."""
     from mrbokeh.renderers.choose import lens_and_renderer, read_lens
 
     if not isinstance(lens, (Lens, str, Path, NoneType)):
         raise InputError(f"lens: expected a mrbokeh.Lens or the path of a lens file or bank, got {type(lens).__name__}")
+    if not isinstance(renderer, (Renderer, str, Path, NoneType)):
+        raise InputError(
+            f"renderer: expected its name, a mrbokeh renderer, or the path of a network or bank, got {type(renderer).__name__}"
+        )
     path = lens.spread_by if isinstance(lens, Lens) else None if lens is None else Path(lens)
-    if renderer is None or isinstance(renderer, str):
-        read, spreads = lens_and_renderer(path, renderer)
-    else:
+    if isinstance(renderer, Renderer):
         read, spreads = None if path is None or isinstance(lens, Lens) else read_lens(path), renderer
+    else:
+        read, spreads = lens_and_renderer(path, None if renderer is None else str(renderer))
     return lens if isinstance(lens, Lens) else read, spreads
 
 

@@ -98,7 +98,8 @@ def refocus(
     settings = {"stack": str(stack.resolve()), **vars(blur), **facts.given, "lens": str(blur.lens)}
     with kept_when_interrupted(f"finished slices are kept in {out}", result.overwrite):
         slices = _write_slices(way, distances_m, out, settings, result.overwrite)
-    metadata = {"refocused": settings | {"focus": focus}} | inherited_facts(source, with_lens=way.lens is None)
+    asked = {"focus": focus} if focus_at is None else {"focus_at": focus_at}
+    metadata = {"refocused": settings | asked} | inherited_facts(source, with_lens=way.lens is None)
     made = FocalStack(out, slices, way.lens_at(distances_m[0]), source.camera, registered=True, merged=True, metadata=metadata)
     _write_sharp(source, made, distances_m)
     write_focal_stack(made)
@@ -138,13 +139,13 @@ def _write_sharp(source: FocalStack, made: FocalStack, distances_m: tuple[float,
 def _make_room(out: Path, overwrite: bool) -> None:
     """Remove a finished result of this command, if --overwrite asks for it; a run that was stopped has no stack.json yet and goes on."""
     from mrbokeh.stacks.focal_stack import FILE_NAME, read_focal_stack
+    from mrbokeh.system.atomic_files import refuse_existing
 
     if out.exists() and not (out / _SETTINGS).is_file():
         raise InputError(f"{out} exists and was not made by refocus: give another name")
     if not (out / FILE_NAME).is_file():
         return
-    if not overwrite:
-        raise InputError(f"{out} exists already: give another name, or --overwrite to replace it")
+    refuse_existing(out, overwrite)
     for each in read_focal_stack(out).slices:
         for path in (out / each.path, (out / each.path).with_suffix(".png")):
             path.unlink(missing_ok=True)

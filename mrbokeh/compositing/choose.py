@@ -170,7 +170,7 @@ def insertion_of(mode: str, near_m: float | None = None, *, exact_depth: bool = 
     near_m: distance of what a user's matte shows, for the mode between. exact_depth: edges stay where the depth has them.
     """
     if mode not in MODES:
-        raise InputError(f"expected --mode out of {', '.join(MODES)}, got {mode!r}")
+        raise InputError(f"mode: expected one of {', '.join(MODES)}, got {mode!r}")
     if near_m is not None and mode != "between":
         raise InputError(f"the distance of what the matte shows is for the mode between, got the mode {mode}: leave it out")
     if mode == "between":

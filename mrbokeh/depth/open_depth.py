@@ -185,7 +185,7 @@ def read_number_map(path: Path, settings: DepthSettings) -> DepthMap:
         if name == _METRES and settings.near_far_m is None and settings.metres_per_unit is None:
             settings = replace(settings, metres_per_unit=1.0)
     elif path.suffix.lower() == ".exr":
-        numbers = stored_depth(path)
+        numbers = stored_depth(path, or_grey=True)
     else:
         pixels = stored_pixels(path)
         numbers = pixels if pixels.ndim == 2 else pixels[..., 0]
@@ -258,8 +258,8 @@ _SAME_ASPECT, _SMALLER = 0.02, 0.75
 def open_depth(source: Path, photo_rgb: Rgb, settings: DepthSettings | None = None) -> DepthMap:
     """Read depth from any source and bring it to the photograph's size along its edges.
 
-    source: one distance for all (a number in place of a file), EXR with Z, PNG or TIFF (settings say what the numbers mean), an array
-    (.npz, .npy; one named depth holds metres), a phone's photograph with depth inside, or a depth network (.onnx).
+    source: one distance for all (a number in place of a file), EXR with Z in metres, PNG, TIFF or EXR of numbers whose meaning the
+    settings say, an array (.npz, .npy; one named depth holds metres), a phone's photograph with depth inside, or a depth network (.onnx).
     photo_rgb: (H, W, 3) linear.
     Raises InputError if the source cannot be read, does not say what it means, or is of another shape than the photograph.
     """
@@ -310,11 +310,11 @@ def _read(source: Path, photo_rgb: Rgb, settings: DepthSettings) -> tuple[DepthM
     suffix = source.suffix.lower()
     if suffix == ".onnx":
         return network_depth(source, photo_rgb, settings), True
-    if suffix == ".exr":
+    if suffix == ".exr" and settings.near_far_m is None and settings.metres_per_unit is None:
         depth_m = read_depth(source, with_holes=not settings.exact)
         known = ~np.isnan(depth_m)
         return DepthMap(np.where(known, depth_m, np.float32(np.inf)), known, source.name), False
-    if suffix in _ARRAYS:
+    if suffix in (".exr", *_ARRAYS):
         return (_of_stereo(source, settings.stereo) if settings.stereo else read_number_map(source, settings)), False
     phone = read_phone_photo(source, settings.near_far_m)
     return (read_number_map(source, settings), settings.metres_per_unit is None) if phone is None else (phone.depth, True)

@@ -155,21 +155,20 @@ def read_depth(path: Path | str, *, with_holes: bool = False) -> Float32[np.ndar
     return np.where((depth_m > 0) | np.isnan(depth_m), depth_m, np.float32(np.inf))
 
 
-def stored_depth(path: Path | str) -> Float32[np.ndarray, "height width"]:
-    """Return the numbers of an EXR's channel of depth: Z, depth.Z or Y, that of a renderer's only layer (ViewLayer.Depth.Z), or R of
-    three that are alike. Raises InputError where there is none, or several."""
+def stored_depth(path: Path | str, *, or_grey: bool = False) -> Float32[np.ndarray, "height width"]:
+    """Return the numbers of an EXR's channel of depth: Z, depth.Z or Y, or that of a renderer's only layer (ViewLayer.Depth.Z).
+
+    or_grey: a picture whose R, G and B are alike will do. Raises InputError where there is none, or several.
+    """
     channels = {name: pixels for part in reversed(read_exr(path)) for name, pixels in part.channels.items()}
-    of_layers = [name for name in channels if name.lower().endswith("depth.z")]
-    names = [*_LONE_DEPTH_NAMES, *(of_layers if len(of_layers) == 1 else ())]
+    of_layers = sorted(name for name in channels if name.lower().endswith("depth.z"))
+    is_grey = set("RGB") <= channels.keys() <= set("RGBA") and all(np.array_equal(channels["R"], channels[each]) for each in "GB")
+    names = [*_LONE_DEPTH_NAMES, *(of_layers if len(of_layers) == 1 else ()), *("R" if or_grey and is_grey else "")]
     name = next((name for name in names if name in channels), None)
-    if (
-        name is None
-        and set("RGB") <= channels.keys() <= set("RGBA")
-        and all(np.array_equal(channels["R"], channels[each]) for each in "GB")
-    ):
-        name = "R"
     if name is None:
-        raise InputError(f"{path}: expected depth in a channel {', '.join(_LONE_DEPTH_NAMES)}, but it has {', '.join(sorted(channels))}")
+        one = f"one channel of depth, but it has {' and '.join(of_layers)}: write the one that is meant as Z"
+        none = f"depth in a channel {', '.join(_LONE_DEPTH_NAMES)}, but it has {', '.join(sorted(channels))}: write it as Z"
+        raise InputError(f"{path}: expected {one if of_layers else none}")
     return channels[name].astype(np.float32)
 
 
@@ -195,11 +194,8 @@ def read_layer(path: Path | str, *, extra: bool = False) -> Layer:
     of_one_view = [part for part in parts if part.attributes.get("view") == colour.attributes.get("view")]
     channels = {name: pixels for part in [*reversed(of_one_view), colour] for name, pixels in part.channels.items()}
     if not set("RGB") <= channels.keys():
-        of_layers = any(name.endswith(".R") for name in channels)
-        raise InputError(
-            f"{path}: expected channels R, G and B, but it has {', '.join(sorted(channels))}"
-            + (": a renderer's file of several layers is taken by --layer" if of_layers else ": write the picture with these names")
-        )
+        had = ", ".join(sorted(channels))
+        raise InputError(f"{path}: expected channels R, G and B, but it has {had}: write the picture with these names")
     rgb = in_rec709(ExrPart(channels).stacked("RGB"), stated_primaries(colour, parts), path)
     alpha = channels.get("A", np.ones(rgb.shape[:2])).astype(np.float32)
     require_alpha(path, alpha)

@@ -141,7 +141,7 @@ class Lens:
         told_facts = {"sensor_height_mm": height_mm, **facts, "f_number": max(f_number, least)}
         stated = replace(self, **told_facts)  # type: ignore[arg-type]
         wider = width_mm / self.sensor_width_mm * self.focal_length_mm / stated.focal_length_mm
-        return replace(stated, aperture=_closed(self.aperture, stated.f_number / self.f_number, wider))
+        return replace(stated, aperture=_stopped_down(self.aperture, stated.f_number / self.f_number, wider))
 
     def focused_at(self, focus_distance_m: float) -> "Lens":
         """Return the same lens focused at a distance in metres; inf is allowed."""
@@ -229,8 +229,10 @@ class Lens:
         taken as the whole picture, image_width_px wide; numbers and arrays of other shapes lie on the axis. (The
         foreshortening of a tilted pupil, 1 % at 8 degrees, is left out.)
         """
-        if (isinstance(depth_m, float | int) and depth_m <= 0) or image_width_px <= 0:
-            raise InputError(f"expected a depth above 0 m and a picture at least 1 px wide, got {depth_m} m and {image_width_px} px")
+        if np.ndim(depth_m) == 0 and depth_m <= 0:
+            raise InputError(f"expected a depth above 0 m, got {depth_m:g} m")
+        if image_width_px <= 0:
+            raise InputError(f"expected a picture at least 1 px wide, got {image_width_px} px")
         dioptres = 1.0 / np.asarray(depth_m)
         in_focus: float | np.ndarray = 1.0 / self.focus_distance_m
         if not self.has_flat_focus and dioptres.ndim == 2:
@@ -245,7 +247,7 @@ class Lens:
 
 
 @lru_cache(maxsize=64)
-def _closed(aperture: Aperture, ratio: float, wider: float) -> Aperture:
+def _stopped_down(aperture: Aperture, ratio: float, wider: float) -> Aperture:
     """Return an opening closed by a ratio, on a sensor so many times as wide; always the same object, which keeps what was `seen` of it."""
     closed = aperture.stopped_down(ratio)
     return closed if wider == 1.0 else replace(closed, rims=tuple((shift * wider, radius) for shift, radius in closed.rims))

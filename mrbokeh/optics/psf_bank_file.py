@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from mrbokeh.optics.psf_bank import Axis, Grid, PsfBank, check_kernel, check_space, grid_over
-from mrbokeh.system.atomic_files import atomic_path, read_json, write_json
+from mrbokeh.system.atomic_files import atomic_path, read_json, refuse_existing, write_json
 from mrbokeh.system.errors import InputError
 from mrbokeh.system.messages import channel
 
@@ -103,8 +103,8 @@ def refuse_existing_bank(folder: Path | str, overwrite: bool) -> None:
     folder = Path(folder)
     if folder.exists() and not (folder.is_dir() and (not any(folder.iterdir()) or (folder / HEAD).is_file())):
         raise InputError(f"{folder} exists and is not a bank of PSFs: give another name")
-    if (folder / HEAD).is_file() and not overwrite:
-        raise InputError(f"{folder} exists already: give another name, or --overwrite to replace it")
+    if (folder / HEAD).is_file():
+        refuse_existing(folder, overwrite)
 
 
 def write_bank(folder: Path | str, bank: PsfBank, overwrite: bool = False) -> None:

@@ -18,7 +18,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from itertools import repeat
-from multiprocessing import connection, get_context
+from multiprocessing import connection, get_context, resource_tracker
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -242,13 +242,13 @@ class ProcessExecutor:
 class _Worker:
     """Worker process and this end of its pipe: what it tells comes in, and the end of the pipe or a word tells it to stop.
 
-    begun: it has said that it is at work; before, while it imports, nothing is lost when it is ended.
+    at_work: it has said that it is at work; before, while it imports, nothing is lost when it is ended.
     """
 
     def __init__(self, tasks: Sequence[SegmentTask]) -> None:
         context = get_context("spawn")
         self.pipe, theirs = context.Pipe()
-        self.process, self.begun = context.Process(target=_work, args=(theirs, tasks), daemon=True), False
+        self.process, self.at_work = context.Process(target=_work, args=(theirs, tasks), daemon=True), False
         with _ctrl_c_later():
             self.process.start()
         theirs.close()
@@ -260,8 +260,8 @@ class _Worker:
                 heard = self.pipe.recv()
                 if isinstance(heard, BaseException):
                     raise heard
-                if heard == _BEGUN:
-                    self.begun = True
+                if heard == _AT_WORK:
+                    self.at_work = True
                 else:
                     tell(*heard)
         except (EOFError, ConnectionError):
@@ -270,7 +270,7 @@ class _Worker:
 
     def stop(self) -> None:
         """Let the worker leave after its frame, without half files."""
-        if not self.begun and not self.pipe.poll():
+        if not self.at_work and not self.pipe.poll():
             self.process.terminate()
         with suppress(OSError):
             self.pipe.send(None)
@@ -282,6 +282,7 @@ def _ctrl_c_later() -> Iterator[None]:
     if not hasattr(signal, "pthread_sigmask"):  # Windows
         yield
         return
+    resource_tracker.ensure_running()  # the first process would start it, which lets Ctrl-C through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         yield
@@ -289,7 +290,7 @@ def _ctrl_c_later() -> Iterator[None]:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
-_BEGUN = "begun"
+_AT_WORK = "at work"
 
 
 class _StopWorkingError(Exception):
@@ -315,7 +316,7 @@ def _work(pipe: Any, tasks: Sequence[SegmentTask]) -> None:
             raise _StopWorkingError
 
     try:
-        pipe.send(_BEGUN)
+        pipe.send(_AT_WORK)
         work_off(tasks, tell)
     except _StopWorkingError:
         os._exit(0)  # nothing is left to do, and Ctrl-C waits for it

@@ -103,10 +103,8 @@ class SequenceTarget:
             raise InputError(
                 f"{self.path}: {self.space.name} is linear light, which integers cut off at 1: write .exr, or name a space with a curve"
             )
-        files = (self.file(index) for index in shot.taken)
-        there = next((file for file in files if file.exists()), None)
-        if there is not None and not overwrite:
-            raise InputError(f"{there} exists already: give another name, or --overwrite to replace it")
+        for index in shot.taken:
+            refuse_existing(self.file(index), overwrite)
 
     def part(self, folder: Path, segment: Segment) -> Path:
         return folder / f"{segment.number:05d}.json"

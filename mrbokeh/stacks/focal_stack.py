@@ -273,7 +273,7 @@ def _number(value: float | str | None) -> float | None:
 
 
 def require_folder(scene: Path) -> None:
-    """Raise InputError unless there is a folder, as it is where focal stacks are."""
+    """Raise InputError unless there is a folder, in which focal stacks may be."""
     if not Path(scene).is_dir():
         raise InputError(
             f"expected a folder with focal stacks, but there is no folder {scene}: check the name, or run `mrbokeh capture process` first"

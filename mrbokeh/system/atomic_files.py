@@ -126,10 +126,10 @@ def read_json(path: Path | str, expected: str) -> Any:
         raise InputError(f"expected {expected} at {path}, but its brackets lie too deep in one another") from None
 
 
-def refuse_existing(path: Path | str, overwrite: bool) -> None:
-    """Refuse to replace an existing result unless the user asked for it with --overwrite."""
+def refuse_existing(path: Path | str, overwrite: bool, advice: str = "give another name") -> None:
+    """Refuse to replace an existing result unless the user asked for it with --overwrite. advice: what to do else."""
     if Path(path).exists() and not overwrite:
-        raise InputError(f"{path} exists already: give another name, or --overwrite to replace it")
+        raise InputError(f"{path} exists already: {advice}, or --overwrite to replace it")
 
 
 def require_safe_outputs(outputs: Iterable[Path | str | None], inputs: Iterable[Path | str | None], overwrite: bool) -> None:

@@ -42,13 +42,13 @@ class Heartbeat:
     """Line in a log whenever a command has been silent for long. line: what it is at, or "" if that was told lately."""
 
     def __init__(self, line: Callable[[], str]) -> None:
-        self._line, self._ended = line, Event()
+        self._line = line
 
     def start(self) -> None:
         self._ended = Event()
         Thread(target=self._beat, args=(self._ended,), daemon=True).start()
 
-    def stop(self, **_: object) -> None:
+    def stop(self) -> None:
         self._ended.set()
 
     def _beat(self, ended: Event) -> None:
@@ -70,9 +70,10 @@ class PlainLines(Progress):
         self._heartbeat = Heartbeat(self._silent_line)
 
     def add_task(self, description: str, *args: Any, **fields: Any) -> TaskID:
-        task = super().add_task(description, *args, **fields)
-        self._told[task] = self.get_time(), -1.0
-        self._begun_with[task] = float(self._tasks[task].completed)  # not 0 where an earlier run is gone on with
+        with self._lock:  # the heartbeat's thread asks too
+            task = super().add_task(description, *args, **fields)
+            self._told[task] = self.get_time(), -1.0
+            self._begun_with[task] = float(self._tasks[task].completed)  # not 0 where an earlier run is gone on with
         return task
 
     def advance(self, task_id: TaskID, advance: int | float = 1) -> None:
@@ -142,7 +143,7 @@ def progress_bars() -> Iterator[Progress]:
         TimeRemainingColumn(),
     )
     console = Console(stderr=True, emoji=False)
-    with resting(), Progress(*columns, console=console) if console.is_terminal else PlainLines(console) as progress:
+    with resting(), Progress(*columns, console=console) if _can_erase(console) else PlainLines(console) as progress:
         yield progress
 
 
@@ -161,7 +162,7 @@ def working(description: str) -> Iterator[None]:
     """Show a spinner on the terminal while something of unknown length runs."""
     console = Console(stderr=True, emoji=False)
     with ExitStack() as shown:
-        if console.is_terminal:
+        if _can_erase(console):
             shown.enter_context(resting())
             shown.enter_context(_spinner(description, console))
         yield
@@ -172,12 +173,17 @@ def begin(command: str) -> None:
     console, began_s = Console(stderr=True, emoji=False), time.monotonic()
     if channel() is OF_NO_COMMAND:
         return
-    if not console.is_terminal:
+    if not _can_erase(console):
         channel().spinner = Heartbeat(lambda: f"{command}: at work, {timedelta(seconds=round(time.monotonic() - began_s))}")
     elif sys.stdout.isatty():  # not over the page of a pager
         channel().spinner = _spinner(command, console)
     if channel().spinner:
         channel().spinner.start()
+
+
+def _can_erase(console: Console) -> bool:
+    """Return whether a console takes back what it drew: a terminal that is not dumb, and not a log whose colours are forced."""
+    return console.is_interactive and console.file.isatty()
 
 
 def _spinner(description: str, console: Console) -> Progress:

@@ -26,7 +26,7 @@ class Channel:
     """Way of a command's words, and what --json says of it.
 
     inputs: by option; outputs: files and folders that were finished; kept: what is left after Ctrl-C. spinner: what turns on the terminal
-    while the command says nothing, or tells a log that it is at work; None outside a command.
+    while the command says nothing, or, in a log, the heartbeat that tells that it is at work; None outside a command.
     """
 
     quiet: bool = False
@@ -131,7 +131,7 @@ def write_object(file: Any, exit_code: int, error: str) -> None:
 
 @contextmanager
 def resting() -> Iterator[None]:
-    """Take the command's spinner off the terminal in the block, which writes there itself."""
+    """Stop the command's spinner, or the heartbeat of its log, in the block, which writes itself."""
     global _resting
     with _terminal:
         _resting += 1
@@ -147,7 +147,7 @@ def resting() -> Iterator[None]:
 
 
 def end_spinner() -> None:
-    """Take the command's spinner off the terminal for good."""
+    """Stop the command's spinner, or the heartbeat of its log, for good."""
     spinner, _channel.spinner = _channel.spinner, None
     if spinner:
         spinner.stop()

@@ -175,7 +175,7 @@ def test_objects_are_placed_in_camera_axes_wherever_the_camera_stood(tmp_path: P
     ({}, "nothing to put into the photograph"),
     ({"--lens": None}, "nothing to put into the photograph"),
     ({"--layer": "card.exr", "--lens": None}, "does not tell its lens"),
-    ({"--layer": "card.exr", "--lens": None, "--mode": "infront"}, "expected --mode out of front, over"),
+    ({"--layer": "card.exr", "--lens": None, "--mode": "infront"}, "mode: expected one of front, over"),
     ({"--layer": "none.exr"}, "none.exr"),
     ({"--object": "cake"}, "where does the object stand"),
     ({"--object": "cake", "--at-pixel": "10,10", "--pitch": "0"}, "above the horizon"),

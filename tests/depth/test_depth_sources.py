@@ -15,7 +15,7 @@ from mrbokeh.depth.open_depth import depth_of_file, open_depth
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.color import linear_to_srgb, srgb_to_linear
 from mrbokeh.images.exr_io import ExrPart, write_exr
-from mrbokeh.images.image_io import read_image
+from mrbokeh.images.image_io import read_depth, read_image
 from mrbokeh.images.image_metrics import psnr
 from mrbokeh.images.layer import opaque
 from mrbokeh.optics.lens import Lens
@@ -320,3 +320,18 @@ def test_an_exr_of_plain_numbers_is_put_in_metres_by_its_range(tmp_path: Path, n
     write_exr(tmp_path / "z.exr", ExrPart(dict.fromkeys(names, numbers)))
     expected = 1.0 / (1.0 / 8.0 + numbers * (1.0 / 0.5 - 1.0 / 8.0))
     np.testing.assert_allclose(depth_of_file(tmp_path / "z.exr", (0.5, 8.0)), expected, rtol=1e-5)
+    found = open_depth(tmp_path / "z.exr", GREY[:3, :4], DepthSettings((0.5, 8.0), exact=True))
+    np.testing.assert_allclose(found.depth_m, expected, rtol=1e-5)
+    found = open_depth(tmp_path / "z.exr", GREY[:3, :4], DepthSettings(metres_per_unit=10.0, exact=True))
+    np.testing.assert_allclose(found.depth_m[found.valid], 10.0 * numbers[numbers > 0])
+
+
+def test_an_exr_without_one_channel_of_depth_is_no_metres(tmp_path: Path) -> None:
+    """A picture in black and white, whose numbers are light unless the user says that they are not, and two layers of a renderer."""
+    numbers = np.linspace(0.1, 1.0, 12, dtype=np.float32).reshape(3, 4)
+    write_exr(tmp_path / "grey.exr", ExrPart(dict.fromkeys("RGB", numbers)))
+    refused("but it has B, G, R: write it as Z", read_depth, tmp_path / "grey.exr")
+    write_exr(tmp_path / "two.exr", ExrPart(dict.fromkeys(["A.Depth.Z", "B.Depth.Z"], numbers)))
+    refused("one channel of depth, but it has A.Depth.Z and B.Depth.Z: write the one", read_depth, tmp_path / "two.exr")
+    write_exr(tmp_path / "one.exr", ExrPart({"A.Depth.Z": numbers}))
+    np.testing.assert_array_equal(read_depth(tmp_path / "one.exr"), numbers)

@@ -119,6 +119,12 @@ def test_missing_channels_are_named() -> None:
         ExrPart({"R": np.zeros((2, 2), np.float32)}).stacked("RGB")
 
 
+def test_a_renderer_s_file_of_layers_is_no_single_picture(tmp_path: Path) -> None:
+    write_exr(tmp_path / "a.exr", ExrPart({f"ViewLayer.Combined.{name}": picture()[..., 0] for name in "RGB"}))
+    for read in (read_layer, read_image):
+        refused(r"R, G and B, but it has ViewLayer.Combined.B, .*: write the picture with these names", read, tmp_path / "a.exr")
+
+
 def test_a_failed_write_leaves_the_old_file_and_no_rest(tmp_path: Path) -> None:
     path = tmp_path / "a.exr"
     write_image(path, picture())

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from mrbokeh.optics.lens import Lens
 from mrbokeh.system.errors import InputError
+from tests.support.refusals import refused
 
 NIKKOR = Lens(focal_length_mm=35.0, f_number=1.8, focus_distance_m=0.8, sensor_width_mm=35.9)
 
@@ -38,9 +39,10 @@ def test_nothing_but_positive_numbers(field: str) -> None:
 
 
 def test_what_no_lens_can_do_is_refused() -> None:
-    for depth_m, width_px in ((0.0, 1000), (-1.0, 1000), (1.0, 0)):
-        with pytest.raises(InputError, match="expected a depth above 0 m"):
-            NIKKOR.coc_px(depth_m, width_px)
+    for depth_m in (0.0, -1.0, 0, np.float32(0.0), np.array(0.0)):
+        refused(r"^expected a depth above 0 m, got -?[01] m$", NIKKOR.coc_px, depth_m, 1000)
+    for some_m in (1.0, np.ones((4, 8))):
+        refused("^expected a picture at least 1 px wide, got 0 px$", NIKKOR.coc_px, some_m, 0)
     tilted, far = replace(NIKKOR, tilt_rad=(0.1, 0.0)), np.full((20, 30), 50.0)
     for wrong, said in (
         (lambda: NIKKOR.focused_at(0.02), "is the distance in metres"),

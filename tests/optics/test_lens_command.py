@@ -91,8 +91,9 @@ def test_kernels_in_colour_and_the_sheet_shows_what_the_lens_has() -> None:
 
 def test_coc_wants_a_width_and_a_lens_file(tmp_path: Path) -> None:
     (tmp_path / "bank.json").touch()
-    refused = CliRunner().invoke(app, ["coc", str(tmp_path), "1", "--image-width", "0"], env={"COLUMNS": "200"})
-    assert refused.exit_code == 2 and "greater than or equal to 1" in refused.output
+    for words in (["coc", str(tmp_path), "1", "--image-width", "0"], ["psf", "physical", "--out", str(tmp_path), "--image-width", "-5"]):
+        refused = CliRunner().invoke(app, words, env={"COLUMNS": "200"})
+        assert refused.exit_code == 2 and "greater than or equal to 1" in refused.output
     with pytest.raises(InputError, match="it is a bank of PSFs: give the lens file that it was made of"):
         CliRunner().invoke(app, ["coc", str(tmp_path), "1"], catch_exceptions=False)
 

@@ -1,6 +1,7 @@
 """The verbs on arrays do what the commands do, take files and arrays alike, refuse what cannot be meant; the examples run."""
 
 import runpy
+import subprocess
 import sys
 from pathlib import Path
 
@@ -116,6 +117,11 @@ def test_merge_takes_arrays_and_keeps_the_stack_where_asked(tmp_path: Path) -> N
         (lambda rgb, z: mb.render(rgb, np.nan * z, LENS), "no pixel has any"),
         (lambda rgb, z: mb.render(rgb, 1e-4 * z, LENS), "times the picture"),
         (lambda rgb, _: mb.composite(rgb, [], LENS), "expected a GLB file, a layer"),
+        (lambda rgb, _: mb.composite(rgb, ball(), LENS, mode="infront"), "mode: expected one of front, over"),
+        (lambda rgb, _: mb.composite(rgb, "cake.glb", LENS), "at_pixel: on which pixel"),
+        (lambda rgb, z: mb.render(rgb, z, LENS, renderer=Path("none.onnx")), "none.onnx"),
+        (lambda *_: mb.merge(["none.jpg"]), "two or more of one scene at several focus distances, or a folder, got 1"),
+        (lambda *_: mb.merge([Path(__file__).parent]), "but found none"),
         (lambda rgb, _: mb.merge([rgb]), "two or more"),
         (lambda rgb, _: mb.merge([rgb, (255 * rgb).astype(np.uint8)]), "got uint8"),
     ],
@@ -123,6 +129,27 @@ def test_merge_takes_arrays_and_keeps_the_stack_where_asked(tmp_path: Path) -> N
 def test_what_cannot_be_meant_is_refused_in_one_sentence(call: object, told: str) -> None:
     with pytest.raises(mb.InputError, match=told):
         call(*picture_and_depth())  # type: ignore[operator]
+
+
+OF_WRONG_TYPE = """
+import numpy as np
+import mrbokeh as mb
+rgb, depth_m, lens = np.full((4, 6, 3), 0.5), np.full((4, 6), 2.0), mb.Lens(50, 2)
+for call in (
+    lambda: mb.composite(rgb, 5, lens), lambda: mb.composite(rgb, np.array(5), lens), lambda: mb.merge(5),
+    lambda: mb.render(rgb, {}, lens), lambda: mb.render(rgb, depth_m, lens, renderer=5),
+):
+    try:
+        call()
+    except mb.InputError as error:
+        print(str(error).partition(" expected")[0])
+"""
+
+
+def test_arguments_of_a_wrong_type_are_refused_in_one_sentence_too() -> None:
+    """In a process of its own: in this one the annotations refuse them first."""
+    told = subprocess.run([sys.executable, "-c", OF_WRONG_TYPE], capture_output=True, text=True, cwd=ROOT)
+    assert told.stdout.split() == ["inserted:", "inserted:", "photographs:", "depth_m:", "renderer:"], told.stderr
 
 
 def test_the_public_names_are_listed_and_say_what_they_are() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from tests.project.test_style import FILES, PACKAGES, ROOT, nodes
 
-# The levels of mrbokeh/, top first: a room imports from lower levels only; inside a room anything without a cycle.
+# The levels of mrbokeh/, top first: a folder imports from lower levels only; inside a folder anything without a cycle.
 LEVELS = (
     {"cli"},
     {"commands"},
@@ -61,12 +61,12 @@ def imported(path: Path) -> Iterator[str]:
 
 
 def level_of(module: str, levels: tuple[set[str], ...], folder: str) -> tuple[int, str]:
-    """Return (level, room) of a module below a folder."""
-    room = module.removeprefix(folder + ".").split(".")[0]
-    for level, rooms in enumerate(levels):
-        if room in rooms:
-            return level, room
-    raise AssertionError(f"{module} lies in no room of {folder}: say in which folder {room!r} belongs")
+    """Return (level, name) of the part of a folder, itself a folder or a module, in which a module lies."""
+    name = module.removeprefix(folder + ".").split(".")[0]
+    for level, names in enumerate(levels):
+        if name in names:
+            return level, name
+    raise AssertionError(f"{module} has no level in {folder}: say on which one {name!r} belongs")
 
 
 @cache
@@ -81,10 +81,10 @@ def test_packages_meet_in_files_only() -> None:
 
 
 @pytest.mark.parametrize(("folder", "levels"), [("mrbokeh", LEVELS), ("mrbokeh.renderers", RENDERER_LEVELS)])
-def test_rooms_import_from_lower_levels_only(folder: str, levels: tuple[set[str], ...]) -> None:
+def test_folders_import_from_lower_levels_only(folder: str, levels: tuple[set[str], ...]) -> None:
     inside = [(a, b) for a, b in arrows() if a.startswith(folder + ".") and b.startswith(folder + ".")]
     places = [(level_of(a, levels, folder), level_of(b, levels, folder), f"{a} -> {b}") for a, b in inside]
-    wrong = [arrow for (above, room), (below, target), arrow in places if room != target and above >= below]
+    wrong = [arrow for (above, source), (below, target), arrow in places if source != target and above >= below]
     assert not wrong
 
 

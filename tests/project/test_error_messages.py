@@ -19,7 +19,7 @@ def literal(node: ast.expr) -> str:
     return str(node.value) if isinstance(node, ast.Constant) else ""
 
 
-def test_messages_to_people_are_sentences_of_the_house() -> None:
+def test_messages_to_people_are_sentences() -> None:
     """One sentence: no full stop at its end, no shouting, no bare refusal, and enough words to say what was expected and what came.
 
     Messages that are put together of others ({}) are judged where their parts are written.

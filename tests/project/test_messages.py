@@ -38,10 +38,10 @@ SLEEPING = (
 
 SPEAKING = (
     "import sys; import mrbokeh.optics.lens_file as file\n"
-    "from mrbokeh import cli; from mrbokeh.system import messages as channel; from rich.table import Table\n"
+    "from mrbokeh import cli; from mrbokeh.system import messages; from rich.table import Table\n"
     "def speak(path, lens):\n"
-    "    channel.say('a hint'); channel.warn('careful'); print('noise', file=sys.stderr); channel.tell('the result')\n"
-    "    table = Table('of two', box=None); channel.show(table); sys.exit()\n"
+    "    messages.say('a hint'); messages.warn('careful'); print('noise', file=sys.stderr); messages.tell('the result')\n"
+    "    table = Table('of two', box=None); messages.show(table); sys.exit()\n"
     "file.write_lens = speak; sys.argv[0] = 'mrbokeh'; cli.main()"
 )
 

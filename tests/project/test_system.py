@@ -4,6 +4,7 @@ that is handed out again, which tethered camera is meant, and what its errors me
 import io
 import time
 from collections.abc import Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 import numpy as np
 import pytest
@@ -94,6 +95,40 @@ def test_silent_work_says_in_a_log_that_it_goes_on(
     assert said.getvalue() == "slices: 0 of 5, 0:01:00\n", "the end of what was broken off"
     time.sleep(0.2)
     assert capsys.readouterr().err == "", "nothing after the command"
+
+
+@pytest.mark.usefixtures("said")
+def test_a_task_is_told_of_only_when_all_of_it_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread of the heartbeat asks in the middle of `add_task`, where rich calls `refresh`."""
+    with console.progress_bars() as bars, ThreadPoolExecutor(1) as pool:
+        asked: list[Future[str]] = []
+
+        def refresh() -> None:
+            asked.append(pool.submit(bars._silent_line))  # type: ignore[attr-defined]
+            wait(asked, 0.2)
+
+        monkeypatch.setattr(bars, "refresh", refresh)
+        bars.add_task("slices", total=5)
+        assert asked[0].result() == ""
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+@pytest.mark.parametrize(("file", "environment"), [(Terminal(), {"TERM": "dumb"}), (io.StringIO(), {"FORCE_COLOR": "1"})])
+def test_nothing_is_drawn_where_nothing_can_be_erased(
+    file: io.StringIO, environment: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a dumb terminal, and in a log whose colours are forced, as those of CI: a heartbeat, and no line that is not asked for."""
+    monkeypatch.setattr(console, "Console", lambda **_: Console(file=file, _environ=environment))
+    with opened() as channel:
+        console.begin("export")
+        assert isinstance(channel.spinner, console.Heartbeat)
+        with console.working("rendering"):
+            list(track([1, 2], "kernels"))
+    assert file.getvalue() == ""
 
 
 @pytest.mark.parametrize(("total", "lines"), [(0, ["frames: 4, 0:00:08"]), (2, ["frames: 2 of 2, 0:00:04", "frames: 4 of 2, 0:00:08"])])

@@ -59,9 +59,11 @@ def test_the_lens_and_the_focus_may_be_told_by_facts_and_by_a_pixel(tmp_path: Pa
     write_lens(tmp_path / "wide.json", wide)
     facts = ("--f-number", wide.f_number, "--sensor-width", wide.sensor_width_mm)
     run(stack.folder, "--focus", "@5,5", "--lens", tmp_path / "wide.json", "--out", tmp_path / "by_file")
-    run(stack.folder, "--focus-at", "5,5", *facts, "--out", tmp_path / "by_facts")
+    run(stack.folder, "--focus-at", "5,5,2", *facts, "--out", tmp_path / "by_facts")
     by_file, by_facts = (read_focal_stack(tmp_path / name) for name in ("by_file", "by_facts"))
     assert by_facts.focus_distances_m == pytest.approx(by_file.focus_distances_m)
+    asked = [[stack.metadata["refocused"].get(name) for name in ("focus", "focus_at")] for stack in (by_file, by_facts)]
+    assert asked == [["@5,5", None], [None, "5,5,2"]], "what was asked for stands in stack.json"
     np.testing.assert_allclose(by_facts.slice_rgb(0), by_file.slice_rgb(0), atol=1e-5)
     refused("where to focus", run, stack.folder, "--out", tmp_path / "no")
     monkeypatch.setattr("mrbokeh.renderers.choose.make_renderer", lambda _, **__: object.__new__(OnnxNetwork))

@@ -295,6 +295,27 @@ def test_a_mistake_in_a_worker_is_told_once(tmp_path: Path) -> None:
         render_shot(shot_of(clip_of_blobs(tmp_path), VideoTarget(tmp_path / "out.mkv"), Brighter(as_layer=True)), ProcessExecutor(1))
 
 
+STARTING = """
+import signal, time
+from multiprocessing import get_context
+from pathlib import Path
+from mrbokeh.shots.executors import _ctrl_c_later
+for _ in range(2):
+    worker = get_context("spawn").Process(target=time.sleep, args=(60,), daemon=True)
+    with _ctrl_c_later():
+        worker.start()
+    blocked = Path(f"/proc/{worker.pid}/status").read_text().partition("SigBlk:")[2].split()[0]
+    print(int(blocked, 16) >> signal.SIGINT - 1 & 1, int(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())))
+    worker.terminate()
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_ctrl_c_is_held_back_from_the_first_worker_as_from_the_others() -> None:
+    """The first start of a process starts Python's resource tracker too, which lets SIGINT through again (CPython 3.11). 1: held back."""
+    assert subprocess.run([sys.executable, "-c", STARTING], capture_output=True, text=True).stdout == "1 0\n" * 2
+
+
 def held_shot(folder: Path) -> Shot:
     """The clip in a folder; frames from the third segment on wait for its gate."""
     recipe = Brighter(gate=folder / "gate", held_from=2 * PER_SEGMENT, pids=folder / "pids")

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from capture.cli import app
 from capture.matchmove import clip_matchmove
 from capture.matchmove.clip_matchmove import MatchmoveSettings, matchmove_clip
-from capture.matchmove.clip_solve import FLAT, TURNING
+from capture.matchmove.clip_solve import FLAT, TURNING, begin_solving
 from capture.matchmove.ground import GroundPicks, Ruler, on_ground, parse_frame_distance, parse_ground, parse_ruler, ruler_scale
 from capture.matchmove.keyframes import chosen_keyframes, motion_of_clip
 from capture.matchmove.space_solve import off_px, poses_between, rotation_only_residual_px
@@ -182,6 +182,16 @@ def test_frames_beyond_the_clip_and_resting_cameras_are_refused(tmp_path: Path) 
     refused("frames 0 to 8", matchmove_clip, clip, tmp_path / "work", MatchmoveSettings(distance=(0, 9, 1.0)))
     clip = write_clip(tmp_path / "resting.mkv", walking(9)[:1] * 4)
     refused("take a single camera", matchmove_clip, clip, tmp_path / "work")
+
+
+def test_what_was_solved_outlives_settings_that_are_refused(tmp_path: Path) -> None:
+    clip, kept = write_clip(tmp_path / "clip.mkv", walking(2)), tmp_path / "work" / "solve.json"
+    key = clip_matchmove._key(clip, MatchmoveSettings())
+    assert not begin_solving(kept.parent, key)
+    kept.touch()
+    refused("--mapper must be", matchmove_clip, clip, kept.parent, MatchmoveSettings(mapper="globel"))
+    refused("--camera-model must be", matchmove_clip, clip, kept.parent, MatchmoveSettings(camera_model="radial"))
+    assert kept.exists() and begin_solving(kept.parent, key)
 
 
 @pytest.mark.slow

@@ -149,7 +149,7 @@ def test_mistakes_end_in_a_sentence(clip: Path, settings: list[str], tmp_path: P
         (("--layer", tmp_path / "small.exr", *lens, *out), r"small\.exr is 48x32 px but the clip is 96x64 px"),
         ((*settings, *out, "--frames", "40-50"), r"has the frames 0-11"), ((*settings, "--out", clip), "is read and would be written over"),
         ((*settings, "--out", tmp_path / "there.mkv"), "exists already"), ((*settings, *out, "--renderer", "magic"), "expected a renderer"),
-        ((*lens, *out), "nothing to put into the clip"), ((*settings, *out, "--mode", "infront"), "expected --mode out of front"),
+        ((*lens, *out), "nothing to put into the clip"), ((*settings, *out, "--mode", "infront"), "mode: expected one of front"),
     ):  # fmt: skip
         refused(sentence, run, clip, *words)
     assert not list(tmp_path.glob("out.mov*"))
