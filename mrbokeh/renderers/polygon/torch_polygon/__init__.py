@@ -31,7 +31,7 @@ from torch import Tensor
 
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.layering import Layering
-from mrbokeh.layering.padded_layers import coc_px_of
+from mrbokeh.layering.padded_layers import check_reach, coc_px_of
 from mrbokeh.layering.psf_over_field import reach_px
 from mrbokeh.layering.torch_layering.slicing import Slices
 from mrbokeh.optics.aperture import Aperture
@@ -110,6 +110,7 @@ class TorchPolygons:
     def render_layer(self, layer: Layer, lens: Lens, slices: int) -> Layer:
         """Render an opaque layer, whose pixels come from the host and go back there."""
         coc_px = coc_px_of(layer, lens)
+        check_reach([layer], [coc_px], reach_px(lens.aperture, float(np.abs(coc_px).max())))
         found = self.render(self._sent_array(layer.rgb), self._sent_array(coc_px), lens.aperture, slices).cpu().numpy()
         return Layer(np.ascontiguousarray(found[..., :3]), np.ascontiguousarray(found[..., 3]), layer.depth_m)
 
