@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial.transform import Rotation
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.atomic_files import atomic_path
@@ -95,6 +94,8 @@ def colmap_camera(frame: TrackedFrame) -> ColmapCamera:
 
 def colmap_image(name: str, frame: TrackedFrame, camera: int) -> ColmapImage:
     pose = frame.camera.camera_from_world
+    from scipy.spatial.transform import Rotation
+
     x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True).tolist()
     return ColmapImage(name, (w, x, y, z), tuple(pose[:3, 3].tolist()), camera)
 
@@ -104,6 +105,8 @@ def _rotation(turn: Sequence[float], where: str) -> Float64[np.ndarray, "3 3"]:
     length = float(np.linalg.norm(turn))
     if not 0.5 < length < 2.0:
         raise InputError(f"{where}: expected a quaternion of length 1, got {tuple(turn)}")
+    from scipy.spatial.transform import Rotation
+
     return Rotation.from_quat([x, y, z, w]).as_matrix()
 
 
