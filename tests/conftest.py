@@ -134,7 +134,7 @@ LONG_FILES = (
     "viewfinder/test_page_browser.py",
     "compositing/test_compositing_rims.py",
     "project/test_demo.py",
-    "training/test_network_field.py",
+    "tracking/test_simple_cameras.py",
     "training/test_ablation.py",
     "views/test_depth.py",
     "project/test_packaging.py",

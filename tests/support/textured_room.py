@@ -38,17 +38,17 @@ def picture(camera: Camera) -> np.ndarray:
     """Grey, 8 bits; four rays for each pixel."""
     fine = camera.resized(2 * camera.width_px, 2 * camera.height_px)
     origin = camera.world_from_camera[:3, 3]
-    rays = fine.unproject(fine.pixel_centres_px(), np.ones((fine.height_px, fine.width_px))) - origin
-    best, grey = np.full(rays.shape[:2], np.inf), np.zeros(rays.shape[:2], np.uint8)
+    rays = (fine.unproject(fine.pixel_centres_px(), np.ones((fine.height_px, fine.width_px))) - origin).astype(np.float32)
+    rays, origin = np.ascontiguousarray(np.moveaxis(rays, 2, 0)), origin.astype(np.float32)
+    best, grey = np.full(rays.shape[1:], np.inf, np.float32), np.zeros(rays.shape[1:], np.uint8)
     for texture, axis, place, across in zip(PAPERS, (0, 1, 2), (1.5, 0.8, 3.5), ((1, 2), (0, 2), (0, 1)), strict=True):
         with np.errstate(divide="ignore", invalid="ignore"):
-            far = (place - origin[axis]) / rays[..., axis]
-        hit = np.where(far > 0, far, np.inf)
-        points = origin + np.where(np.isfinite(hit), hit, 0.0)[..., None] * rays
-        x, y = ((points[..., one] * _PER_M + _TEXTURE_PX / 2).astype(np.float32) for one in across)
+            far = (np.float32(place) - origin[axis]) / rays[axis]
+        nearer = (far > 0) & (far < best)
+        hit = np.where(nearer, far, np.float32(0.0))
+        x, y = (_PER_M * (origin[one] + hit * rays[one]) + np.float32(_TEXTURE_PX / 2) for one in across)
         seen = cv2.remap(texture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)
-        grey = np.where(hit < best, seen, grey)
-        best = np.minimum(best, hit)
+        grey, best = np.where(nearer, seen, grey), np.where(nearer, far, best)
     return cv2.resize(grey, (camera.width_px, camera.height_px), interpolation=cv2.INTER_AREA)
 
 

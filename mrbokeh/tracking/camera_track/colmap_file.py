@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial.transform import Rotation
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.atomic_files import atomic_path
@@ -94,12 +93,16 @@ def colmap_camera(frame: TrackedFrame) -> ColmapCamera:
 
 
 def colmap_image(name: str, frame: TrackedFrame, camera: int) -> ColmapImage:
+    from scipy.spatial.transform import Rotation
+
     pose = frame.camera.camera_from_world
     x, y, z, w = Rotation.from_matrix(pose[:3, :3]).as_quat(canonical=True).tolist()
     return ColmapImage(name, (w, x, y, z), tuple(pose[:3, 3].tolist()), camera)
 
 
 def _rotation(turn: Sequence[float], where: str) -> Float64[np.ndarray, "3 3"]:
+    from scipy.spatial.transform import Rotation
+
     w, x, y, z = turn
     length = float(np.linalg.norm(turn))
     if not 0.5 < length < 2.0:

@@ -25,8 +25,6 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
-from scipy.ndimage import gaussian_filter1d
 
 from mrbokeh.system.errors import InputError, require_file
 
@@ -59,6 +57,8 @@ def smoothed_within_steps(values: Samples) -> Samples:
 
 def _averaged(values: Samples) -> Samples:
     """Average samples, mirrored through the first and last one so that a steady pull stays as it is at its ends."""
+    from scipy.ndimage import gaussian_filter1d
+
     pad = min(len(values) - 1, int(6 * _SIGMA_FRAMES))
     before, after = 2.0 * values[0] - values[pad:0:-1], 2.0 * values[-1] - values[-2 : -pad - 2 : -1]
     longer = np.concatenate([before, values, after])
@@ -120,6 +120,8 @@ class FocusPull:
     def _smooth(self, place: float) -> float:
         if len(self.frames) == 1:
             return float(self.dioptres[0])
+        from scipy.interpolate import CubicHermiteSpline, PchipInterpolator  # 0.3 s for each worker of a video, which seldom has a pull
+
         slopes = PchipInterpolator(self.frames, self.dioptres).derivative()(self.frames)
         slopes[[0, -1]] = 0.0
         return max(float(CubicHermiteSpline(self.frames, self.dioptres, slopes)(place)), 0.0)

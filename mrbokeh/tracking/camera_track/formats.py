@@ -28,7 +28,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from mrbokeh.optics.camera import Camera, camera_from_json, camera_to_json
 from mrbokeh.system.atomic_files import atomic_path, read_json, write_json
@@ -89,6 +88,8 @@ def _chan_values(line: str, where: str) -> list[float]:
 
 
 def _chan_camera(values: Sequence[float], size_px: tuple[int, int], order: str) -> Camera:
+    from scipy.spatial.transform import Rotation
+
     place, angles_deg, view_deg = values[:3], values[3:6], values[6]
     width_px, height_px = size_px
     focal_px = 0.5 * height_px / np.tan(np.deg2rad(view_deg) / 2.0)
@@ -117,6 +118,8 @@ def _chan_line(number: int, camera: Camera, order: str) -> str:
 
 def _euler_deg(rotation: np.ndarray, order: str) -> list[float]:
     """Return angles of x, y, z. If the middle rotation is a right angle, many triples are one rotation: SciPy chooses, and would warn."""
+    from scipy.spatial.transform import Rotation
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)
         angles = Rotation.from_matrix(rotation).as_euler(order.lower(), degrees=True)

@@ -13,7 +13,6 @@ from pathlib import PurePosixPath
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.spatial.transform import Rotation
 
 from mrbokeh.optics.camera import Camera
 from mrbokeh.system.errors import InputError
@@ -85,6 +84,8 @@ def camera_between(one: Camera, other: Camera, share: float) -> Camera:
 
 def pose_between(one: Pose, other: Pose, share: float) -> Pose:
     """Interpolate two camera_from_world."""
+    from scipy.spatial.transform import Rotation  # here, for workers of a video seldom need it and it takes a third of their start
+
     a, b = np.linalg.inv(one), np.linalg.inv(other)
     turn = Rotation.from_matrix(a[:3, :3].T @ b[:3, :3]).as_rotvec()
     pose = np.eye(4)
