@@ -3,7 +3,6 @@
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -618,7 +617,7 @@ async def test_a_clip_shows_its_track_and_is_filmed(tmp_path: Path, size_px: tup
     """The path of the object's foot through the frames follows where it stands; saved is what `mrbokeh video` makes of it."""
     clip = write_live_clip(tmp_path, WIDTH, HEIGHT, 2)
     write_track(tmp_path / "track.json", CameraTrack({number: TrackedFrame(each) for number, each in enumerate(clip.cameras)}))
-    first = replace(clip_state(clip.path, tmp_path / "track.json", tmp_path / "studio_files", StudioState()), shadow=0.0)
+    first = clip_state(clip.path, tmp_path / "track.json", tmp_path / "studio_files", StudioState())
     async with opened(tmp_path, size_px, first) as (page, made):
         hidden = "[...document.querySelectorAll('.of_still')].every((each) => each.hidden)"
         assert await page.value(hidden), "the track says how the camera was held"
