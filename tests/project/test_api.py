@@ -15,10 +15,10 @@ from mrbokeh.optics.lens_file import write_lens
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.system.errors import InputError
 from tests.support.command_line import mrbokeh
+from tests.support.shipped_photographs import few_small_photographs
 
 ROOT = Path(__file__).resolve().parents[2]
 LENS = mb.Lens(focal_length_mm=50, f_number=2.0, focus_distance_m=2.0)
-SHIPPED = Path(mb.__file__).parent / "demo_data"
 
 
 def picture_and_depth() -> tuple[np.ndarray, np.ndarray]:
@@ -159,11 +159,9 @@ def test_the_public_names_are_listed_and_say_what_they_are() -> None:
 
 @pytest.mark.parametrize("script", sorted((ROOT / "examples").glob("*.py")), ids=lambda path: path.stem)
 def test_examples_run(script: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    few = tmp_path / "few"
-    few.mkdir()
-    for name in ("01.jpg", "04.jpg", "07.jpg"):
-        mb.write_image(few / name, mb.read_picture(SHIPPED / "pcb_oblique" / name)[::4, ::4])
-    arguments = [str(tmp_path / "out"), *([str(few)] if "PHOTOGRAPHS_FOLDER" in script.read_text(encoding="utf-8") else [])]
+    arguments = [str(tmp_path / "out")]
+    if "PHOTOGRAPHS_FOLDER" in script.read_text(encoding="utf-8"):
+        arguments.append(str(few_small_photographs(tmp_path / "few")))
     monkeypatch.setattr(sys, "argv", [str(script), *arguments])
     runpy.run_path(str(script), run_name="__main__")
     assert len(list((tmp_path / "out").glob("*.png"))) == 2

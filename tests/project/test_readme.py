@@ -10,6 +10,7 @@ import pytest
 
 import mrbokeh as mb
 from mrbokeh.cli import command_of
+from tests.support.shipped_photographs import DATA, few_small_photographs
 
 ROOT = Path(__file__).resolve().parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -54,11 +55,8 @@ def test_every_command_and_option_exists() -> None:
 
 def test_the_python_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    shipped = Path(mb.__file__).parent / "demo_data"
-    (tmp_path / "desk").mkdir()
-    for name in ("01.jpg", "04.jpg", "07.jpg"):
-        mb.write_image(tmp_path / "desk" / name, mb.read_picture(shipped / "pcb_oblique" / name)[::4, ::4])
-    (tmp_path / "cake.glb").symlink_to(shipped / "objects" / "cakeBirthday.glb")
+    few_small_photographs(tmp_path / "desk")
+    (tmp_path / "cake.glb").symlink_to(DATA / "objects" / "cakeBirthday.glb")
     rng = np.random.default_rng(0)
     variables = {"picture": rng.uniform(0.0, 1.0, (80, 120, 3)), "depth_m": rng.uniform(1.0, 2.0, (80, 120))}
     exec(blocks("python")[0], variables)

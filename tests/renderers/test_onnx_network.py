@@ -30,7 +30,7 @@ FACTS = RunFacts(LENS, SIZE[1], SIZE[0], LARGEST_COC_PX, 4.0, ("a/view_0",), (),
 
 
 @cache
-def exported(settings: NetworkSettings, jitter: float = 0.0) -> OnnxNetwork:
+def _exported(settings: NetworkSettings, jitter: float) -> tuple[OnnxNetwork, bytes]:
     network = build_network(TrainSettings(network=settings), FACTS).eval()
     with torch.no_grad():
         for parameter in network.parameters():
@@ -38,7 +38,11 @@ def exported(settings: NetworkSettings, jitter: float = 0.0) -> OnnxNetwork:
     with TemporaryDirectory() as folder:
         path = Path(folder) / "lens.onnx"
         export_network(network, settings, FACTS, path)
-        return OnnxNetwork(path, threads=1)
+        return OnnxNetwork(path, threads=1), path.read_bytes()
+
+
+def exported(settings: NetworkSettings, jitter: float = 0.0) -> OnnxNetwork:
+    return _exported(settings, jitter)[0]
 
 
 @pytest.fixture
@@ -67,8 +71,8 @@ def card(coc_px: float, rgb: tuple[float, float, float] = (0.5, 0.25, 1.0), half
 
 def test_a_network_is_a_lens_that_keeps_its_own_blur(tmp_path: Path) -> None:
     """By its path, and read as a Lens, which another renderer may spread by the opening that it was trained with."""
-    path, settings = tmp_path / "lens.onnx", demo_settings().network
-    export_network(build_network(TrainSettings(network=settings), FACTS).eval(), settings, FACTS, path)
+    path = tmp_path / "lens.onnx"
+    path.write_bytes(_exported(demo_settings().network, 0.0)[1])
     lens, sharp, depth_m = read_lens(path), np.full((*SIZE, 3), 0.5, np.float32), np.full(SIZE, depth_for(5.0), np.float32)
     sharp[::8] = 0.0
     assert lens.spread_by == path and isinstance(lens_and_renderer(path, None)[1], OnnxNetwork)

@@ -134,12 +134,12 @@ class TestGeometry:
             assert np.hypot(*(centroid - [x, y])) < 0.1
 
     def test_alpha_edges_against_sixteen_by_sixteen_samples(self, backend: SceneRenderer) -> None:
-        camera = Camera(160, 90, (130.0, 127.0), (75.3, 47.7))
+        camera = Camera(96, 54, (78.0, 76.2), (45.2, 28.6))
         blade = rectangle((-0.9, -0.5, 2.0), (0.45, 0.1, 0), (-0.05, 0.9, 0.2), matte(0.5, 0.5, 0.5))
         upright = rectangle((0.95, -0.6, 2.0), (0.32, 0, 0), (0, 1.13, 0), matte(0.5, 0.5, 0.5))
         scene = Scene((sphere((0.2, 0.0, 2.0), 0.45, matte(0.5, 0.5, 0.5)), blade, upright))
-        fine = backend.render(scene, camera.resized(160 * 16, 90 * 16)).alpha
-        truth = (fine > 0.5).reshape(90, 16, 160, 16).mean((1, 3))
+        fine = backend.render(scene, camera.resized(96 * 16, 54 * 16)).alpha
+        truth = (fine > 0.5).reshape(54, 16, 96, 16).mean((1, 3))
         partly = (truth > 0) & (truth < 1)
         error = backend.render(scene, camera).alpha - truth
         assert partly.sum() > 250

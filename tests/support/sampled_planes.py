@@ -32,20 +32,20 @@ def sample_planes(planes: Sequence[Plane], size_px: int, per_pixel: int, seed: i
     """The planes, front first. Each pixel gets one Sobol sequence over area, pupil and shutter, shifted by chance."""
     rng = np.random.default_rng(seed)
     unit = qmc.Sobol(5, seed=rng).random(per_pixel)[None] + rng.uniform(size=(size_px * size_px, 1, 5))
-    unit = (unit % 1.0).reshape(-1, 5)
+    unit = (unit - (unit >= 1.0)).reshape(-1, 5)
     rows, columns = np.repeat(np.indices((size_px, size_px)).reshape(2, -1), per_pixel, axis=1)
     xy_px = np.column_stack([columns, rows]) + unit[:, :2]
     radius, angle = np.sqrt(unit[:, 2]), 2.0 * np.pi * unit[:, 3]
     uv, time = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)]), unit[:, 4]
     rgb, coc_px, motion_px = np.zeros((len(unit), 3)), np.zeros(len(unit)), np.zeros((len(unit), 2))
-    free = np.ones(len(unit), bool)
+    free = np.arange(len(unit))
     for plane in planes:
-        at = _met_at_px(plane, xy_px, uv, time, 0.5 * size_px)
-        hit = free if plane.covers is None else free & plane.covers(at[:, 0], at[:, 1])
-        rgb[hit] = plane.colour(at[hit, 0], at[hit, 1])
-        coc_px[hit] = plane.coc_px + (at[hit] - 0.5 * size_px) @ np.array(plane.gradient)
+        at = _met_at_px(plane, xy_px[free], uv[free], time[free], 0.5 * size_px)
+        covered = np.ones(len(free), bool) if plane.covers is None else plane.covers(at[:, 0], at[:, 1])
+        hit, at, free = free[covered], at[covered], free[~covered]
+        rgb[hit] = plane.colour(at[:, 0], at[:, 1])
+        coc_px[hit] = plane.coc_px + (at - 0.5 * size_px) @ np.array(plane.gradient)
         motion_px[hit] = plane.motion_px
-        free = free & ~hit
     depth_m = 1.0 / (1.0 / lens.focus_distance_m - coc_px / lens.coc_px_per_dioptre(size_px))
     arrays = (xy_px, uv, time, rgb, depth_m, motion_px)
     return LightFieldSamples(size_px, size_px, *(values.astype(np.float32) for values in arrays))
