@@ -129,23 +129,7 @@ def test_the_command_says_what_it_guesses(tmp_path: Path) -> None:
     write_image(tmp_path / "photo.png", rgb)
     write_image(tmp_path / "second.png", halved(seen_from(*WAYS_M["right"])[0]))
     width_mm = 28.0 * camera().width_px / camera().focal_px[0]
-    words = (
-        "--object",
-        CAKE,
-        "--at-pixel",
-        "150,165",
-        "--height",
-        "60px",
-        "--plain",
-        "--mode",
-        "over",
-        "--shadow",
-        0,
-        "--focal-length",
-        "28",
-        "--f-number",
-        "4",
-    )
+    words = ("--object", CAKE, "--at-pixel", "150,165", "--height", "60px", "--plain", "--focal-length", "28", "--f-number", "4")
     lens = ("--focus", "1", "--sensor-width", f"{width_mm:.6g}")
     done = mrbokeh("composite", tmp_path / "photo.png", "--stereo", tmp_path / "second.png", *words, *lens, "--out", tmp_path / "out.exr")
     assert done.returncode == 0, done.stderr
