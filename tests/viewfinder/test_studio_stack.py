@@ -52,9 +52,11 @@ def test_each_slice_is_the_picture_of_its_command_line(folder: Path, tmp_path: P
         assert not changed[:, : CARD_PX - 3].any(), "the card is sharp and hides it"
     kept.holds_light = True
     shown = region_of(WholePhotograph(opened), options, kept, Region(36.0, 24.0, 24))
-    # Rims are moved by what a part shows, which differs from the whole in a few pixels.
-    np.testing.assert_allclose(shown, preview.rgb[12:36, 24:48], atol=0.04)
-    assert np.abs(shown - preview.rgb[12:36, 24:48]).mean() < 0.002
+    # Rims are moved by what a part shows, which differs from the whole in a few pixels at the card's edge, and nowhere else.
+    off = np.abs(shown - preview.rgb[12:36, 24:48]).max(axis=2)
+    at_rim = np.abs(np.arange(24, 48) - CARD_PX + 0.5) < 4.0
+    assert off.mean() < 0.002 and off[:, ~at_rim].max() < 0.02
+    assert (off > 0.04).sum() <= 3 and off.max() < 0.06
 
 
 def test_the_object_is_blurred_as_its_surroundings_in_every_slice(folder: Path) -> None:
