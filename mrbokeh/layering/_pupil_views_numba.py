@@ -116,6 +116,8 @@ def correlate(
     """
     for k in range(len(pupil)):
         _view(nearest, which, window, groups, pupil[k, 0], pupil[k, 1], pupil[k, 2])
+        for group in range(len(which) - 1):
+            _close_cracks(which[group], window)
         _add_view(sums, which, window.rgb, cells, weights[:, k])
 
 
@@ -169,6 +171,26 @@ def _view(
                 column = np.uint32(np.int32(x_px[i] + u * half_px) - BEFORE_PX)
                 if row < np.uint32(rows) and column < np.uint32(columns) and half_px < near[row, column] and alpha[i] > least:
                     near[row, column], numbers[row, column] = half_px, i
+
+
+@njit(cache=True, nogil=True)
+def _close_cracks(numbers: np.ndarray, window: Window) -> None:
+    """Fill places between two pixels of a view that lie side by side in their surface: a slope is drawn apart, but has no holes."""
+    rows, columns = numbers.shape
+    for down, right in ((0, 1), (1, 0)):
+        for row in range(down, rows - down):
+            for column in range(right, columns - right):
+                if numbers[row, column] < 0:
+                    before, after = numbers[row - down, column - right], numbers[row + down, column + right]
+                    if before >= 0 and after >= 0 and _are_neighbours(window, before, after):
+                        numbers[row, column] = before
+
+
+@njit(cache=True, nogil=True)
+def _are_neighbours(window: Window, i: int, j: int) -> bool:
+    """Return whether two pixels are one surface and at most one lies between them: slopes that shift rows draw such gaps."""
+    apart_px = max(abs(window.x_px[i] - window.x_px[j]), abs(window.y_px[i] - window.y_px[j]))
+    return apart_px < 2.5 and 2.0 * abs(window.half_px[i] - window.half_px[j]) < _STEP_PX
 
 
 @njit(cache=True, nogil=True)

@@ -260,12 +260,15 @@ class _Views:
         from mrbokeh.layering._pupil_views_numba import correlate, take_back
 
         top, bottom, left, right = block
-        cells = field_cells_of(np.arange(top, bottom)[:, None], np.arange(left, right)[None], self.aperture, self.frame)
-        count, shape = int(self.groups[-1]) + 1, (bottom - top, right - left)
+        grown = top - 1, bottom + 1, left - 1, right + 1  # cracks are closed between neighbours
+        rows, columns = np.arange(*grown[:2]), np.arange(*grown[2:])
+        rows, columns = rows.clip(0, self.frame.height_px - 1), columns.clip(0, self.frame.width_px - 1)
+        cells = field_cells_of(rows[:, None], columns[None], self.aperture, self.frame)
+        count, shape = int(self.groups[-1]) + 1, (len(rows), len(columns))
         sums = np.zeros((*shape, count - 1, 9), np.float32)
         nearest, which = np.empty((count, *shape), np.float32), np.empty((count, *shape), np.int32)
-        correlate(sums, self._window(block), self.groups, self._pupil, cells, self._weights, nearest, which)
-        take_back(colour, sums, tiles, _TILE_PX, top, left, _NOISE)
+        correlate(sums, self._window(grown), self.groups, self._pupil, cells, self._weights, nearest, which)
+        take_back(colour, sums[1:-1, 1:-1], tiles, _TILE_PX, top, left, _NOISE)
 
     def _window(self, block: tuple[int, int, int, int]) -> "Window":
         """Collect the pixels of all surfaces that any view may show in a block."""

@@ -1,6 +1,7 @@
 """Rims as the pupil sees them, against areas of the pupil known by geometry and against plain loops over its points."""
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 import pytest
@@ -143,12 +144,39 @@ def test_sums_over_the_pupil_are_those_of_plain_loops() -> None:
             place = int(np.floor(row - around + 0.5 + v * h)), int(np.floor(column - around + 0.5 + u * h))
             seen = nearest[groups[s]]
             if place not in seen or h < seen[place][0]:
-                seen[place] = h, rgb[s, row, column]
-        for place, (_, behind) in nearest[1].items():
+                seen[place] = h, rgb[s, row, column], (row, column)
+        _close_cracks(nearest[0], rows, columns)
+        for place, (_, behind, _) in nearest[1].items():
             if 0 <= place[0] < rows and 0 <= place[1] < columns:
                 hidden = float(place in nearest[0])
                 expected[place] += np.array([1.0, hidden, *behind, *(hidden * behind), np.square(behind).sum()])
     np.testing.assert_allclose(sums[:, :, 0], expected, rtol=1e-4, atol=1e-4)
+
+
+def _close_cracks(seen: dict[tuple[int, int], tuple[float, np.ndarray, tuple[int, int]]], rows: int, columns: int) -> None:
+    """Between two places that show neighbours of one surface nothing shows through: side by side first, then below one another."""
+    for down, right in ((0, 1), (1, 0)):
+        for row, column in product(range(down, rows - down), range(right, columns - right)):
+            ends = seen.get((row - down, column - right)), seen.get((row + down, column + right))
+            if (row, column) not in seen and None not in ends:
+                (h, _, source), (other_h, _, other) = ends
+                if np.abs(np.subtract(source, other)).max() <= 2 and 2 * abs(h - other_h) < 1:
+                    seen[row, column] = ends[0]
+
+
+def test_a_round_thing_in_a_layer_lets_nothing_of_the_picture_through() -> None:
+    """Its blur grows from pixel to pixel, so that points of the pupil see it drawn apart; one grey is one grey all the same."""
+    y, x = np.indices((96, 208))  # two blocks
+    radius_px = np.hypot(x - 150, y - 48)
+    lens, alpha = Lens(50.0, 1.4, 1.0, 2.8), (radius_px < 44).astype(np.float32)
+    ball_m = np.where(alpha > 0, 1.12 - 0.2 * np.sqrt(np.maximum(0.0, 1.0 - (radius_px / 44.0) ** 2)), np.inf).astype(np.float32)
+    squares = np.random.default_rng(0).uniform(0.0, 2.0, (24, 52, 3)).repeat(4, axis=0).repeat(4, axis=1).astype(np.float32)
+    picture = opaque(squares, np.full((96, 208), 6.0, np.float32))
+    seen = RIMS.render([Layer(0.3 * np.repeat(alpha[..., None], 3, axis=2), alpha, ball_m), picture], lens)
+    blur_px = np.abs(lens.coc_px(ball_m[alpha > 0], 208)).max()
+    assert 8.0 < blur_px < 15.0
+    off = np.abs(seen.rgb[radius_px < 41 - blur_px / 2] - 0.3).max(axis=1)
+    assert np.quantile(off, 0.97) < 0.005 and off.max() < 0.02
 
 
 def _starts(there: np.ndarray) -> np.ndarray:
