@@ -86,7 +86,11 @@ def photograph_plate(photo: Path, photograph: Photograph, phone: PhonePhoto | No
         return replace(plate, focus_known=held.focus_known, view_known=held.view_known, rough_focus_m=held.rough_focus_m)
     original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
     stated = wishes.lens is not None or wishes.focus_m is not None or photograph.focus_distance_m is not None
-    guessed = [] if phone.focus is None else [phone.focus.note * (not stated), phone.focus.blur_note * bool(held.blur_from)]
+    guessed = (
+        []
+        if phone.focus is None
+        else [phone.focus.note * (not stated), phone.focus.blur_note * (held.blur_from != "" and not wishes.facts)]
+    )
     note = "; ".join(each for each in (f"{photo}: {phone.depth.note}", *guessed) if each)
     deep = with_depth(plate, photo, DepthSettings(exact=wishes.exact_depth))
     deep = replace(deep, metres_guessed=not phone.has_unit, slopes_known=phone.has_unit)
@@ -128,8 +132,14 @@ def held_lens(photo: Path, photograph: Photograph, phone: PhonePhoto | None, wis
         guess(f"{photo} does not tell its lens, which is guessed: {guesses}" if guesses else "")
         focus_known = focus_m is not None or photograph.focus_distance_m is not None
         photograph = photograph if focus_known else replace(photograph, focus_distance_m=float("inf"))
-    if lens is None and not wishes.facts and phone is not None and phone.focus is not None and phone.focus.blur_at_infinity is not None:
-        photograph, blur_from = _with_the_phones_blur(photograph, phone.focus, photo), "the phone's own blur"
+    portrait = None if lens is not None or phone is None or phone.focus is None or phone.focus.blur_at_infinity is None else phone.focus
+    if portrait is not None and not wishes.facts:
+        photograph, blur_from = _with_the_phones_blur(photograph, portrait, photo), "the phone's own blur"
+    elif portrait is not None and portrait.f_number is not None and wishes.facts.keys() == {"f_number"}:
+        own, wished = _with_the_phones_blur(photograph, portrait, photo), wishes.facts["f_number"]
+        assert own.f_number is not None
+        photograph = replace(own, f_number=own.f_number * wished / portrait.f_number)
+        blur_from = f"blur of full frame at f/{wished:g} in place of the phone's, at f/{portrait.f_number:g}"
     elif phone is not None and phone.focus is not None and photograph.focus_distance_m is None:
         photograph = replace(photograph, focus_distance_m=phone.focus.focus_distance_m)
     lens = photograph.lens(photo, focus_m) if lens is None else lens_for_photograph(lens, photograph, photo)

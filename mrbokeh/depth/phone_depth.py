@@ -271,8 +271,9 @@ def _apple_focus(depth: DepthMap, found: AppleDepth, path: Path) -> PhoneFocus |
     px_per_dioptre = _portrait_blur(found, tags, size_px)
     if px_per_dioptre is None:
         return PhoneFocus(1.0 / dioptres, None, note)
-    blur_note = f"its blur is taken for that of full frame at f/{float(found.xmp[_BLUR + 'SimulatedAperture']):g}, as its file tells"
-    return PhoneFocus(1.0 / dioptres, px_per_dioptre * dioptres / (2.0 * max(size_px)), note, blur_note)
+    f_number = float(found.xmp[_BLUR + "SimulatedAperture"])
+    blur_note = f"its blur is taken for that of full frame at f/{f_number:g}, as its file tells"
+    return PhoneFocus(1.0 / dioptres, px_per_dioptre * dioptres / (2.0 * max(size_px)), note, blur_note, f_number)
 
 
 def _facts(path: Path) -> tuple[dict[int, Any], tuple[int, int], int]:

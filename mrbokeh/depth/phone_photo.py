@@ -13,13 +13,15 @@ class PhoneFocus:
     """Focus of a phone's photograph, as GFocus states it or guessed.
 
     focus_distance_m: in the unit of the depth. blur_at_infinity: RADIUS of the blur at infinity over the longer side of the picture; None
-    if the phone put none on. note, blur_note: what of the focus and of the blur is guessed, for people.
+    if the phone put none on. f_number: at which full frame has that blur, if the file tells. note, blur_note: what of the focus and of the
+    blur is guessed, for people.
     """
 
     focus_distance_m: float
     blur_at_infinity: float | None
     note: str = ""
     blur_note: str = ""
+    f_number: float | None = None
 
     def coc_px_per_dioptre(self, width_px: int, height_px: int) -> float:
         """Return c_inf d_f, by which coc = c_inf (1 - d_f / d) grows for each dioptre away from the focus. Only where the phone blurred."""

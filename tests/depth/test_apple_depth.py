@@ -175,7 +175,10 @@ def test_composite_takes_depth_lens_and_blur_from_the_file(tmp_path: Path) -> No
     assert told.lens.focus_distance_m == 0.5 and "guessed from" not in told.depth_note
     sharp = open_plate(heic(tmp_path / "q.heic", xmp_of(), rendered=0))
     assert not sharp.blur_from and (sharp.lens.focal_length_mm, sharp.lens.f_number) == (5.7, 1.5), "the lens of its Exif"
-    assert open_plate(path, facts={"f_number": 1.8}).lens.f_number == 1.8
+    wider = open_plate(path, facts={"f_number": 1.4})
+    assert wider.lens.coc_px_per_dioptre(128) == pytest.approx(2.0 * plate.lens.coc_px_per_dioptre(128)), "the file says f/2.8"
+    assert "full frame at f/1.4" in wider.blur_from and "f/2.8" not in wider.depth_note
+    assert open_plate(path, facts={"f_number": 1.8, "focal_length_mm": 5.7}).lens.f_number == 1.8
     assert open_sharp(path, None, DepthSettings()).focus_m == pytest.approx(0.25, rel=0.02)
     assert open_depth(path, plate.rgb, DepthSettings(near_far_m=(1.0, 2.0))).depth_m.min() == pytest.approx(1.0, rel=0.02)
 
