@@ -14,7 +14,7 @@ from jaxtyping import Float32
 from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
-from mrbokeh.system.errors import InputError
+from mrbokeh.system.errors import InputError, require_file
 
 File = str | Path
 Rgb = Float32[np.ndarray, "height width 3"]
@@ -25,6 +25,7 @@ def read_picture(path: File) -> Rgb:
     """Read a photograph (RAW, JPEG, TIFF, PNG, WebP, HEIC, EXR, HDR), upright, as linear Rec.709 (H, W, 3) of float32; white is 1."""
     from mrbokeh.stacks.photograph import read_photograph
 
+    require_file(path, "a photograph")
     return read_photograph(path).rgb
 
 
@@ -95,7 +96,7 @@ def composite(
     from mrbokeh.compositing.plate import plate_of
     from mrbokeh.depth.depth_map import DepthSettings
     from mrbokeh.depth.mended_depth import mended_aloud
-    from mrbokeh.images.image_io import read_layer
+    from mrbokeh.images.image_io import read_layer, require_alpha
 
     known_lens, spreads = _optics(lens, renderer)
     focus_m = None if focus is None or isinstance(focus, tuple) else focus_in_numbers(focus)[0]
@@ -123,6 +124,9 @@ def composite(
         raise InputError(
             "inserted: expected a GLB file, a layer or several of them; an array becomes one by mrbokeh.Layer(rgb, alpha, depth_m)"
         )
+    for each in given:
+        if isinstance(each, Layer):
+            require_alpha("inserted", each.alpha)
     glbs = [Path(each) for each in given if not isinstance(each, Layer) and Path(each).suffix.lower() == ".glb"]
     pixels = np.zeros((0, 2)) if at_pixel is None else np.atleast_2d(at_pixel)
     if pixels.ndim != 2 or pixels.shape[1] != 2:

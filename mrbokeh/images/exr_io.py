@@ -15,6 +15,9 @@ from mrbokeh.system.errors import InputError
 Channels = dict[str, Float[np.ndarray, "height width"]]
 
 
+_MAGIC = b"\x76\x2f\x31\x01"
+
+
 @dataclass(frozen=True)
 class ExrPart:
     """Picture of an EXR file: one part with its channels.
@@ -52,6 +55,9 @@ def read_exr(path: Path | str, *, overscan: bool = False) -> list[ExrPart]:
 
     if not Path(path).is_file():
         raise InputError(f"expected an EXR file at {path}, but there is none")
+    with open(path, "rb") as file:
+        if (begins := file.read(4)) and begins != _MAGIC:
+            raise InputError(f"{path} cannot be read as EXR: its first bytes are of another kind of file; render or convert it to EXR")
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             is_deep = any(part.type() in (OpenEXR.deepscanline, OpenEXR.deeptile) for part in file.parts)

@@ -114,7 +114,11 @@ def require_suffix(path: Path | str, suffixes: tuple[str, ...], what: str) -> No
 
 def write_image(path: Path | str, rgb: Float[np.ndarray, "height width 3"], encoding: Encoding = "srgb", *, half: bool = True) -> None:
     """Write scene-linear RGB. EXR keeps it (half or float); PNG and TIFF store 16 bit, JPEG 8 bit, clipped to [0, 1]."""
-    suffix = Path(path).suffix.lower()
+    suffix, kind = Path(path).suffix.lower(), np.asarray(rgb).dtype
+    if kind.kind != "f":
+        raise InputError(
+            f"{path}: expected linear light as numbers with a fraction, white at 1, got {kind}: read_picture makes them of a file"
+        )
     if suffix == ".exr":
         dtype = np.float16 if half else np.float32
         write_exr(path, ExrPart({name: rgb[..., i].astype(dtype) for i, name in enumerate("RGB")}))
@@ -177,8 +181,8 @@ LARGEST_ALPHA_ERROR = 0.1
 
 
 def require_alpha(path: Path | str, alpha: Float32[np.ndarray, "height width"]) -> None:
-    """Raise InputError if alpha lies outside of 0 to 1 by more than a filter's overshoot."""
-    if alpha.min(initial=0.0) < -LARGEST_ALPHA_ERROR or alpha.max(initial=0.0) > 1.0 + LARGEST_ALPHA_ERROR:
+    """Raise InputError if alpha is NaN, or outside of 0 to 1 by more than a filter's overshoot."""
+    if not (alpha.min(initial=0.0) >= -LARGEST_ALPHA_ERROR and alpha.max(initial=0.0) <= 1.0 + LARGEST_ALPHA_ERROR):
         raise InputError(f"{path}: expected alpha from 0 to 1, but A goes from {alpha.min():g} to {alpha.max():g}")
 
 

@@ -3,6 +3,7 @@
 import runpy
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -117,6 +118,10 @@ def test_merge_takes_arrays_and_keeps_the_stack_where_asked(tmp_path: Path) -> N
         (lambda rgb, z: mb.render(rgb, np.nan * z, LENS), "no pixel has any"),
         (lambda rgb, z: mb.render(rgb, 1e-4 * z, LENS), "times the picture"),
         (lambda rgb, _: mb.composite(rgb, [], LENS), "expected a GLB file, a layer"),
+        (lambda rgb, _: mb.composite(rgb, replace(ball(), alpha=255 * ball().alpha), LENS), "expected alpha from 0 to 1"),
+        (lambda rgb, _: mb.composite(rgb, replace(ball(), alpha=np.nan * ball().alpha), LENS), "expected alpha from 0 to 1"),
+        (lambda *_: mb.read_picture("none.jpg"), "expected a photograph at none.jpg"),
+        (lambda rgb, _: mb.composite(rgb, Path(__file__).parents[2] / "README.md", LENS), "first bytes are of another kind"),
         (lambda rgb, _: mb.composite(rgb, ball(), LENS, mode="infront"), "mode: expected one of front, over"),
         (lambda rgb, _: mb.composite(rgb, "cake.glb", LENS), "at_pixel: on which pixel"),
         (lambda rgb, z: mb.render(rgb, z, LENS, renderer=Path("none.onnx")), "none.onnx"),
@@ -138,6 +143,7 @@ rgb, depth_m, lens = np.full((4, 6, 3), 0.5), np.full((4, 6), 2.0), mb.Lens(50, 
 for call in (
     lambda: mb.composite(rgb, 5, lens), lambda: mb.composite(rgb, np.array(5), lens), lambda: mb.merge(5),
     lambda: mb.render(rgb, {}, lens), lambda: mb.render(rgb, depth_m, lens, renderer=5),
+    lambda: mb.write_image("w.png", np.zeros((4, 6, 3), np.uint8)),
 ):
     try:
         call()
@@ -149,7 +155,7 @@ for call in (
 def test_arguments_of_a_wrong_type_are_refused_in_one_sentence_too() -> None:
     """In a process of its own: in this one the annotations refuse them first."""
     told = subprocess.run([sys.executable, "-c", OF_WRONG_TYPE], capture_output=True, text=True, cwd=ROOT)
-    assert told.stdout.split() == ["inserted:", "inserted:", "photographs:", "depth_m:", "renderer:"], told.stderr
+    assert told.stdout.split() == ["inserted:", "inserted:", "photographs:", "depth_m:", "renderer:", "w.png:"], told.stderr
 
 
 def test_the_public_names_are_listed_and_say_what_they_are() -> None:
