@@ -74,6 +74,8 @@ def test_the_gallery_is_made_by_the_commands_and_what_a_check_finds_is_its_resul
     assert [each.name for each in demo.iterdir()] == ["report.html"]
     broken = Entry(title="b", commands=("mrbokeh lens show none.json --out b.png",), caption="", picture=Path("b.jpg"), shows="b.png")
     refused(r"(?s)ended with 2.*none\.json", build, out, [broken], demo)
+    quick = Entry(title="q", commands=("mrbokeh demo --quick --no-such-option",), caption="", picture=Path("q.jpg"), shows="q.png")
+    refused("ended with 2", build, out, [quick], demo)  # it was run: only the whole demo is done already
 
 
 def test_pictures_stand_side_by_side_long_sheets_are_cut_and_linear_ones_shown_as_light(tmp_path: Path) -> None:
