@@ -16,7 +16,9 @@ from functools import cache
 from importlib import import_module
 from pathlib import Path
 from threading import enumerate as threads
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import Mock
 
 import aiohttp
 import numpy as np
@@ -40,8 +42,9 @@ from tests.support.phone_on_camera import PHONE
 from tests.support.refusals import refused
 from tests.support.renderer_banks import bank_folder
 from tests.support.thin_lens_board import Shot, camera_over, display_bgr, photograph
+from viewfinder.app.live_compositor import LiveCompositor
 from viewfinder.app.opening import read_lenses, renderers_of
-from viewfinder.app.running import opened
+from viewfinder.app.running import Preparing, opened
 from viewfinder.cli import app, board_command
 from viewfinder.frames import CameraFrame
 from viewfinder.options import TrackingOptions, ViewfinderOptions
@@ -332,6 +335,23 @@ def test_the_guide_names_every_option() -> None:
     options = {option for parameter in group.params for option in parameter.opts if option.startswith("--")}
     missing = {option for option in options - {"--help", "--renderer"} if option not in text}
     assert not missing, missing
+
+
+def test_a_busy_machine_has_frames_and_not_only_seconds_to_show_its_scene(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After the scene is drawn: 5 seconds and 100 frames without anything virtual, then nobody waits for it any longer."""
+    now_s = 0.0
+    monkeypatch.setattr("time.monotonic", lambda: now_s)
+    compositor = Mock(spec=LiveCompositor, overlays=SimpleNamespace(status=SimpleNamespace(busy=True)), last=None)
+    preparing = Preparing(compositor)
+    now_s = 60.0
+    assert preparing(), "it is still drawn"
+    compositor.overlays.status.busy = False
+    for _ in range(100):
+        now_s += 1.0
+        compositor.last = SimpleNamespace(overlay=SimpleNamespace(rgb=np.zeros((0, 0, 3))))
+        assert preparing() and preparing()
+    compositor.last = SimpleNamespace(overlay=SimpleNamespace(rgb=np.zeros((0, 0, 3))))
+    assert not preparing()
 
 
 @pytest.mark.usefixtures("in_folder")

@@ -250,22 +250,26 @@ def running(parts: Parts) -> Iterator[Viewfinder]:
         yield Viewfinder(pipeline, compositor, site, parts.webcam)
 
 
-_UNASKED_S = 5.0
+_UNASKED_S, _UNASKED_FRAMES = 5.0, 100
 
 
 class Preparing:
     """Whether frames are composited before anybody watches: until the scene is shown, while it is drawn and for seconds after that.
 
-    What is done once, such as loading kernels, is done then when the page is opened. A camera that is not tracked is not waited for.
+    What is done once, such as loading kernels, is done then when the page is opened. A camera that is not tracked is not waited for; on a
+    busy machine, where seconds are few frames, it has some frames to be tracked in.
     """
 
     def __init__(self, compositor: LiveCompositor) -> None:
         self._compositor, self._until_s = compositor, time.monotonic() + _UNASKED_S
+        self._last, self._frames = compositor.last, 0
 
     def __call__(self) -> bool:
         if self._compositor.overlays.status.busy:
-            self._until_s = time.monotonic() + _UNASKED_S
-        return not is_shown(self._compositor) and time.monotonic() < self._until_s
+            self._until_s, self._frames = time.monotonic() + _UNASKED_S, 0
+        self._frames += self._compositor.last is not self._last
+        self._last = self._compositor.last
+        return not is_shown(self._compositor) and (time.monotonic() < self._until_s or self._frames <= _UNASKED_FRAMES)
 
 
 def is_shown(compositor: LiveCompositor) -> bool:
