@@ -273,7 +273,7 @@ def _apple_focus(depth: DepthMap, found: AppleDepth, path: Path) -> PhoneFocus |
         return PhoneFocus(1.0 / dioptres, None, note)
     f_number = float(found.xmp[_BLUR + "SimulatedAperture"])
     blur_note = f"its blur is taken for that of full frame at f/{f_number:g}, as its file tells"
-    return PhoneFocus(1.0 / dioptres, px_per_dioptre * dioptres / (2.0 * max(size_px)), note, blur_note, f_number)
+    return PhoneFocus(1.0 / dioptres, px_per_dioptre * dioptres / (2.0 * max(size_px)), note, blur_note=blur_note, f_number=f_number)
 
 
 def _facts(path: Path) -> tuple[dict[int, Any], tuple[int, int], int]:
