@@ -20,7 +20,7 @@ WIDTH_PX, HEIGHT_PX = 160, 107
 SLICES = 6
 FOCUS_M = tuple(float(each) for each in 1.0 / np.linspace(1.0 / 0.65, 1.0 / 2.05, SLICES))
 LENS = Lens(35.0, 1.0, FOCUS_M[0], 23.5, Aperture.disc())
-SAMPLES = 25
+SAMPLES = 32
 
 
 @dataclass(frozen=True)
