@@ -86,11 +86,8 @@ def photograph_plate(photo: Path, photograph: Photograph, phone: PhonePhoto | No
         return replace(plate, focus_known=held.focus_known, view_known=held.view_known, rough_focus_m=held.rough_focus_m)
     original = phone.original_rgb if phone.original_rgb is not None and phone.original_rgb.shape == plate.rgb.shape else None
     stated = wishes.lens is not None or wishes.focus_m is not None or photograph.focus_distance_m is not None
-    guessed = (
-        []
-        if phone.focus is None
-        else [phone.focus.note * (not stated), phone.focus.blur_note * (held.blur_from != "" and not wishes.facts)]
-    )
+    own_blur = held.blur_from == _OWN_BLUR
+    guessed = [] if phone.focus is None else [phone.focus.note * (not stated), phone.focus.blur_note * own_blur]
     note = "; ".join(each for each in (f"{photo}: {phone.depth.note}", *guessed) if each)
     deep = with_depth(plate, photo, DepthSettings(exact=wishes.exact_depth))
     deep = replace(deep, metres_guessed=not phone.has_unit, slopes_known=phone.has_unit)
@@ -134,7 +131,7 @@ def held_lens(photo: Path, photograph: Photograph, phone: PhonePhoto | None, wis
         photograph = photograph if focus_known else replace(photograph, focus_distance_m=float("inf"))
     portrait = None if lens is not None or phone is None or phone.focus is None or phone.focus.blur_at_infinity is None else phone.focus
     if portrait is not None and not wishes.facts:
-        photograph, blur_from = _with_the_phones_blur(photograph, portrait, photo), "the phone's own blur"
+        photograph, blur_from = _with_the_phones_blur(photograph, portrait, photo), _OWN_BLUR
     elif portrait is not None and portrait.f_number is not None and wishes.facts.keys() == {"f_number"}:
         own, wished = _with_the_phones_blur(photograph, portrait, photo), wishes.facts["f_number"]
         assert own.f_number is not None
@@ -161,6 +158,7 @@ def _require_no_panorama(photo: Path, photograph: Photograph) -> None:
         _log.warning(f"{photo} of {width_px}x{height_px} px is shaped as a panorama, for which its lens would be wrong: {advice}")
 
 
+_OWN_BLUR = "the phone's own blur"
 _GPANO = "{http://ns.google.com/photos/1.0/panorama/}"
 _PANORAMIC = 2.2
 

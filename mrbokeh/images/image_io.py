@@ -166,8 +166,9 @@ def stored_depth(path: Path | str, *, or_grey: bool = False) -> Float32[np.ndarr
     """
     channels = {name: pixels for part in reversed(read_exr(path)) for name, pixels in part.channels.items()}
     of_layers = sorted(name for name in channels if name.lower().endswith("depth.z"))
-    is_grey = set("RGB") <= channels.keys() <= set("RGBA") and all(np.array_equal(channels["R"], channels[each]) for each in "GB")
-    names = [*_LONE_DEPTH_NAMES, *(of_layers if len(of_layers) == 1 else ()), *("R" if or_grey and is_grey else "")]
+    is_colour = or_grey and set("RGB") <= channels.keys() <= set("RGBA")
+    is_grey = is_colour and all(np.array_equal(channels["R"], channels[each]) for each in "GB")
+    names = [*_LONE_DEPTH_NAMES, *(of_layers if len(of_layers) == 1 else ()), *("R" if is_grey else "")]
     name = next((name for name in names if name in channels), None)
     if name is None:
         one = f"one channel of depth, but it has {' and '.join(of_layers)}: write the one that is meant as Z"
