@@ -34,8 +34,9 @@ RESIDUAL_REACH_PX = 24.0
 """A residual counts fully where the blur is that of its slice, and 1/e where the circle of confusion differs by this."""
 RESIDUAL_LIGHT, RESIDUAL_LIGHT_REACH_PX = 0.95, 4.0
 """Share of white: what is brighter, in the slice or as rendered, is of lights, whose discs change with the focus: it reaches less far."""
-RESIDUAL_WHITE = 0.98
-"""Share of white: what a slice shows brighter was not measured, so that it can only tell that rendering is too dark."""
+RESIDUAL_WHITE, RESIDUAL_MEASURED = 0.98, 0.85
+"""Shares of white: what a slice shows brighter than the first was not measured, so that it can only tell that rendering is too dark.
+Down to the second that holds less and less: a border between what is believed and what is not would be seen as stairs."""
 RESIDUAL_BLUR, RESIDUAL_LARGEST_BLUR_PX = 0.85, 2.0
 """Detail of a residual finer than this share of the difference in blur, 2 px at most, is not carried over: it is noise or another's."""
 
@@ -121,10 +122,11 @@ class Refocusing:
         rendered = self.rendered(float(self._captured(None)[index]))
         residual = np.where(masks.valid[..., None], captured - rendered, np.float32(0.0))
         peak = captured.max(axis=2)
-        full = (masks.saturated | (peak >= RESIDUAL_WHITE))[..., None]
         light = (masks.saturated | (np.maximum(peak, rendered.max(axis=2)) >= RESIDUAL_LIGHT))[..., None]
-        at_lights = np.where(full, np.maximum(residual, np.float32(0.0)), residual)
-        return captured, np.where(light, np.float32(0.0), residual), np.where(light, at_lights, np.float32(0.0))
+        white = self.stack.slices[index].metadata.get("saturation_level") or 1.0
+        measured = np.clip((RESIDUAL_WHITE - peak / np.float32(white)) / np.float32(RESIDUAL_WHITE - RESIDUAL_MEASURED), 0.0, 1.0)[..., None]
+        residual = np.where(residual < 0.0, residual * measured, residual)
+        return captured, np.where(light, np.float32(0.0), residual), np.where(light, residual, np.float32(0.0))
 
     def _sharp(self) -> Layer:
         return opaque(self.stack.all_in_focus(), self.stack.depth_m())

@@ -78,6 +78,8 @@ def merge_aloud(
     with kept_when_interrupted(f"finished stacks are kept in {scene}", overwrite):
         stacks = merge_scene(scene, overwrite, registration, prefer)
     new = {each.folder for each in before}
+    if not new:
+        say(f"all of {scene} was merged before and stays as it is (--overwrite merges it again)")
     for stack in stacks:
         if prefer is not None and preferred_side(stack) != prefer:
             say(f"{stack.folder} was merged before, without --prefer {prefer}: --overwrite merges it again")

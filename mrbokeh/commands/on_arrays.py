@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import NoneType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float32
@@ -15,6 +16,9 @@ from mrbokeh.images.layer import Layer, opaque
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.base import Renderer
 from mrbokeh.system.errors import InputError, require_file
+
+if TYPE_CHECKING:
+    from mrbokeh.commands._composite_options import ObjectOptions
 
 File = str | Path
 Rgb = Float32[np.ndarray, "height width 3"]
@@ -88,20 +92,34 @@ def composite(
 
     >>> picture = mrbokeh.composite("scene/desk", "cake.glb", slice_index=2, at_pixel=(600, 420), height="120px")
     """
-    from mrbokeh.commands._composite_layers import held_upright, layers_by, standing_on_pixel
-    from mrbokeh.commands._composite_options import CompositeOptions, ObjectOptions
+    from mrbokeh.commands._composite_layers import layers_by, standing_on_pixel
+    from mrbokeh.commands._composite_options import CompositeOptions
+    from mrbokeh.commands._composited import placed
     from mrbokeh.compositing.choose import best_mode, insertion_of
-    from mrbokeh.compositing.ground import with_ground_behind
+    from mrbokeh.compositing.ground import with_ground_behind, without_specks
     from mrbokeh.compositing.open_plate import open_plate, with_depth
     from mrbokeh.compositing.plate import plate_of
     from mrbokeh.depth.depth_map import DepthSettings
     from mrbokeh.depth.mended_depth import mended_aloud
     from mrbokeh.images.image_io import read_layer, require_alpha
 
+    given = [inserted] if isinstance(inserted, (Layer, str, Path)) else list(inserted) if np.iterable(inserted) else []
+    if not given or not all(isinstance(each, (Layer, str, Path)) for each in given):
+        raise InputError(
+            "inserted: expected a GLB file, a layer or several of them; an array becomes one by mrbokeh.Layer(rgb, alpha, depth_m)"
+        )
+    for each in given:
+        if isinstance(each, Layer):
+            require_alpha("inserted", each.alpha)
+    glbs = [Path(each) for each in given if not isinstance(each, Layer) and Path(each).suffix.lower() == ".glb"]
+    standing = _standing(glbs, at_pixel, height)
+    if glbs and len(glbs) < len(given):
+        raise InputError("inserted: expected GLB files or layers, got some of both: put one into the picture of the other")
+    options = CompositeOptions(Path(photo) if isinstance(photo, (str, Path)) else Path("array"), standing=standing)
     known_lens, spreads = _optics(lens, renderer)
     focus_m = None if focus is None or isinstance(focus, tuple) else focus_in_numbers(focus)[0]
     if isinstance(photo, (str, Path)):
-        plate = open_plate(Path(photo), slice_index, known_lens, focus_m, exact_depth=exact_depth)
+        plate = open_plate(Path(photo), slice_index, known_lens, focus_m, guessing=options.guesses_ground, exact_depth=exact_depth)
     elif known_lens is None:
         raise InputError("a photograph as an array does not tell its lens: give lens, such as mrbokeh.Lens(focal_length_mm=50, f_number=2)")
     else:
@@ -115,38 +133,40 @@ def composite(
         mends = not exact_depth and surface_m.shape == seen_rgb.shape[:2]
         plate = replace(plate, depth_m=mended_aloud(surface_m, seen_rgb) if mends else surface_m)
         plate = replace(plate, depth_confidence=None, depth_error_dioptres=0.0)
-    if isinstance(focus, tuple):
-        if plate.depth_m is None:
-            raise InputError("to focus on a pixel the photograph needs depth: give depth_m, or focus in metres")
+    if plate.depth_m is None and (isinstance(focus, tuple) or (at_pixel is not None and not glbs)):
+        asked = "to focus on a pixel" if isinstance(focus, tuple) else "to put layers onto a pixel"
+        raise InputError(f"{asked} the photograph needs depth: give depth_m{', or focus in metres' if isinstance(focus, tuple) else ''}")
+    if isinstance(focus, tuple) and plate.depth_m is not None:
         plate = replace(plate, lens=_focused(plate.lens, focus, plate.depth_m))
-    given = [inserted] if isinstance(inserted, (Layer, str, Path)) else list(inserted) if np.iterable(inserted) else []
-    if not given or not all(isinstance(each, (Layer, str, Path)) for each in given):
-        raise InputError(
-            "inserted: expected a GLB file, a layer or several of them; an array becomes one by mrbokeh.Layer(rgb, alpha, depth_m)"
-        )
-    for each in given:
-        if isinstance(each, Layer):
-            require_alpha("inserted", each.alpha)
-    glbs = [Path(each) for each in given if not isinstance(each, Layer) and Path(each).suffix.lower() == ".glb"]
+    if glbs:
+        plate, options = placed(plate, options)
+        layers = layers_by(options, plate)(plate)
+    else:
+        layers = [each if isinstance(each, Layer) else read_layer(each) for each in given]
+        layers = standing_on_pixel(layers, plate, *standing.first_px) if standing.at_pixel else layers
+    if options.standing.at_pixel:
+        plate = without_specks(with_ground_behind(plate, standing.pixels, layers), layers)
+    return insertion_of(mode or best_mode(plate), exact_depth=exact_depth).insert(plate, layers, spreads).rgb
+
+
+def _standing(
+    glbs: list[Path],
+    at_pixel: tuple[float, float] | Sequence[tuple[float, float]] | None,
+    height: float | str | Sequence[float | str] | None,
+) -> "ObjectOptions":
+    """Return where objects stand as the command takes it. Raises InputError where a GLB has no place."""
+    from mrbokeh.commands._composite_options import ObjectOptions
+
     pixels = np.zeros((0, 2)) if at_pixel is None else np.atleast_2d(at_pixel)
     if pixels.ndim != 2 or pixels.shape[1] != 2:
         raise InputError(f"at_pixel: expected (x, y), or one for each GLB, got {at_pixel!r}")
-    at_pixels = [f"{x_px},{y_px}" for x_px, y_px in pixels.tolist()]
-    heights = [] if height is None else np.atleast_1d(height).tolist()
-    standing = ObjectOptions(object_=glbs, at_pixel=at_pixels, height=[str(each) for each in heights])
-    if glbs and not at_pixels:
+    if glbs and not len(pixels):
         raise InputError("at_pixel: on which pixel (x, y) does the object stand? Give one for each GLB")
+    heights = [] if height is None else np.atleast_1d(height).tolist()
+    at_pixels = [f"{x_px},{y_px}" for x_px, y_px in pixels.tolist()]
+    standing = ObjectOptions(object_=glbs, at_pixel=at_pixels, height=[str(each) for each in heights])
     standing.require_places()
-    if glbs and len(glbs) < len(given):
-        raise InputError("inserted: expected GLB files or layers, got some of both: put one into the picture of the other")
-    if glbs:
-        layers = layers_by(CompositeOptions(Path(), standing=standing), held_upright(plate, standing))(plate)
-    else:
-        layers = [each if isinstance(each, Layer) else read_layer(each) for each in given]
-        layers = standing_on_pixel(layers, plate, *standing.first_px) if at_pixels else layers
-    if at_pixels:
-        plate = with_ground_behind(plate, standing.pixels, layers)
-    return insertion_of(mode or best_mode(plate), exact_depth=exact_depth).insert(plate, layers, spreads).rgb
+    return standing
 
 
 def _rgb(given: np.ndarray | File, name: str) -> Rgb:
@@ -162,7 +182,7 @@ def _rgb(given: np.ndarray | File, name: str) -> Rgb:
 
 
 def _depth_of(given: np.ndarray | File, *, with_holes: bool) -> Plane:
-    from mrbokeh.images.image_io import read_depth
+    from mrbokeh.images.image_io import doubt_metres, read_depth
 
     if isinstance(given, (str, Path)):
         return read_depth(given, with_holes=with_holes)
@@ -172,6 +192,7 @@ def _depth_of(given: np.ndarray | File, *, with_holes: bool) -> Plane:
         raise InputError(f"depth_m: expected metres of shape (height, width), inf where nothing is, got shape {depth_m.shape} or NaN in it")
     if not (depth_m > 0).any():
         raise InputError("depth_m: expected metres above 0 somewhere, but no pixel has any")
+    doubt_metres("depth_m", depth_m)
     return np.where((depth_m > 0) | np.isnan(depth_m), depth_m, np.float32(np.inf))
 
 

@@ -18,7 +18,7 @@ from mrbokeh.depth.depth_map import DepthMap, DepthSettings, StereoCalibration, 
 from mrbokeh.depth.mended_depth import mended_aloud
 from mrbokeh.depth.phone_depth import read_phone_photo
 from mrbokeh.images.color import linear_to_srgb
-from mrbokeh.images.image_io import read_depth, stored_depth
+from mrbokeh.images.image_io import doubt_metres, read_depth, stored_depth
 from mrbokeh.images.picture_codec import stored_pixels
 from mrbokeh.optics.camera import have_same_shape
 from mrbokeh.system.atomic_files import read_json
@@ -193,6 +193,7 @@ def read_number_map(path: Path, settings: DepthSettings) -> DepthMap:
     if settings.metres_per_unit is not None:
         known = numbers > 0  # inf is background
         depth_m = np.where(known, numbers * np.float32(settings.metres_per_unit), np.inf).astype(np.float32)
+        doubt_metres(path, depth_m)
         return DepthMap(depth_m, known, f"{path.name}, {settings.metres_per_unit:g} m per step")
     if settings.near_far_m is None:
         raise InputError(

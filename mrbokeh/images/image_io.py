@@ -20,6 +20,7 @@ from mrbokeh.images.heif import HEIF_SUFFIXES
 from mrbokeh.images.layer import Layer
 from mrbokeh.images.picture_codec import Encoding, codes_of, linear_from_codes, stored_pixels, stored_rgb, write_stored
 from mrbokeh.system.errors import InputError, require_file
+from mrbokeh.system.messages import warn
 
 
 def require_numbers(path: Path | str, planes: Mapping[str, np.ndarray]) -> None:
@@ -39,6 +40,16 @@ def require_depth_ahead(path: Path | str, name: str, stored: np.ndarray) -> None
             f"{path}: {name} is negative ({float(stored.min()):g} to {float(stored.max()):g}): expected distances ahead of the camera "
             f"as positive numbers, so turn the sign"
         )
+
+
+_HARDLY_METRES = 100.0
+
+
+def doubt_metres(path: Path | str, depth_m: np.ndarray) -> None:
+    """Warn where nothing is nearer than 100 m: such depth is in millimetres more often than in metres."""
+    nearest_m = float(np.min(depth_m, initial=np.inf, where=depth_m > 0))
+    if _HARDLY_METRES <= nearest_m < np.inf:
+        warn(f"nothing in {path} is nearer than {nearest_m:.4g} m: is its depth in metres? If it is in millimetres, divide it by 1000")
 
 
 WIDEST_PX = 320
@@ -156,6 +167,7 @@ def read_depth(path: Path | str, *, with_holes: bool = False) -> Float32[np.ndar
         raise InputError(f"{path}: {int(np.isnan(depth_m).sum())} pixels of depth are NaN: write inf (or 0) where there is background")
     if not (depth_m > 0).any():
         raise InputError(f"{path}: expected metres above 0 in its depth, but the largest is {depth_m.max():g}: is it depth along the axis?")
+    doubt_metres(path, depth_m)
     return np.where((depth_m > 0) | np.isnan(depth_m), depth_m, np.float32(np.inf))
 
 
@@ -222,6 +234,7 @@ def write_layer(path: Path | str, layer: Layer, *, half: bool = True, objects: E
     channels |= {"A": layer.alpha.astype(colour), "Z": layer.depth_m.astype(np.float32)}
     for name, values in layer.extra.items():
         channels |= {name if values.shape[2] == 1 else f"{name}.{i}": values[..., i] for i in range(values.shape[2])}
+    require_suffix(path, (".exr",), "a layer")
     comments = "premultiplied alpha; Z in metres along the optical axis, not antialiased"
     attributes = {"comments": comments, **STATED_REC709, **(objects.attributes if objects else {})}
     write_exr(path, ExrPart(channels | (objects.channels if objects else {}), attributes=attributes))

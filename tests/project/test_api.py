@@ -85,6 +85,23 @@ def test_composite_knows_the_best_mode_and_where_layers_stand() -> None:
     assert not np.array_equal(mb.composite(photo, ball(), LENS, focus=(50, 20), **known), between)
 
 
+def test_an_object_stands_on_a_photograph_without_depth_as_by_the_command(tmp_path: Path) -> None:
+    photo = tmp_path / "photo.exr"
+    mb.write_image(photo, picture_and_depth()[0])
+    cake = ROOT / "mrbokeh/demo_data/objects/cakeBirthday.glb"
+    picture = mb.composite(photo, cake, at_pixel=(30, 32), height="20px")
+    words = ("--object", cake, "--at-pixel", "30,32", "--height", "20px", "--out", tmp_path / "command.exr")
+    assert "there is no depth: mrbokeh takes the camera" in mrbokeh("composite", photo, *words).stdout
+    np.testing.assert_allclose(mb.read_picture(tmp_path / "command.exr"), picture, rtol=2e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize(("factor", "told"), [(1.0, False), (1000.0, True)])
+def test_depth_in_millimetres_is_doubted(factor: float, told: bool, capsys: pytest.CaptureFixture[str]) -> None:
+    picture, depth_m = picture_and_depth()
+    mb.render(picture, factor * depth_m, LENS)
+    assert ("is its depth in metres?" in capsys.readouterr().err) == told
+
+
 def test_merge_takes_arrays_and_keeps_the_stack_where_asked(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     near, far = (np.repeat(np.repeat(rng.uniform(0.05, 0.6, (48, 64, 3)), 2, 0), 2, 1).astype(np.float32) for _ in range(2))
@@ -97,6 +114,8 @@ def test_merge_takes_arrays_and_keeps_the_stack_where_asked(tmp_path: Path) -> N
     # Each half is that of the slice focused on it; slices differ from the truth in the other half by 0.1 and more.
     assert np.abs(left - truth[8:-8, 8:50]).mean() < 0.01 and np.abs(right - truth[8:-8, 78:-8]).mean() < 0.01
     assert merged.folder is not None and len(mb.read_focal_stack(merged.folder)) == 3 and not merged.metres_known
+    with pytest.raises(mb.InputError, match="expected a new folder, but .* is merged already"):
+        mb.merge(slices[:2], tmp_path / "scene")
     again = mb.merge(slices)
     assert again.folder is None
     np.testing.assert_array_equal(again.all_in_focus, merged.all_in_focus)
@@ -114,6 +133,8 @@ def test_merge_takes_arrays_and_keeps_the_stack_where_asked(tmp_path: Path) -> N
         (lambda rgb, z: mb.render(rgb, z, "no_such_lens.json"), "no_such_lens.json"),
         (lambda rgb, _: mb.composite(rgb, ball()), "does not tell its lens"),
         (lambda rgb, _: mb.composite(rgb, ball(), LENS, focus=(3, 3)), "needs depth"),
+        (lambda rgb, _: mb.composite(rgb, ball(), LENS, at_pixel=(3, 3)), "onto a pixel the photograph needs depth: give depth_m"),
+        (lambda rgb, z: mb.write_layer("layer.png", ball()), "a name that ends in .exr, got layer.png"),
         (lambda rgb, _: mb.composite(rgb[:30], ball(), LENS), "60x30"),
         (lambda rgb, z: mb.render(rgb, np.nan * z, LENS), "no pixel has any"),
         (lambda rgb, z: mb.render(rgb, 1e-4 * z, LENS), "times the picture"),

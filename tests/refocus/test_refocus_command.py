@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -131,6 +132,24 @@ def test_residuals_hold_the_light_that_an_all_in_focus_picture_lost(tmp_path: Pa
     write_camera_rgb(captured.all_in_focus_path, np.minimum(stack.all_in_focus(), 1.0), None, half=False)
     for left_out in leave_one_out(captured, ScatterReference(threads=1)):
         assert left_out.with_residuals_db > left_out.rendered_db + 6.0
+
+
+def test_pixels_beside_full_photosites_are_believed_as_far_as_they_were_measured(tmp_path: Path) -> None:
+    """The stack is cut at 0.8, its masks reach 3 px farther than what is full, and its all-in-focus picture is a quarter too bright."""
+    stack = card_stack(tmp_path / "stack")
+    for each in stack.slices:
+        cut = np.minimum(read_camera_rgb(stack.folder / each.path), np.float32(0.8))
+        mask = cv2.dilate((cut.max(axis=2) >= 0.8).astype(np.uint8), np.ones((7, 7), np.uint8)) > 0
+        write_camera_rgb(stack.folder / each.path, cut, None, saturated=mask, half=False)
+    write_camera_rgb(stack.all_in_focus_path, 1.25 * stack.all_in_focus(), None, half=False)
+    slices = tuple(replace(each, metadata={"saturation_level": 0.8}) for each in stack.slices)
+    way = Refocusing(replace(stack, slices=slices), ScatterReference(threads=1))
+    beside, captured, marked = way.slice_at(0.5502), stack.slice_rgb(1), stack.slice_masks(1).saturated
+    peak = captured.max(axis=2)
+    measured, full = marked & (peak < 0.85 * 0.8), peak >= 0.8
+    assert measured.sum() > 100 and full.sum() > 20
+    assert np.abs(way.rendered(0.5502) - captured)[measured].mean() > 0.05
+    assert np.abs(beside - captured)[measured].max() < 0.01 and (beside[full] > captured[full] - 0.01).all()
 
 
 @pytest.mark.slow

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32
 
 from mrbokeh.images.exr_io import Channels, ExrPart, in_rec709, read_exr, stated_primaries
-from mrbokeh.images.image_io import require_alpha, require_depth_ahead, require_numbers
+from mrbokeh.images.image_io import doubt_metres, require_alpha, require_depth_ahead, require_numbers
 from mrbokeh.images.layer import Layer
 from mrbokeh.layering.motion import with_motion
 from mrbokeh.system.errors import InputError
@@ -240,4 +240,5 @@ def layer_of(render: RenderChannels) -> Layer:
     require_depth_ahead(render.path, depth_name, render.plane(depth_name)[is_seen])
     require_numbers(render.path, {depth_name: depth_m})
     is_there = is_seen & (depth_m > 0) & (depth_m < BACKGROUND_FROM)
+    doubt_metres(render.path, depth_m[is_there])
     return Layer(rgb, alpha, np.where(is_there, depth_m, np.float32(np.inf)))
