@@ -105,16 +105,16 @@ if tests.checked is not None:
 
 
 def pytest_collection() -> None:
-    """Import test modules from the last to the first in every second worker.
+    """Import test modules from the last to the first in the second worker, and from the middle on in the third.
 
-    In a fresh clone each is compiled, and that is kept: two workers that went the same way at once would both compile everything.
+    In a fresh clone each is compiled, and that is kept: workers that went the same way at once would all compile everything.
     What is imported stays: Python need not look through it for waste, now and after each test.
     """
     gc.disable()
-    if os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:] in ("1", "3", "5", "7"):
-        for path in sorted((ROOT / "tests").glob("*/test_*.py"), reverse=True):
-            with contextlib.suppress(pytest.skip.Exception, Exception):  # told when the file is collected
-                importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))
+    paths, worker = sorted((ROOT / "tests").glob("*/test_*.py")), int(os.environ.get("PYTEST_XDIST_WORKER", "gw0")[2:]) % 3
+    for path in ([], paths[::-1], paths[len(paths) // 2 :])[worker]:
+        with contextlib.suppress(pytest.skip.Exception, Exception):  # told when the file is collected
+            importlib.import_module(".".join(path.relative_to(ROOT).with_suffix("").parts))
 
 
 def pytest_collection_finish() -> None:
@@ -142,8 +142,8 @@ LONG_FILES = (
     "training/test_fast_export.py",
     "training/test_export_onnx.py",
 )
-"""Files with tests or fixtures of many seconds, in a fresh clone: they begin, in turn with one worker and the other. The first two compile
-most kernels, and not the same ones, so that no worker waits for a kernel of the other."""
+"""Files with tests or fixtures of many seconds, in a fresh clone: they begin, in turn with one worker and the next. The first two compile
+most kernels, and not the same ones, so that no worker waits for a kernel of another."""
 
 
 @pytest.hookimpl(trylast=True)  # once those that do not run are left out
