@@ -225,13 +225,17 @@ def test_a_walk_is_matchmoved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize(
     ("name", "kind", "least_fitting"),
     [
-        pytest.param("nikon_d90_chart.avi", FLAT, 0.8, id="over-a-chart"),
+        pytest.param("nikon_d90_chart.avi", FLAT, 0.7, id="over-a-chart"),
         pytest.param("iphone_xr_chart.mov", FLAT, 0.8, id="hardly-moving"),
         pytest.param("ducks_720p.mp4", TURNING, 0.15, id="over-water"),
     ],
 )
 def test_clips_that_hardly_move_are_solved(shared_data: Path, tmp_path: Path, name: str, kind: str, least_fitting: float) -> None:
-    """Real clips, all of whose frames come out within 1 px. On the pond most of what is followed is water and ducks."""
+    """Real clips, all of whose frames come out within 1 px. On the pond most of what is followed is water and ducks.
+
+    The D90 looks at its chart face on, and its shutter rolls: a plane tilted by 36 degrees, through a lens of two and a half times the
+    focal length, takes that for perspective, and explains 85 % of the features; the one face on, which is true, 74 %.
+    """
     pytest.importorskip("pycolmap")
     path = shared_data / "video" / name
     if not path.is_file():
@@ -239,3 +243,7 @@ def test_clips_that_hardly_move_are_solved(shared_data: Path, tmp_path: Path, na
     solve = matchmove_clip(path, tmp_path / "work").solve
     assert solve.kind == kind and solve.lost == () and solve.residual_px < 1.0
     assert np.median([each.fitting for each in solve.fits.values()]) > least_fitting
+    if kind == FLAT:
+        points, middle = solve.model.points, solve.model.views[len(solve.model.views) // 2].camera.camera_from_world
+        normal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][2]
+        assert abs((middle[:3, :3] @ normal)[2]) > np.cos(np.radians(10.0)), "both charts are seen face on"
