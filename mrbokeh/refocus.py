@@ -123,8 +123,8 @@ class Refocusing:
         residual = np.where(masks.valid[..., None], captured - rendered, np.float32(0.0))
         peak = captured.max(axis=2)
         light = (masks.saturated | (np.maximum(peak, rendered.max(axis=2)) >= RESIDUAL_LIGHT))[..., None]
-        white = self.stack.slices[index].metadata.get("saturation_level") or 1.0
-        measured = np.clip((RESIDUAL_WHITE - peak / np.float32(white)) / np.float32(RESIDUAL_WHITE - RESIDUAL_MEASURED), 0.0, 1.0)[..., None]
+        white = np.float32(self.stack.slices[index].metadata.get("saturation_level") or 1.0)
+        measured = np.clip((RESIDUAL_WHITE - peak[..., None] / white) / np.float32(RESIDUAL_WHITE - RESIDUAL_MEASURED), 0.0, 1.0)
         residual = np.where(residual < 0.0, residual * measured, residual)
         return captured, np.where(light, np.float32(0.0), residual), np.where(light, residual, np.float32(0.0))
 

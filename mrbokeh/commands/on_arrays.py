@@ -81,6 +81,9 @@ def composite(
 ) -> Rgb:
     """Put virtual objects into a photograph, blurred by its lens, before and behind what it shows; return linear Rec.709 (H, W, 3).
 
+    Where a GLB stands on a pixel, what the photograph does not tell (its lens, its ground, the object's light) is guessed, and said, as
+    by the command.
+
     photo: (H, W, 3) linear, a photograph's file, or the folder of a merged focal stack with the slice_index to put it into.
     inserted: GLB files, or sharp layers (Layer or EXR with R, G, B, A and Z in metres) of the photograph's size, front first.
     lens, renderer, exact_depth: as in `render`; None takes what the file or the stack tells. focus: metres, or a pixel (x, y); needs depth.

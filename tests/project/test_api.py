@@ -114,7 +114,7 @@ def test_merge_takes_arrays_and_keeps_the_stack_where_asked(tmp_path: Path) -> N
     # Each half is that of the slice focused on it; slices differ from the truth in the other half by 0.1 and more.
     assert np.abs(left - truth[8:-8, 8:50]).mean() < 0.01 and np.abs(right - truth[8:-8, 78:-8]).mean() < 0.01
     assert merged.folder is not None and len(mb.read_focal_stack(merged.folder)) == 3 and not merged.metres_known
-    with pytest.raises(mb.InputError, match="expected a new folder, but .* is merged already"):
+    with pytest.raises(mb.InputError, match=r"expected a new folder, but .* is merged already"):
         mb.merge(slices[:2], tmp_path / "scene")
     again = mb.merge(slices)
     assert again.folder is None
@@ -134,7 +134,7 @@ def test_merge_takes_arrays_and_keeps_the_stack_where_asked(tmp_path: Path) -> N
         (lambda rgb, _: mb.composite(rgb, ball()), "does not tell its lens"),
         (lambda rgb, _: mb.composite(rgb, ball(), LENS, focus=(3, 3)), "needs depth"),
         (lambda rgb, _: mb.composite(rgb, ball(), LENS, at_pixel=(3, 3)), "onto a pixel the photograph needs depth: give depth_m"),
-        (lambda rgb, z: mb.write_layer("layer.png", ball()), "a name that ends in .exr, got layer.png"),
+        (lambda *_: mb.write_layer("layer.png", ball()), "a name that ends in .exr, got layer.png"),
         (lambda rgb, _: mb.composite(rgb[:30], ball(), LENS), "60x30"),
         (lambda rgb, z: mb.render(rgb, np.nan * z, LENS), "no pixel has any"),
         (lambda rgb, z: mb.render(rgb, 1e-4 * z, LENS), "times the picture"),
