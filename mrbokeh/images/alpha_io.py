@@ -11,7 +11,7 @@ from jaxtyping import Float32
 
 from mrbokeh.images.color_management import NamedSpace
 from mrbokeh.images.exif import AS_STORED, upright
-from mrbokeh.images.exr_io import ATTRIBUTE, INTEROP_ID, INTEROP_IDS, SPACE_NAME, STATED_REC709, ExrPart, read_exr, write_exr
+from mrbokeh.images.exr_io import ATTRIBUTE, INTEROP_ID, INTEROP_IDS, SPACE_NAME, STATED_REC709, ExrPart, headers_of, read_exr, write_exr
 from mrbokeh.images.image_io import INTEGER_SUFFIXES, write_image
 from mrbokeh.images.picture_codec import codes_of, even_codes, stored_pixels, write_stored
 
@@ -53,6 +53,8 @@ def coverage_with(plate_alpha: Plane, virtual_alpha: Plane) -> Plane:
 def _stored(path: Path) -> Plane | None:
     suffix = path.suffix.lower()
     if suffix == ".exr":
+        if not any(channel.name == "A" for header in headers_of(path) for channel in header["channels"]):
+            return None
         parts = [part for part in read_exr(path) if set("RGBA") <= part.channels.keys()]
         return parts[0].stacked("A")[..., 0] if parts else None
     if suffix not in HOLDING_ALPHA:
