@@ -3,6 +3,7 @@
 What may be an array may be the path of a file too. Every error a caller can mend is an `InputError`.
 """
 
+import os
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -104,21 +105,11 @@ def composite(
     from mrbokeh.compositing.plate import plate_of
     from mrbokeh.depth.depth_map import DepthSettings
     from mrbokeh.depth.mended_depth import mended_aloud
-    from mrbokeh.images.image_io import read_layer, require_alpha
+    from mrbokeh.images.image_io import read_layer
 
-    given = [inserted] if isinstance(inserted, (Layer, str, Path)) else list(inserted) if np.iterable(inserted) else []
-    if not given or not all(isinstance(each, (Layer, str, Path)) for each in given):
-        raise InputError(
-            "inserted: expected a GLB file, a layer or several of them; an array becomes one by mrbokeh.Layer(rgb, alpha, depth_m)"
-        )
-    for each in given:
-        if isinstance(each, Layer):
-            require_alpha("inserted", each.alpha)
-    glbs = [Path(each) for each in given if not isinstance(each, Layer) and Path(each).suffix.lower() == ".glb"]
+    glbs, given = _glbs_or_layers(inserted)
     standing = _standing(glbs, at_pixel, height)
-    if glbs and len(glbs) < len(given):
-        raise InputError("inserted: expected GLB files or layers, got some of both: put one into the picture of the other")
-    options = CompositeOptions(Path(photo) if isinstance(photo, (str, Path)) else Path("array"), standing=standing)
+    options = CompositeOptions(Path(photo) if isinstance(photo, (str, Path)) else Path(os.devnull), standing=standing)
     known_lens, spreads = _optics(lens, renderer)
     focus_m = None if focus is None or isinstance(focus, tuple) else focus_in_numbers(focus)[0]
     if isinstance(photo, (str, Path)):
@@ -140,7 +131,7 @@ def composite(
         asked = "to focus on a pixel" if isinstance(focus, tuple) else "to put layers onto a pixel"
         raise InputError(f"{asked} the photograph needs depth: give depth_m{', or focus in metres' if isinstance(focus, tuple) else ''}")
     if isinstance(focus, tuple) and plate.depth_m is not None:
-        plate = replace(plate, lens=_focused(plate.lens, focus, plate.depth_m))
+        plate = replace(plate, lens=_focused(plate.lens, focus, plate.depth_m), focus_known=True)
     if glbs:
         plate, options = placed(plate, options)
         layers = layers_by(options, plate)(plate)
@@ -150,6 +141,24 @@ def composite(
     if options.standing.at_pixel:
         plate = without_specks(with_ground_behind(plate, standing.pixels, layers), layers)
     return insertion_of(mode or best_mode(plate), exact_depth=exact_depth).insert(plate, layers, spreads).rgb
+
+
+def _glbs_or_layers(inserted: Layer | File | Sequence[Layer | File]) -> tuple[list[Path], list[Layer | File]]:
+    """Return (GLB files, layers), one of which is empty. Raises InputError for anything else, or some of both."""
+    from mrbokeh.images.image_io import require_alpha
+
+    given = [inserted] if isinstance(inserted, (Layer, str, Path)) else list(inserted) if np.iterable(inserted) else []
+    if not given or not all(isinstance(each, (Layer, str, Path)) for each in given):
+        raise InputError(
+            "inserted: expected a GLB file, a layer or several of them; an array becomes one by mrbokeh.Layer(rgb, alpha, depth_m)"
+        )
+    for each in given:
+        if isinstance(each, Layer):
+            require_alpha("inserted", each.alpha)
+    glbs = [Path(each) for each in given if not isinstance(each, Layer) and Path(each).suffix.lower() == ".glb"]
+    if glbs and len(glbs) < len(given):
+        raise InputError("inserted: expected GLB files or layers, got some of both: put one into the picture of the other")
+    return glbs, [] if glbs else given
 
 
 def _standing(

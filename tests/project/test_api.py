@@ -95,6 +95,16 @@ def test_an_object_stands_on_a_photograph_without_depth_as_by_the_command(tmp_pa
     np.testing.assert_allclose(mb.read_picture(tmp_path / "command.exr"), picture, rtol=2e-3, atol=1e-3)
 
 
+def test_the_focus_that_is_given_stays_where_the_photograph_tells_none(tmp_path: Path) -> None:
+    """The object stands at 2 m; the lens that is guessed blurs it by a fraction of a pixel where it is focused at 0.8 m."""
+    photo, (picture, depth_m) = tmp_path / "photo.exr", picture_and_depth()
+    mb.write_image(photo, picture)
+    cake = ROOT / "mrbokeh/demo_data/objects/cakeBirthday.glb"
+    seen = [mb.composite(photo, cake, depth_m=depth_m, at_pixel=(20, 32), height="20px", focus=each) for each in ((50, 20), 0.8, (20, 32))]
+    np.testing.assert_allclose(seen[0], seen[1], atol=1e-5)
+    assert np.abs(seen[0] - seen[2]).max() > 1e-3
+
+
 @pytest.mark.parametrize(("factor", "told"), [(1.0, False), (1000.0, True)])
 def test_depth_in_millimetres_is_doubted(factor: float, told: bool, capsys: pytest.CaptureFixture[str]) -> None:
     picture, depth_m = picture_and_depth()

@@ -1,7 +1,8 @@
 """Match-move: drawn rooms with true cameras. COLMAP itself runs in the slow tests only."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from capture.cli import app
 from capture.matchmove import clip_matchmove
 from capture.matchmove.clip_matchmove import MatchmoveSettings, matchmove_clip
-from capture.matchmove.clip_solve import FLAT, TURNING, begin_solving
+from capture.matchmove.clip_solve import FLAT, TURNING, ClipSolve, begin_solving
 from capture.matchmove.ground import GroundPicks, Ruler, on_ground, parse_frame_distance, parse_ground, parse_ruler, ruler_scale
 from capture.matchmove.keyframes import chosen_keyframes, motion_of_clip
 from capture.matchmove.space_solve import off_px, poses_between, rotation_only_residual_px
@@ -221,29 +222,48 @@ def test_a_walk_is_matchmoved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     refused("say with --ground", printed_by, app, "matchmove", clip, "--out", tmp_path / "track.json", "--keyframes", 8, *picks[2:])
 
 
+@pytest.fixture(scope="module")
+def solved_clip(shared_data: Path, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], ClipSolve]:
+    """Give the solve of a real clip, made once."""
+
+    @cache
+    def solved(name: str) -> ClipSolve:
+        pytest.importorskip("pycolmap")
+        path = shared_data / "video" / name
+        if not path.is_file():
+            pytest.skip(f"video/{name} is not in the shared test data")
+        return matchmove_clip(path, tmp_path_factory.mktemp("matchmove") / "work").solve
+
+    return solved
+
+
+ROLLING = (
+    "since a plane seen face on goes before a tilted one, 74 %: the shutter rolls, which a plane tilted by 36 degrees through a lens of "
+    "two and a half times the focal length takes for perspective, and explains 85 %"
+)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "kind", "least_fitting"),
+    ("name", "least_fitting"),
     [
-        pytest.param("nikon_d90_chart.avi", FLAT, 0.7, id="over-a-chart"),
-        pytest.param("iphone_xr_chart.mov", FLAT, 0.8, id="hardly-moving"),
-        pytest.param("ducks_720p.mp4", TURNING, 0.15, id="over-water"),
+        pytest.param("nikon_d90_chart.avi", 0.8, id="over-a-chart", marks=pytest.mark.xfail(strict=True, reason=ROLLING)),
+        pytest.param("iphone_xr_chart.mov", 0.8, id="hardly-moving"),
+        pytest.param("ducks_720p.mp4", 0.15, id="over-water"),
     ],
 )
-def test_clips_that_hardly_move_are_solved(shared_data: Path, tmp_path: Path, name: str, kind: str, least_fitting: float) -> None:
-    """Real clips, all of whose frames come out within 1 px. On the pond most of what is followed is water and ducks.
+def test_most_of_what_rests_is_explained(solved_clip: Callable[[str], ClipSolve], name: str, least_fitting: float) -> None:
+    """On the pond most of what is followed is water and ducks."""
+    assert np.median([each.fitting for each in solved_clip(name).fits.values()]) > least_fitting
 
-    The D90 looks at its chart face on, and its shutter rolls: a plane tilted by 36 degrees, through a lens of two and a half times the
-    focal length, takes that for perspective, and explains 85 % of the features; the one face on, which is true, 74 %.
-    """
-    pytest.importorskip("pycolmap")
-    path = shared_data / "video" / name
-    if not path.is_file():
-        pytest.skip(f"video/{name} is not in the shared test data")
-    solve = matchmove_clip(path, tmp_path / "work").solve
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "kind"), [("nikon_d90_chart.avi", FLAT), ("iphone_xr_chart.mov", FLAT), ("ducks_720p.mp4", TURNING)])
+def test_clips_that_hardly_move_are_solved(solved_clip: Callable[[str], ClipSolve], name: str, kind: str) -> None:
+    """Real clips, all of whose frames come out within 1 px; both charts are seen face on."""
+    solve = solved_clip(name)
     assert solve.kind == kind and solve.lost == () and solve.residual_px < 1.0
-    assert np.median([each.fitting for each in solve.fits.values()]) > least_fitting
     if kind == FLAT:
         points, middle = solve.model.points, solve.model.views[len(solve.model.views) // 2].camera.camera_from_world
         normal = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][2]
-        assert abs((middle[:3, :3] @ normal)[2]) > np.cos(np.radians(10.0)), "both charts are seen face on"
+        assert abs((middle[:3, :3] @ normal)[2]) > np.cos(np.radians(10.0))
