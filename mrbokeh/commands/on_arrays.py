@@ -131,7 +131,9 @@ def composite(
         asked = "to focus on a pixel" if isinstance(focus, tuple) else "to put layers onto a pixel"
         raise InputError(f"{asked} the photograph needs depth: give depth_m{', or focus in metres' if isinstance(focus, tuple) else ''}")
     if isinstance(focus, tuple) and plate.depth_m is not None:
-        plate = replace(plate, lens=_focused(plate.lens, focus, plate.depth_m), focus_known=True)
+        focused = _focused(plate.lens, focus, plate.depth_m)
+        camera = plate.camera if options.photo.is_dir() else plate_of(plate.rgb, focused).camera
+        plate = replace(plate, lens=focused, camera=camera, focus_known=True)
     if glbs:
         plate, options = placed(plate, options)
         layers = layers_by(options, plate)(plate)
