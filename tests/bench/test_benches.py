@@ -1,6 +1,8 @@
 """Benchmarks are run by hand: that they still find what they measure is asked of them with the tests."""
 
 import json
+import os
+import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -52,9 +54,21 @@ def test_a_part_that_takes_too_long_keeps_its_rows(monkeypatch: pytest.MonkeyPat
 
 
 def test_the_viewfinder_benchmark_says_nothing_of_a_run_that_says_nothing() -> None:
-    assert bench_viewfinder.refusal([12.0, 11.0], 0) is None
-    for draws_per_s, compiled, word in (([9.0, 10.5], 0, "9.8 times"), ([], 0, "0.0 times"), ([30.0], 2, "2 kernels")):
-        assert word in str(bench_viewfinder.refusal(draws_per_s, compiled))
+    assert bench_viewfinder.refusal([7.0, 8.0], 0.05, 0) is None
+    for draws_per_s, others, compiled, word in (([9.0], 0.3, 0, "30 % of a core"), ([], 0.0, 0, "never"), ([30.0], 0.0, 2, "2 kernels")):
+        assert word in str(bench_viewfinder.refusal(draws_per_s, others, compiled))
+
+
+def test_what_another_program_takes_of_the_machine_is_seen_and_the_viewers_are_not_taken_for_it() -> None:
+    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as spinning:
+        counted, not_counted = bench_viewfinder.Spent(), bench_viewfinder.Spent()
+        not_counted.begin(spinning.pid)
+        counted.begin(os.getpid())
+        time.sleep(0.5)
+        counted.end()
+        not_counted.end()
+        spinning.kill()
+    assert counted.others - not_counted.others > 0.2
 
 
 def test_outcomes_are_read_of_what_pytest_prints_alone_and_with_several_workers() -> None:

@@ -1,4 +1,4 @@
-"""How much processor time each thread of this process spends, as Linux counts it."""
+"""How much processor time threads, processes and the whole machine spend, as Linux counts it."""
 
 import os
 import threading
@@ -33,8 +33,27 @@ def _ticks() -> dict[int, int]:
     found = {}
     for path in Path("/proc/self/task").glob("*/stat"):
         try:
-            after_name = path.read_text().rpartition(")")[2].split()
+            found[int(path.parent.name)] = _spent(path)
         except OSError:
             continue
-        found[int(path.parent.name)] = int(after_name[11]) + int(after_name[12])
     return found
+
+
+def _spent(stat: Path) -> int:
+    after_name = stat.read_text().rpartition(")")[2].split()
+    return int(after_name[11]) + int(after_name[12])
+
+
+def process_s(process: int) -> float:
+    """Return the user and system time of a process with all its threads, 0 where there is no /proc."""
+    stat = Path(f"/proc/{process}/stat")
+    return _spent(stat) / _TICKS_PER_S if stat.is_file() else 0.0
+
+
+def machine_s() -> float:
+    """Return the time in which the cores were not idle, all together, with what a host took away; 0 where there is no /proc."""
+    stat = Path("/proc/stat")
+    if not stat.is_file():
+        return 0.0
+    user, nice, system, _, _, interrupts, soft, stolen = map(int, stat.read_text().split()[1:9])
+    return (user + nice + system + interrupts + soft + stolen) / _TICKS_PER_S
