@@ -78,9 +78,7 @@ def refusal(draws_per_s: Sequence[float], others: float, compiled: int) -> str |
     if not any(draws_per_s):
         return "the object was never drawn"
     if others > LARGEST_OTHERS:
-        return (
-            f"other programs took {100 * others:.0f} % of a core, expected at most {100 * LARGEST_OTHERS:.0f} %: stop them"
-        )
+        return f"other programs took {100 * others:.0f} % of a core, expected at most {100 * LARGEST_OTHERS:.0f} %: stop them"
     return None
 
 
