@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float32
 
 from capture.merging.merge import merge_stack
-from capture.merging.retouch import stacks_before
 from capture.stacks.grouping import Grouping
 from capture.stacks.ingest import IngestSettings, ingest
 from mrbokeh.images.image_io import write_image
+from mrbokeh.stacks.focal_stack import FILE_NAME
 from mrbokeh.system.errors import InputError
 
 Plane = Float32[np.ndarray, "height width"]
@@ -40,7 +40,7 @@ def merge(photographs: str | Path | Sequence[str | Path | np.ndarray], out: str 
     """Merge photographs of one scene at several focus distances, in any order, from a tripod or by hand.
 
     photographs: a folder, or files (RAW, TIFF, PNG, JPEG, EXR), or linear arrays (H, W, 3) of one size. out: a new folder to keep the
-    FocalStack in. Raises InputError if they do not make one stack, or if out holds a merged one.
+    FocalStack in. Raises InputError if they do not make one stack, or if out holds one.
 
     >>> merged = mrbokeh.merge("desk/")
     """
@@ -49,9 +49,10 @@ def merge(photographs: str | Path | Sequence[str | Path | np.ndarray], out: str 
     else:
         given = list(photographs) if np.iterable(photographs) else []
         _require_several(given, photographs)
-    before = [] if out is None else [each.folder for each in stacks_before(Path(out)) if each.merged]
-    if before:
-        raise InputError(f"out: expected a new folder, but {before[0]} is merged already: read it (read_focal_stack), or give another")
+    if out is not None and Path(out).exists() and not Path(out).is_dir():
+        raise InputError(f"out: expected the name of a folder, but {out} is a file: give another")
+    if out is not None and (before := sorted(Path(out).rglob(FILE_NAME))):
+        raise InputError(f"out: expected a new folder, but {before[0].parent} is a stack: read it (read_focal_stack), or give another")
     with TemporaryDirectory() as temporary, nullcontext(temporary) if out is None else nullcontext(str(out)) as scene:
         files = [_file_of(each, Path(temporary) / "arrays", index) for index, each in enumerate(given)]
         report = ingest(files, Path(scene), IngestSettings(Grouping.none))

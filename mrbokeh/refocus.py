@@ -121,10 +121,10 @@ class Refocusing:
         masks, captured = self.stack.slice_masks(index), self.stack.slice_rgb(index)
         rendered = self.rendered(float(self._captured(None)[index]))
         residual = np.where(masks.valid[..., None], captured - rendered, np.float32(0.0))
-        peak = captured.max(axis=2)
-        light = (masks.saturated | (np.maximum(peak, rendered.max(axis=2)) >= RESIDUAL_LIGHT))[..., None]
-        white = np.float32(self.stack.slices[index].metadata.get("saturation_level") or 1.0)
-        measured = np.clip((RESIDUAL_WHITE - peak[..., None] / white) / np.float32(RESIDUAL_WHITE - RESIDUAL_MEASURED), 0.0, 1.0)
+        white = np.float32(self.stack.slices[index].metadata.get("saturation_level") or 1.0)  # of a full grey; colours differ from it
+        peak = captured.max(axis=2) / white
+        light = (masks.saturated | (np.maximum(peak, rendered.max(axis=2) / white) >= RESIDUAL_LIGHT))[..., None]
+        measured = np.clip((RESIDUAL_WHITE - peak[..., None]) / np.float32(RESIDUAL_WHITE - RESIDUAL_MEASURED), 0.0, 1.0)
         residual = np.where(residual < 0.0, residual * measured, residual)
         return captured, np.where(light, np.float32(0.0), residual), np.where(light, residual, np.float32(0.0))
 

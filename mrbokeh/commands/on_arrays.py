@@ -25,6 +25,9 @@ File = str | Path
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 
+_NO_FILE = Path(os.devnull)
+"""A photograph that is an array."""
+
 
 def read_picture(path: File) -> Rgb:
     """Read a photograph (RAW, JPEG, TIFF, PNG, WebP, HEIC, EXR, HDR), upright, as linear Rec.709 (H, W, 3) of float32; white is 1."""
@@ -83,7 +86,7 @@ def composite(
     """Put virtual objects into a photograph, blurred by its lens, before and behind what it shows; return linear Rec.709 (H, W, 3).
 
     Where a GLB stands on a pixel, what the photograph does not tell (its lens, its ground, the object's light) is guessed, and said, as
-    by the command.
+    by the command; options that its words name are the command's. What only a screen shows (grain, compression) is not put on.
 
     photo: (H, W, 3) linear, a photograph's file, or the folder of a merged focal stack with the slice_index to put it into.
     inserted: GLB files, or sharp layers (Layer or EXR with R, G, B, A and Z in metres) of the photograph's size, front first.
@@ -96,28 +99,32 @@ def composite(
 
     >>> picture = mrbokeh.composite("scene/desk", "cake.glb", slice_index=2, at_pixel=(600, 420), height="120px")
     """
-    from mrbokeh.commands._composite_layers import layers_by, standing_on_pixel
-    from mrbokeh.commands._composite_options import CompositeOptions
-    from mrbokeh.commands._composited import placed
-    from mrbokeh.compositing.choose import best_mode, insertion_of
+    from mrbokeh.commands._composite_layers import standing_on_pixel
+    from mrbokeh.commands._composite_options import CompositeOptions, PlateOptions
+    from mrbokeh.commands._composited import composited, insertion_by, placed
+    from mrbokeh.commands._insertion_options import VirtualOptions
     from mrbokeh.compositing.ground import with_ground_behind, without_specks
     from mrbokeh.compositing.open_plate import open_plate, with_depth
     from mrbokeh.compositing.plate import plate_of
+    from mrbokeh.compositing.plate_look.finishing import Finishing
     from mrbokeh.depth.depth_map import DepthSettings
     from mrbokeh.depth.mended_depth import mended_aloud
     from mrbokeh.images.image_io import read_layer
 
     glbs, given = _glbs_or_layers(inserted)
     standing = _standing(glbs, at_pixel, height)
-    options = CompositeOptions(Path(photo) if isinstance(photo, (str, Path)) else Path(os.devnull), standing=standing)
+    file, taken = Path(photo) if isinstance(photo, (str, Path)) else _NO_FILE, PlateOptions(exact_depth=exact_depth)
+    options = CompositeOptions(file, taken, VirtualOptions(mode=mode), standing)
     known_lens, spreads = _optics(lens, renderer)
     focus_m = None if focus is None or isinstance(focus, tuple) else focus_in_numbers(focus)[0]
-    if isinstance(photo, (str, Path)):
-        plate = open_plate(Path(photo), slice_index, known_lens, focus_m, guessing=options.guesses_ground, exact_depth=exact_depth)
+    if file is not _NO_FILE:
+        plate = open_plate(file, slice_index, known_lens, focus_m, guessing=options.guesses_ground, exact_depth=exact_depth)
+    elif slice_index is not None:
+        raise InputError(f"slice_index: expected the folder of a focal stack as photo, got an array and slice {slice_index}: leave it out")
     elif known_lens is None:
         raise InputError("a photograph as an array does not tell its lens: give lens, such as mrbokeh.Lens(focal_length_mm=50, f_number=2)")
     else:
-        plate = plate_of(_rgb(photo, "photo"), known_lens if focus_m is None else known_lens.focused_at(focus_m))
+        plate = plate_of(_rgb(np.asarray(photo), "photo"), known_lens if focus_m is None else known_lens.focused_at(focus_m))
     if all_in_focus is not None:
         plate = replace(plate, sharp_rgb=_rgb(all_in_focus, "all_in_focus"))
     if isinstance(depth_m, (str, Path)):
@@ -127,27 +134,28 @@ def composite(
         mends = not exact_depth and surface_m.shape == seen_rgb.shape[:2]
         plate = replace(plate, depth_m=mended_aloud(surface_m, seen_rgb) if mends else surface_m)
         plate = replace(plate, depth_confidence=None, depth_error_dioptres=0.0)
+    if depth_m is not None:  # in place of a phone's own
+        plate = replace(plate, depth_note="", metres_guessed=plate.metres_guessed and file.is_dir())
     if plate.depth_m is None and (isinstance(focus, tuple) or (at_pixel is not None and not glbs)):
         asked = "to focus on a pixel" if isinstance(focus, tuple) else "to put layers onto a pixel"
         raise InputError(f"{asked} the photograph needs depth: give depth_m{', or focus in metres' if isinstance(focus, tuple) else ''}")
     if isinstance(focus, tuple) and plate.depth_m is not None:
         focused = _focused(plate.lens, focus, plate.depth_m)
-        camera = plate.camera if options.photo.is_dir() else plate_of(plate.rgb, focused).camera
-        plate = replace(plate, lens=focused, camera=camera, focus_known=True)
+        camera = plate.camera if file.is_dir() else plate_of(plate.rgb, focused).camera
+        plate = replace(plate, lens=focused, camera=camera, focus_known=True, rough_focus_m=None)
     if glbs:
         plate, options = placed(plate, options)
-        layers = layers_by(options, plate)(plate)
-    else:
-        layers = [each if isinstance(each, Layer) else read_layer(each) for each in given]
-        layers = standing_on_pixel(layers, plate, *standing.first_px) if standing.at_pixel else layers
-    if options.standing.at_pixel:
+        return composited(plate, options, spreads, Finishing(), asked=standing).inserted.rgb
+    layers = [each if isinstance(each, Layer) else read_layer(each) for each in given]
+    if standing.at_pixel:
+        layers = standing_on_pixel(layers, plate, *standing.first_px)
         plate = without_specks(with_ground_behind(plate, standing.pixels, layers), layers)
-    return insertion_of(mode or best_mode(plate), exact_depth=exact_depth).insert(plate, layers, spreads).rgb
+    return insertion_by(options, plate)[1].insert(plate, layers, spreads).rgb
 
 
 def _glbs_or_layers(inserted: Layer | File | Sequence[Layer | File]) -> tuple[list[Path], list[Layer | File]]:
     """Return (GLB files, layers), one of which is empty. Raises InputError for anything else, or some of both."""
-    from mrbokeh.images.image_io import require_alpha
+    from mrbokeh.images.image_io import require_alpha, require_numbers
 
     given = [inserted] if isinstance(inserted, (Layer, str, Path)) else list(inserted) if np.iterable(inserted) else []
     if not given or not all(isinstance(each, (Layer, str, Path)) for each in given):
@@ -156,6 +164,7 @@ def _glbs_or_layers(inserted: Layer | File | Sequence[Layer | File]) -> tuple[li
         )
     for each in given:
         if isinstance(each, Layer):
+            require_numbers("inserted", {"rgb of a layer": each.rgb, "depth_m of a layer": each.depth_m})
             require_alpha("inserted", each.alpha)
     glbs = [Path(each) for each in given if not isinstance(each, Layer) and Path(each).suffix.lower() == ".glb"]
     if glbs and len(glbs) < len(given):
@@ -168,19 +177,23 @@ def _standing(
     at_pixel: tuple[float, float] | Sequence[tuple[float, float]] | None,
     height: float | str | Sequence[float | str] | None,
 ) -> "ObjectOptions":
-    """Return where objects stand as the command takes it. Raises InputError where a GLB has no place."""
+    """Return where objects stand as the command takes it. Raises InputError unless each GLB has a place."""
     from mrbokeh.commands._composite_options import ObjectOptions
 
     pixels = np.zeros((0, 2)) if at_pixel is None else np.atleast_2d(at_pixel)
     if pixels.ndim != 2 or pixels.shape[1] != 2:
         raise InputError(f"at_pixel: expected (x, y), or one for each GLB, got {at_pixel!r}")
+    heights = [] if height is None else np.atleast_1d(height).tolist()
     if glbs and not len(pixels):
         raise InputError("at_pixel: on which pixel (x, y) does the object stand? Give one for each GLB")
-    heights = [] if height is None else np.atleast_1d(height).tolist()
+    if len(pixels) != len(glbs) and (glbs or len(pixels) > 1):
+        raise InputError(f"at_pixel: expected {f'{len(glbs)}, one for each GLB' if glbs else 'one for all layers'}, got {len(pixels)}")
+    if len(heights) not in (0, 1, len(glbs)):
+        raise InputError(f"height: expected one for all GLB files, or one for each of {len(glbs)}, got {len(heights)}")
+    if heights and not glbs:
+        raise InputError("height: layers have theirs in their pixels, only a GLB takes one: leave it out")
     at_pixels = [f"{x_px},{y_px}" for x_px, y_px in pixels.tolist()]
-    standing = ObjectOptions(object_=glbs, at_pixel=at_pixels, height=[str(each) for each in heights])
-    standing.require_places()
-    return standing
+    return ObjectOptions(object_=glbs, at_pixel=at_pixels, height=[str(each) for each in heights])
 
 
 def _rgb(given: np.ndarray | File, name: str) -> Rgb:

@@ -61,7 +61,7 @@ def open_plate(
     if photo.is_dir() and not (photo / FILE_NAME).is_file():
         within = ", ".join(str(each.parent) for each in sorted(photo.glob(f"*/{FILE_NAME}")))
         raise InputError(
-            f"{photo} is a folder, but neither a merged focal stack ({FILE_NAME}) nor a capture of the viewfinder: "
+            f"{photo} is a folder, but no merged focal stack ({FILE_NAME}): "
             f"give {within or 'a photograph, or make a stack of its photographs by `mrbokeh capture process`'}"
         )
     if photo.is_dir():
@@ -129,7 +129,8 @@ def held_lens(photo: Path, photograph: Photograph, phone: PhonePhoto | None, wis
         guess(f"{photo} does not tell its lens, which is guessed: {guesses}" if guesses else "")
         focus_known = focus_m is not None or photograph.focus_distance_m is not None
         photograph = photograph if focus_known else replace(photograph, focus_distance_m=float("inf"))
-    portrait = None if lens is not None or phone is None or phone.focus is None or phone.focus.blur_at_infinity is None else phone.focus
+    portrait = phone.focus if lens is None and phone is not None and phone.focus is not None else None
+    portrait = None if portrait is None or portrait.blur_at_infinity is None else portrait
     if portrait is not None and not wishes.facts:
         photograph, blur_from = _with_the_phones_blur(photograph, portrait, photo), _OWN_BLUR
     elif portrait is not None and portrait.f_number is not None and wishes.facts.keys() == {"f_number"}:

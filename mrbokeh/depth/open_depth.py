@@ -193,7 +193,7 @@ def read_number_map(path: Path, settings: DepthSettings) -> DepthMap:
     if settings.metres_per_unit is not None:
         known = numbers > 0  # inf is background
         depth_m = np.where(known, numbers * np.float32(settings.metres_per_unit), np.inf).astype(np.float32)
-        doubt_metres(path, depth_m)
+        doubt_metres(path, depth_m, "the metres per step")
         return DepthMap(depth_m, known, f"{path.name}, {settings.metres_per_unit:g} m per step")
     if settings.near_far_m is None:
         raise InputError(

@@ -14,7 +14,6 @@ from mrbokeh.system.errors import InputError
 
 Channels = dict[str, Float[np.ndarray, "height width"]]
 
-
 _MAGIC = b"\x76\x2f\x31\x01"
 
 

@@ -45,11 +45,13 @@ def require_depth_ahead(path: Path | str, name: str, stored: np.ndarray) -> None
 _HARDLY_METRES = 100.0
 
 
-def doubt_metres(path: Path | str, depth_m: np.ndarray) -> None:
-    """Warn where nothing is nearer than 100 m: such depth is in millimetres more often than in metres."""
+def doubt_metres(path: Path | str, depth_m: np.ndarray, divided: str = "it") -> None:
+    """Warn where nothing is nearer than 100 m: such depth is in millimetres more often than in metres. divided: what mends it then."""
     nearest_m = float(np.min(depth_m, initial=np.inf, where=depth_m > 0))
     if _HARDLY_METRES <= nearest_m < np.inf:
-        warn(f"nothing in {path} is nearer than {nearest_m:.4g} m: is its depth in metres? If it is in millimetres, divide it by 1000")
+        warn(
+            f"nothing in {path} is nearer than {nearest_m:.4g} m: is its depth in metres? If it is in millimetres, divide {divided} by 1000"
+        )
 
 
 WIDEST_PX = 320
@@ -125,17 +127,18 @@ def require_suffix(path: Path | str, suffixes: tuple[str, ...], what: str) -> No
 
 def write_image(path: Path | str, rgb: Float[np.ndarray, "height width 3"], encoding: Encoding = "srgb", *, half: bool = True) -> None:
     """Write scene-linear RGB. EXR keeps it (half or float); PNG and TIFF store 16 bit, JPEG 8 bit, clipped to [0, 1]."""
-    suffix, kind = Path(path).suffix.lower(), np.asarray(rgb).dtype
-    if kind.kind != "f":
+    rgb, suffix = np.asarray(rgb), Path(path).suffix.lower()
+    if rgb.dtype.kind != "f" or rgb.ndim != 3 or rgb.shape[2] != 3:
         raise InputError(
-            f"{path}: expected linear light as numbers with a fraction, white at 1, got {kind}: read_picture makes them of a file"
+            f"{path}: expected linear light as floats of shape (height, width, 3), white at 1, got {rgb.dtype} {rgb.shape}: "
+            f"read_picture makes them of a file"
         )
     if suffix == ".exr":
         dtype = np.float16 if half else np.float32
         write_exr(path, ExrPart({name: rgb[..., i].astype(dtype) for i, name in enumerate("RGB")}))
     elif suffix in INTEGER_SUFFIXES:
         integers = np.uint8 if suffix in (".jpg", ".jpeg") else np.uint16
-        write_stored(path, codes_of(np.asarray(rgb, np.float32), integers, encoding))
+        write_stored(path, codes_of(rgb.astype(np.float32, copy=False), integers, encoding))
     else:
         raise InputError(f"cannot write {path}: expected .exr, {', '.join(INTEGER_SUFFIXES)}, not {suffix or 'a file without suffix'}")
 
@@ -229,12 +232,12 @@ def write_layer(path: Path | str, layer: Layer, *, half: bool = True, objects: E
 
     objects: Cryptomatte with its header entries. An extra channel of one component keeps its name, others become NAME.0, NAME.1 and so on.
     """
+    require_suffix(path, (".exr",), "a layer")
     colour = np.float16 if half else np.float32
     channels = {name: layer.rgb[..., i].astype(colour) for i, name in enumerate("RGB")}
     channels |= {"A": layer.alpha.astype(colour), "Z": layer.depth_m.astype(np.float32)}
     for name, values in layer.extra.items():
         channels |= {name if values.shape[2] == 1 else f"{name}.{i}": values[..., i] for i in range(values.shape[2])}
-    require_suffix(path, (".exr",), "a layer")
     comments = "premultiplied alpha; Z in metres along the optical axis, not antialiased"
     attributes = {"comments": comments, **STATED_REC709, **(objects.attributes if objects else {})}
     write_exr(path, ExrPart(channels | (objects.channels if objects else {}), attributes=attributes))

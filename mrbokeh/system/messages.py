@@ -190,9 +190,11 @@ def show(renderable: Any, **figures: Any) -> None:
 
 
 def warn(text: str) -> None:
-    """Say that something may not be as the user wants it."""
-    channel().warnings.append(text)
-    say(f"warning: {text}", err=True)
+    """Say that something may not be as the user wants it; within a command once."""
+    said = channel()
+    if said is OF_NO_COMMAND or text not in said.warnings:
+        said.warnings.append(text)
+        say(f"warning: {text}", err=True)
 
 
 def guess(text: str, short: str = "") -> None:

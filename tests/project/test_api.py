@@ -95,6 +95,12 @@ def test_an_object_stands_on_a_photograph_without_depth_as_by_the_command(tmp_pa
     np.testing.assert_allclose(mb.read_picture(tmp_path / "command.exr"), picture, rtol=2e-3, atol=1e-3)
 
 
+def test_an_object_in_a_grey_photograph_is_grey_as_by_the_command(tmp_path: Path) -> None:
+    photo, cake = tmp_path / "grey.exr", ROOT / "mrbokeh/demo_data/objects/cakeBirthday.glb"
+    mb.write_image(photo, np.repeat(picture_and_depth()[0].mean(axis=2, keepdims=True), 3, axis=2))
+    assert np.ptp(mb.composite(photo, cake, at_pixel=(30, 32), height="20px"), axis=2).max() < 1e-6
+
+
 def test_the_focus_that_is_given_stays_where_the_photograph_tells_none(tmp_path: Path) -> None:
     """The object stands at 2 m; the lens that is guessed blurs it by a fraction of a pixel where it is focused at 0.8 m."""
     photo, (picture, depth_m) = tmp_path / "photo.exr", picture_and_depth()
@@ -124,8 +130,10 @@ def test_merge_takes_arrays_and_keeps_the_stack_where_asked(tmp_path: Path) -> N
     # Each half is that of the slice focused on it; slices differ from the truth in the other half by 0.1 and more.
     assert np.abs(left - truth[8:-8, 8:50]).mean() < 0.01 and np.abs(right - truth[8:-8, 78:-8]).mean() < 0.01
     assert merged.folder is not None and len(mb.read_focal_stack(merged.folder)) == 3 and not merged.metres_known
-    with pytest.raises(mb.InputError, match=r"expected a new folder, but .* is merged already"):
+    with pytest.raises(mb.InputError, match=r"expected a new folder, but .* is a stack"):
         mb.merge(slices[:2], tmp_path / "scene")
+    with pytest.raises(mb.InputError, match="is a file"):
+        mb.merge(slices[:2], __file__)
     again = mb.merge(slices)
     assert again.folder is None
     np.testing.assert_array_equal(again.all_in_focus, merged.all_in_focus)
@@ -151,6 +159,11 @@ def test_merge_takes_arrays_and_keeps_the_stack_where_asked(tmp_path: Path) -> N
         (lambda rgb, _: mb.composite(rgb, [], LENS), "expected a GLB file, a layer"),
         (lambda rgb, _: mb.composite(rgb, replace(ball(), alpha=255 * ball().alpha), LENS), "expected alpha from 0 to 1"),
         (lambda rgb, _: mb.composite(rgb, replace(ball(), alpha=np.nan * ball().alpha), LENS), "expected alpha from 0 to 1"),
+        (lambda rgb, _: mb.composite(rgb, replace(ball(), rgb=np.nan * ball().rgb), LENS), "rgb of a layer is NaN"),
+        (lambda rgb, _: mb.composite(rgb, ball(), LENS, slice_index=7), "got an array and slice 7"),
+        (lambda rgb, _: mb.composite(rgb, ball(), LENS, height=3), "only a GLB takes one"),
+        (lambda rgb, _: mb.composite(rgb, ball(), LENS, at_pixel=[(3, 3), (4, 4)]), "at_pixel: expected one for all layers, got 2"),
+        (lambda rgb, _: mb.composite(rgb, "cake.glb", LENS, at_pixel=(3, 3), height=[1, 2]), "height: expected one for all GLB files"),
         (lambda *_: mb.read_picture("none.jpg"), "expected a photograph at none.jpg"),
         (lambda rgb, _: mb.composite(rgb, Path(__file__).parents[2] / "README.md", LENS), "first bytes are of another kind"),
         (lambda rgb, _: mb.composite(rgb, ball(), LENS, mode="infront"), "mode: expected one of front, over"),
@@ -174,7 +187,7 @@ rgb, depth_m, lens = np.full((4, 6, 3), 0.5), np.full((4, 6), 2.0), mb.Lens(50, 
 for call in (
     lambda: mb.composite(rgb, 5, lens), lambda: mb.composite(rgb, np.array(5), lens), lambda: mb.merge(5),
     lambda: mb.render(rgb, {}, lens), lambda: mb.render(rgb, depth_m, lens, renderer=5),
-    lambda: mb.write_image("w.png", np.zeros((4, 6, 3), np.uint8)),
+    lambda: mb.write_image("w.png", np.zeros((4, 6, 3), np.uint8)), lambda: mb.write_image("w.png", rgb[..., 0]),
 ):
     try:
         call()
@@ -186,7 +199,7 @@ for call in (
 def test_arguments_of_a_wrong_type_are_refused_in_one_sentence_too() -> None:
     """In a process of its own: in this one the annotations refuse them first."""
     told = subprocess.run([sys.executable, "-c", OF_WRONG_TYPE], capture_output=True, text=True, cwd=ROOT)
-    assert told.stdout.split() == ["inserted:", "inserted:", "photographs:", "depth_m:", "renderer:", "w.png:"], told.stderr
+    assert told.stdout.split() == ["inserted:", "inserted:", "photographs:", "depth_m:", "renderer:", "w.png:", "w.png:"], told.stderr
 
 
 def test_the_public_names_are_listed_and_say_what_they_are() -> None:

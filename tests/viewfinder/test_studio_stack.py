@@ -96,5 +96,5 @@ def test_a_stack_is_opened_by_its_folder_and_states_its_lens(folder: Path, tmp_p
         opened.plate_for(options_of(stated), 1e6)
     with pytest.raises(InputError, match="focal stack of 3 slices"):
         open_photograph(folder, None, 7)
-    with pytest.raises(InputError, match="neither a merged focal stack"):
+    with pytest.raises(InputError, match="no merged focal stack"):
         open_photograph(tmp_path)
