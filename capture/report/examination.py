@@ -50,7 +50,7 @@ def examine(view: StackView, reblur: Reblur, watch: Watch | None = None) -> Exam
     """Examine a stack. watch: is told each slice and its prediction. Raises InputError if the stack is not merged."""
     height, width = view.all_in_focus.shape[:2]
     found, disagreements, saturated, evidence = [], [], [], DepthEvidence()
-    picture, places = PictureEvidence(), DisplacementEvidence()
+    picture, places = PictureEvidence(view.stack.all_in_focus()), DisplacementEvidence()
     for index in track(range(len(view)), f"{view.stack.folder.name}: examine"):
         stored = view.stored(index)
         picture.add(stored.rgb, stored.camera_rgb, stored.masks.valid)

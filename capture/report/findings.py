@@ -217,6 +217,7 @@ def findings_from(document: dict[str, Any], stack: FocalStack) -> StackFindings:
 
 def picture_document(found: PictureFindings, number: Number) -> dict[str, Any]:
     return {
+        "unlike_share": number(found.unlike),
         "lost_share": number(found.lost),
         "flat_detail": number(found.flat),
         "largest": number(found.top),
@@ -229,6 +230,7 @@ def _picture_from(document: dict[str, Any]) -> PictureFindings:
     width, height = document["seen_px"]
     lost, flat = _number(document["lost_share"]), _number(document["flat_detail"])
     return PictureFindings(
+        unlike=float(document["unlike_share"]),
         lost=lost,
         flat=flat,
         top=float(document["largest"]),

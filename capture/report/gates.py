@@ -22,10 +22,11 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
-from capture.report.picture_sharpness import KEPT_DETAIL
+from capture.report.picture_sharpness import KEPT_DETAIL, UNLIKE
 
 LARGEST_LOST = 0.002
 LARGEST_FLAT = 1.1
+LARGEST_UNLIKE = 0.001
 LARGEST_TOP = 1.5
 LARGEST_APART_PX = 1.0
 LARGEST_APART = 5e-4
@@ -181,6 +182,15 @@ SEAMS = Rule(
 )
 
 
+GHOSTS = Rule(
+    "no ghosts",
+    f"at most {LARGEST_UNLIKE:.1%} of the picture more than {UNLIKE:.0%} of white away from every slice",
+    "A mixture of slices that do not match shows what was never there: things half there, or twice.",
+    "Look at the crops: something moved, or the camera did. Leave out a slice, take a tripod and a moment without wind, or put one slice "
+    "over the place by hand (`mrbokeh capture merge STACK --from-slice K --mask FILE`).",
+)
+
+
 LIGHT = Rule(
     "no invented light",
     f"nothing brighter than {LARGEST_TOP:g} times the largest value of the slices, or than the measured flux of a disc supports",
@@ -319,6 +329,7 @@ SOLVED_BLUR = replace(
 STACK_RULES = (
     SHARP,
     SEAMS,
+    GHOSTS,
     LIGHT,
     PLACES,
     SPACING,
@@ -337,7 +348,7 @@ STACK_RULES = (
 
 
 PICTURES = "all-in-focus pictures"
-PICTURE_RULES = (SHARP, SEAMS, LIGHT)
+PICTURE_RULES = (SHARP, SEAMS, GHOSTS, LIGHT)
 """Rules of the all-in-focus picture: a report that lacks a verdict on one of them is not passed."""
 
 

@@ -5,7 +5,7 @@ once it lies on the registered slices.
 """
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import repeat
 
@@ -14,12 +14,16 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int, Shaped
 
 from capture.stacks.slice_looks import BLOCK_PX, detail_of_blocks
-from mrbokeh.images.color import linear_to_srgb
+from mrbokeh.images.color import linear_to_srgb, srgb_codes
 
 BORDER_BLOCKS = 2
 """Blocks at the border of the picture that are left out: slices have no data there, or mirrored data."""
 KEPT_DETAIL = 0.6
 FLAT_PERCENTILE = 30.0
+UNLIKE = 0.05
+"""A pixel that differs more from every slice, as shares of display white around it, is a mixture that none shows."""
+_SAME_PX, _AROUND_PX = 1.0, 4.0
+"""Standard deviations: noise and borders between slices within the first are no difference; differences are averaged over the second."""
 FEWEST_FLAT = 20
 """Fewer blocks have no 95th percentile; a picture of 288 x 312 pixels has as many."""
 
@@ -95,10 +99,12 @@ class Sharpness:
 class PictureFindings:
     """Numbers of a picture beside its slices (see `Sharpness`).
 
-    lost: None where the picture has no textured blocks. flat: None where it has fewer than FEWEST_FLAT flat ones. top, slices_top: largest
-    value of the picture and of all slices, in the RGB in which they are stored. seen_px: width and height of what was looked at.
+    unlike: share of the picture that is unlike every slice. lost: None where the picture has no textured blocks. flat: None where it has
+    fewer than FEWEST_FLAT flat ones. top, slices_top: largest value of the picture and of all slices, in the RGB in which they are
+    stored. seen_px: width and height of what was looked at.
     """
 
+    unlike: float
     lost: float | None
     flat: float | None
     top: float
@@ -110,15 +116,22 @@ class PictureFindings:
         return self.top / max(self.slices_top, 1e-9)
 
 
-@dataclass
 class PictureEvidence:
-    """Evidence of the slices, taken one after the other: a number or two of each block."""
+    """Evidence of the slices, taken one after the other: a number or two of each block, and how unlike them each pixel is."""
 
-    _details: list[Blocks] = field(default_factory=list)
-    _brightest: list[AllBlocks] = field(default_factory=list)
+    def __init__(self, picture: Rgb) -> None:
+        """Take the all-in-focus picture, of the size of the slices' files."""
+        self._coded = _coded(picture)
+        self._unlike = np.full(picture.shape[:2], 255, np.uint8)
+        self._seen = np.zeros(picture.shape[:2], bool)
+        self._details: list[Blocks] = []
+        self._brightest: list[AllBlocks] = []
 
     def add(self, rgb: Rgb, camera_rgb: Rgb, valid: Mask) -> None:
         """Add a slice at the size of its file, in Rec.709 and as it is stored; blocks in which it lacks data do not count as sharp."""
+        unlike = cv2.absdiff(self._coded, _coded(rgb)).max(axis=2)
+        self._unlike = np.where(valid, np.minimum(self._unlike, unlike), self._unlike)
+        self._seen |= valid
         self._details.append(block_detail(rgb, valid))
         self._brightest.append(_largest_of_blocks(camera_rgb))
 
@@ -127,7 +140,9 @@ class PictureEvidence:
         of_slices = np.stack(self._brightest)
         sharpest = SharpestSlices.of_details(self._details, float(of_slices.max()))
         sharpness = sharpest.measure(picture) if sharpest.detail.size else None
+        unlike = np.where(self._seen, self._unlike, 0).astype(np.float32) / np.float32(255.0)
         return PictureLook(
+            unlike=cv2.GaussianBlur(unlike, (0, 0), _AROUND_PX),
             sharpest=sharpest,
             sharpness=sharpness,
             picture=picture,
@@ -141,10 +156,12 @@ class PictureEvidence:
 class PictureLook:
     """Picture and what its slices reach. sharpness: None where the picture is smaller than a block.
 
+    unlike: by how much the surroundings of a pixel differ from the slice that is most like each of theirs; 1 is display white.
     brightest, slices_brightest, brightest_slice: the largest value of the picture in each block, border blocks included, that of all
     slices there, and whose it is.
     """
 
+    unlike: Float32[np.ndarray, "height width"]
     sharpest: SharpestSlices
     sharpness: Sharpness | None
     picture: Rgb
@@ -157,12 +174,24 @@ class PictureLook:
         sharpness, size_px = self.sharpness, (self.picture.shape[1], self.picture.shape[0])
         lost = sharpness.lost if sharpness is not None and self.sharpest.textured.any() else None
         flat = sharpness.flat if sharpness is not None and self.sharpest.flat.sum() >= FEWEST_FLAT else None
-        return PictureFindings(lost=lost, flat=flat, top=float(self.brightest.max()), slices_top=self.sharpest.largest, seen_px=size_px)
+        return PictureFindings(
+            unlike=float((self.unlike > UNLIKE).mean()),
+            lost=lost,
+            flat=flat,
+            top=float(self.brightest.max()),
+            slices_top=self.sharpest.largest,
+            seen_px=size_px,
+        )
 
     def corner_px(self, row: int, column: int) -> tuple[int, int]:
         """Return x, y of the first pixel of a block of `sharpest`."""
         border = border_blocks(self.picture.shape)
         return (column + border) * BLOCK_PX, (row + border) * BLOCK_PX
+
+
+def _coded(rgb: Rgb) -> Shaped[np.ndarray, "height width 3"]:
+    """Return a picture as displayed, in 8 bits, without what noise and the border of a pixel change."""
+    return cv2.GaussianBlur(srgb_codes(rgb, np.uint8), (0, 0), _SAME_PX)
 
 
 def display_luminance(rgb: Rgb) -> Float32[np.ndarray, "height width"]:

@@ -7,8 +7,19 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from capture.report.gates import LARGEST_FLAT, LARGEST_LOST, LARGEST_PARALLAX, LARGEST_TOP, LIGHT, PLACES, SEAMS, SHARP
-from capture.report.picture_sharpness import PictureLook
+from capture.report.gates import (
+    GHOSTS,
+    LARGEST_FLAT,
+    LARGEST_LOST,
+    LARGEST_PARALLAX,
+    LARGEST_TOP,
+    LARGEST_UNLIKE,
+    LIGHT,
+    PLACES,
+    SEAMS,
+    SHARP,
+)
+from capture.report.picture_sharpness import PictureLook, inner_blocks
 from capture.report.registration_check import NeighbourDisplacement
 from capture.report.stack_view import StackView
 from capture.stacks.slice_looks import BLOCK_PX
@@ -128,7 +139,13 @@ def crops_shown(crops: Sequence[tuple[str, Rgb]], block: tuple[int, int, int], *
 
 def worst_places(look: PictureLook, focus_index: Plane, pairs: Sequence[NeighbourDisplacement]) -> list[Place]:
     """Return up to three places for a gate that fails, one where none does. focus_index: in which slice each pixel is sharp."""
-    return [*_lost(look), *_seams(look, focus_index), *_brightest(look), *_farthest_apart(pairs, focus_index.shape[1])]
+    return [
+        *_lost(look),
+        *_seams(look, focus_index),
+        *_ghosts(look, focus_index),
+        *_brightest(look),
+        *_farthest_apart(pairs, focus_index.shape[1]),
+    ]
 
 
 def shown_places(stack: FocalStack, picture: Rgb, places: Sequence[Place]) -> list[ShownPlace]:
@@ -193,6 +210,17 @@ def _seams(look: PictureLook, focus_index: Plane) -> list[Place]:
         slices = tuple((side, f"slice {side}, sharp here") for side in _sharp_in(focus_index, at_px))
         text = f"{float(sharpness.kept[row, column]):.2f} times the detail of slice {index}, the sharpest here"
         places.append(Place(SEAMS.name, at_px, text, slices))
+    return places
+
+
+def _ghosts(look: PictureLook, focus_index: Plane) -> list[Place]:
+    """Find blocks by how unlike all slices they are."""
+    unlike = inner_blocks(look.unlike).max(axis=(1, 3))
+    places = []
+    for row, column in _spread_out(unlike, look.findings.unlike > LARGEST_UNLIKE) if unlike.size else ():
+        at_px = look.corner_px(row, column)
+        slices = tuple((side, f"slice {side}, sharp here") for side in _sharp_in(focus_index, at_px))
+        places.append(Place(GHOSTS.name, at_px, f"{float(unlike[row, column]):.0%} of white away from every slice", slices))
     return places
 
 

@@ -75,7 +75,7 @@ def stack_gates(findings: StackFindings) -> list[Gate]:
 
 
 def picture_gates(findings: StackFindings) -> list[Gate]:
-    return [_sharp(findings), _seams(findings), _light(findings), _places(findings)]
+    return [_sharp(findings), _seams(findings), _ghosts(findings), _light(findings), _places(findings)]
 
 
 def _sharp(findings: StackFindings) -> Gate:
@@ -92,6 +92,11 @@ def _seams(findings: StackFindings) -> Gate:
     return rules.SEAMS.judge(
         findings.name, flat, f"{flat:.3f} times the detail of the sharpest slice in flat zones", flat <= rules.LARGEST_FLAT
     )
+
+
+def _ghosts(findings: StackFindings) -> Gate:
+    unlike = findings.picture.unlike
+    return rules.GHOSTS.judge(findings.name, unlike, f"{unlike:.2%} of the picture is unlike every slice", unlike <= rules.LARGEST_UNLIKE)
 
 
 def _light(findings: StackFindings) -> Gate:

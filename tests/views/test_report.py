@@ -168,7 +168,10 @@ def test_registration_and_spacing_are_read() -> None:
 def test_steps_of_a_solved_focus_are_judged_by_the_blur_that_they_leave(scene: Path) -> None:
     """Two slices at one place lose nothing; 2 px apart all between them is blurred by 1 px or more, 0.6 % of 160 px."""
     stack = read_focal_stack(scene / "view_0")
-    picture, found = PictureFindings(None, None, 1.0, 1.0, (160, 107)), tuple(SliceFindings(index, 1.0, 0.0, 1.0) for index in range(6))
+    picture, found = (
+        PictureFindings(0.0, None, None, 1.0, 1.0, (160, 107)),
+        tuple(SliceFindings(index, 1.0, 0.0, 1.0) for index in range(6)),
+    )
     curve = focus_curve(np.zeros((4, 4), np.float32), np.ones((4, 4), np.float32), 6)
     for step_px, passes in ((1.5, True), (2.0, False)):
         positions_px = np.array([0.0, 0.0, 1.0, 1.0 + step_px, 2.0 + step_px, 3.0 + step_px])
@@ -192,7 +195,7 @@ def test_movement_is_not_judged_from_three_slices(scene: Path) -> None:
     assert moving([quiet] * 3, np.zeros((20, 30), np.float32)) is None and still is not None and not still.any()
     curve = focus_curve(np.zeros((4, 4), np.float32), np.ones((4, 4), np.float32), 3)
     found = tuple(SliceFindings(index, 1.0, 0.0, 1.0) for index in range(3))
-    picture = PictureFindings(None, None, 1.0, 1.0, (160, 107))
+    picture = PictureFindings(0.0, None, None, 1.0, 1.0, (160, 107))
     of_stack = StackFindings(read_focal_stack(scene / "view_0"), (160, 107), (160, 107), found, curve, 0.01, None, picture, ())
     gate = next(each for each in stack_gates(of_stack) if each.name == "nothing moved")
     assert (gate.verdict, gate.measured) == ("absent", "movement shows from 4 slices on, and here are 3: look at the picture yourself")
@@ -212,7 +215,7 @@ def test_a_jump_or_a_pair_that_does_not_match_fails_registration(scene: Path, tm
 
     def verdict(shifts_px: list[float], correlations: tuple[float, ...] = ()) -> str:
         found = tuple(SliceFindings(index, 1.0, 0.0, 1.0) for index in range(len(shifts_px)))
-        picture = PictureFindings(None, None, 1.0, 1.0, (160, 107))
+        picture = PictureFindings(0.0, None, None, 1.0, 1.0, (160, 107))
         of_stack = placed(shifts_px, correlations)
         gates = stack_gates(StackFindings(of_stack, (160, 107), (160, 107), found, curve, None, None, picture, ()))
         return str(next(each for each in gates if each.name == "registration held").verdict)

@@ -100,7 +100,7 @@ def test_an_examination_reads_each_slice_once_and_is_read_back_exactly(scene: Pa
     slices = (SliceFindings(0, 1.0 / 3.0, 0.0, 0.5, 7.25, float("inf"), 20.1, fit), SliceFindings(1, 1.5, 0.0, 1.0))
     curve = FocusCurve(np.array([1 / 3, 2 / 3]), 0.7, 0.1, 0.2)
     pairs = (NeighbourDisplacement(0, 0.1 / 3.0, 0.02, (3, 4)), NeighbourDisplacement(1, None, float("inf"), (160, 107)))
-    picture = PictureFindings(1.0 / 300.0, None, float("inf"), 1.0 / 3.0, (320, 214))
+    picture = PictureFindings(1.0 / 7.0, 1.0 / 300.0, None, float("inf"), 1.0 / 3.0, (320, 214))
     findings = StackFindings(stack, (160, 107), (320, 214), slices, curve, 0.01, None, picture, pairs)
     write_json(scene / "there.json", findings_document(findings))
     text = (scene / "there.json").read_text(encoding="utf-8")

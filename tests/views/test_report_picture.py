@@ -13,7 +13,7 @@ from jaxtyping import Float32
 from capture.commands.process import process_command
 from capture.commands.report import report_command
 from capture.report.findings import FocusCurve, SliceFindings, StackFindings
-from capture.report.gates import LIGHT, PLACES, SEAMS, SHARP, Gate
+from capture.report.gates import GHOSTS, LIGHT, PLACES, SEAMS, SHARP, Gate
 from capture.report.picture_sharpness import PictureFindings
 from capture.report.registration_check import DisplacementEvidence, NeighbourDisplacement
 from capture.report.report_cache import CachedPlace
@@ -94,6 +94,15 @@ def jigsaw() -> Made:
     return slices, picture
 
 
+def ghost() -> Made:
+    """Something dark of 40 px around (300, 200) that walked away after slice 1, half there in the picture, with a soft border."""
+    slices, picture = right()
+    y, x = np.mgrid[:HEIGHT_PX, :WIDTH_PX]
+    there = cv2.GaussianBlur((np.hypot(x - 300, y - 200) < 20).astype(np.float32), (0, 0), 2.0)[..., None]
+    slices[1] = (1.0 - there) * slices[1] + there * np.float32(0.02)
+    return slices, ((1.0 - 0.5 * there) * picture + 0.5 * there * np.float32(0.02)).astype(np.float32)
+
+
 def invented_light() -> Made:
     """A dot of 4.0 at (452, 100), six times the largest value of the slices."""
     slices, picture = right()
@@ -144,7 +153,7 @@ def test_a_right_merge_passes_without_any_lens(tmp_path: Path) -> None:
     assert {each.name for each in report.gates if each.verdict == "passed"} >= {SHARP.name, SEAMS.name, LIGHT.name, PLACES.name}
     document = json.loads((tmp_path / "report.json").read_text())
     assert document["passed"] is True
-    assert (document["judged"], document["failed"], document["absent"]) == (9, 0, 11)
+    assert (document["judged"], document["failed"], document["absent"]) == (10, 0, 11)
     picture = document["stacks"]["view_0"]["picture"]
     assert picture["lost_share"] == 0.0 and picture["flat_detail"] < 1.02
     assert picture["largest"] == pytest.approx(picture["largest_of_slices"], abs=1e-3)
@@ -157,6 +166,7 @@ def test_a_right_merge_passes_without_any_lens(tmp_path: Path) -> None:
     [
         (lost_disc, SHARP, (130, 110), 30),
         (jigsaw, SEAMS, (300, 300), 60),
+        (ghost, GHOSTS, (300, 200), 30),
         (invented_light, LIGHT, (452, 100), BLOCK_PX),
         (shifted_slice, PLACES, (300, 192), 300),
     ],
@@ -253,7 +263,7 @@ def test_a_hand_that_moved_sideways_fails_the_gate(tmp_path: Path) -> None:
         assert judged.verdict == verdict and ("up to 9 px apart" in judged.measured) == (verdict == "failed")
 
 
-SHARP_PICTURE = PictureFindings(0.0, 1.0, 0.5, 0.5, (1000, 800))
+SHARP_PICTURE = PictureFindings(0.0, 0.0, 1.0, 0.5, 0.5, (1000, 800))
 
 
 def findings_with(tmp_path: Path, residuals_px: list[float | None], pairs: tuple[NeighbourDisplacement, ...]) -> StackFindings:
@@ -311,8 +321,8 @@ def test_strict_asks_for_every_gate_and_fails_on_a_fault_whatever_is_allowed(tmp
     """A right stack without lens: 1 for the gates that could not be judged, 0 where each of them was allowed, 1 where one was not."""
     write_made(tmp_path / "view_0", right())
     plain = printed_by(report_command, tmp_path)
-    assert "9 of 20 gates judged, 0 failed, 11 absent: all viewpoints placed" in plain and "--strict" not in plain
-    assert "all-in-focus pictures: passed: as sharp as its slices, no seams, no invented light" in plain
+    assert "10 of 21 gates judged, 0 failed, 11 absent: all viewpoints placed" in plain and "--strict" not in plain
+    assert "all-in-focus pictures: passed: as sharp as its slices, no seams, no ghosts, no invented light" in plain
     assert "depth and blur, for refocusing and training: passed: " in plain
     assert "absent: all viewpoints placed, points lie where they are seen, scales agree: no reconstruction" in plain
     absences = [each.name for each in report_scene(tmp_path).absences]
@@ -320,7 +330,7 @@ def test_strict_asks_for_every_gate_and_fails_on_a_fault_whatever_is_allowed(tmp
     for options, exit_code in (((), 1), (allowed, 0), (allowed[2:], 1)):
         printed_by(report_command, tmp_path, "--strict", *options, exit_code=exit_code)
     write_made(tmp_path / "view_0", lost_disc())
-    assert len(set(GATE_NAMES)) == len(GATE_NAMES) == 20, "names of gates are told apart"
+    assert len(set(GATE_NAMES)) == len(GATE_NAMES) == 21, "names of gates are told apart"
     allowed = [option for name in GATE_NAMES for option in ("--allow-absent", name)]
     failed = printed_by(report_command, tmp_path, "--strict", *allowed, exit_code=1)
     *lines, last = printed_by(report_command, tmp_path).splitlines()
