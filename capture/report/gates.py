@@ -26,7 +26,7 @@ from capture.report.picture_sharpness import KEPT_DETAIL, UNLIKE
 
 LARGEST_LOST = 0.002
 LARGEST_FLAT = 1.1
-LARGEST_UNLIKE = 0.001
+LARGEST_UNLIKE = 0.0005
 LARGEST_TOP = 1.5
 LARGEST_APART_PX = 1.0
 LARGEST_APART = 5e-4
@@ -184,7 +184,7 @@ SEAMS = Rule(
 
 GHOSTS = Rule(
     "no ghosts",
-    f"at most {LARGEST_UNLIKE:.1%} of the picture more than {UNLIKE:.0%} of white away from every slice",
+    f"at most {LARGEST_UNLIKE:.2%} of the picture more than {UNLIKE:.0%} of white away from every slice",
     "A mixture of slices that do not match shows what was never there: things half there, or twice.",
     "Look at the crops: something moved, or the camera did. Leave out a slice, take a tripod and a moment without wind, or put one slice "
     "over the place by hand (`mrbokeh capture merge STACK --from-slice K --mask FILE`).",

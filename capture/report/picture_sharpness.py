@@ -22,7 +22,7 @@ KEPT_DETAIL = 0.6
 FLAT_PERCENTILE = 30.0
 UNLIKE = 0.05
 """A pixel that differs more from every slice, as shares of display white around it, is a mixture that none shows."""
-_SAME_PX, _AROUND_PX = 1.0, 4.0
+_SAME_PX, _AROUND_PX = 1.0, 8.0
 """Standard deviations: noise and borders between slices within the first are no difference; differences are averaged over the second."""
 FEWEST_FLAT = 20
 """Fewer blocks have no 95th percentile; a picture of 288 x 312 pixels has as many."""
