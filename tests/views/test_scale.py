@@ -10,6 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from capture.poses.cauchy_loss import squared_under_cauchy, squared_under_cauchy_slope
+from capture.poses.colmap_job import ColmapJob, ColmapPicture, job_to_json
 from capture.poses.sparse_model import SparseModel, SparseView, read_sparse_model, write_sparse_model
 from capture.scale.answer import ScaleAnswer, ScaleResult, distance_scale, parse_distance, read_scale, write_scale
 from capture.scale.board import (
@@ -24,8 +25,12 @@ from capture.scale.board import (
     umeyama,
 )
 from capture.scale.focus import FocusSample, focus_scale, sharpness_curves, sharpness_peaks, stated_sigma_dioptre
+from capture.scale.focus_calibration import FocusFit, StackFocus
+from capture.scale.metric_scale import ScaledScene, ScaleRequest, _answers, numbered, offset_of, scale_lines, scale_scene, view_pictures
 from mrbokeh.optics.camera import Camera
-from mrbokeh.stacks.focal_stack import FocalStack, Slice
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
+from mrbokeh.system.atomic_files import write_json
+from mrbokeh.system.errors import InputError
 from mrbokeh.tracking.charuco.board import CharucoBoard, CharucoGrid, read_board
 from tests.support.refusals import refused
 
@@ -239,3 +244,84 @@ def test_the_board_counts_most_and_the_others_are_told(tmp_path: Path) -> None:
     unsure = ScaleResult.of([replace(answers[0], uncertainty=0.03), answers[1]], {})
     assert unsure.contradictions == (), "5 % are less than two deviations"
     refused("board: none was given; focus: unknown", ScaleResult.of, [], {"focus": "unknown", "board": "none was given"})
+
+
+def test_a_kept_scale_must_rest_on_what_is_asked_for(tmp_path: Path) -> None:
+    """Found by a distance: neither with a board nor with another distance is it the one that is asked for; nothing is found anew."""
+    result = ScaleResult.of([ScaleAnswer("distance", 0.2, 0.001, {"views": ["a", "b"], "metres": 0.5})], {})
+    write_scale(tmp_path / "reconstruction", result)
+    for request in (ScaleRequest(), ScaleRequest(distance=("a", "b", 0.5))):
+        assert scale_scene(tmp_path, request).result.used.metres_per_unit == 0.2
+    refused(r"scale\.json was found without a board: --overwrite finds", scale_scene, tmp_path, ScaleRequest(BOARD))
+    for other in (("a", "b", 0.6), ("a", "c", 0.5)):
+        refused(r"found without this --distance: --overwrite finds", scale_scene, tmp_path, ScaleRequest(distance=other))
+
+
+def test_every_way_to_the_scale_is_told_with_what_it_rests_on() -> None:
+    """5 % and 30 % above the board: the distance, known to 10 %, does not contradict it. 2 and 0.5 dioptres are 0.5 and 2 m."""
+    answers = [
+        ScaleAnswer("focus", 0.21, 0.005, {"points": 90, "stacks": 2, "offset_m": -0.03, "residual_dioptre": 0.0123}),
+        ScaleAnswer("distance", 0.26, 0.1, {"views": ["a", "b"], "metres": 0.25}),
+        ScaleAnswer("board", 0.2, 0.0003, {"detections": 5, "corners": 35, "residual_px": 0.123}),
+    ]
+    result = ScaleResult.of(answers, {"sonar": "none was given"})
+    fit = FocusFit(np.array([2.0, 0.5]), np.array([4.0, 5.0]), np.array([0.01, 0.02]), np.array([60, 60]))
+    nobody = FocalStack(Path("a"), ())
+    assert list(scale_lines(ScaledScene(result, {"a": StackFocus(nobody, fit, 400)}, {"b": "too few points"}))) == [
+        "board: 0.2 metres per unit +- 0.030 % (used; 5 sightings of 35 corners, residual 0.12 px)",
+        "distance: 0.26 metres per unit +- 10.000 % (+30.00 % from the one used; 0.25 m between a and b, for a ruler of 1 mm)",
+        "focus: 0.21 metres per unit +- 0.500 % (+5.00 % from the one used; 90 points of 2 stacks, offset of the lens -30 mm, "
+        "residual 0.012 dioptres)",
+        "sonar: no answer, for none was given",
+        "warning: focus contradicts board: measure the print or the distance again, or check the focus distances",
+        "a: focus from 0.500 to 2.000 m +- 0.0150 dioptres, blur 4.50 px per dioptre",
+        "b: focus not calibrated (too few points)",
+    ]
+    assert offset_of(result) == -0.03 and offset_of(replace(result, answers=result.answers[:1])) == 0.0
+    assert [numbered("lens.json", number) for number in range(3)] == ["lens.json", "lens_2.json", "lens_3.json"]
+
+
+def test_a_distance_scales_plain_pictures_and_what_has_no_answer_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Poses lie in the folder itself. The first two views are turned by 20 and 12 degrees; 0.5 m between them."""
+    write_sparse_model(tmp_path, MODEL)
+    units = float(np.linalg.norm(MODEL.views[0].centre - MODEL.views[1].centre))
+    refused("board: none was given .* distance: none was given .* focus: the scene has no merged", scale_scene, tmp_path, ScaleRequest())
+    result = scale_scene(tmp_path, ScaleRequest(distance=("view_0", "view_1", 0.5))).result
+    assert read_sparse_model(tmp_path).metres_per_unit == result.used.metres_per_unit == pytest.approx(0.5 / units)
+    assert result.missing["board"] == "none was given (--board)" and "no merged stacks" in result.missing["focus"]
+    # Another run with a board, of which one view's picture is gone.
+    job = ColmapJob(tuple(ColmapPicture(view.name, f"{view.name}.png", "", 0) for view in MODEL.views), (None,))
+    write_json(tmp_path / "colmap_job.json", job_to_json(job))
+    (tmp_path / "images").mkdir()
+    cv2.imwrite(str(tmp_path / "images" / "view_0.png"), np.full((2, 3, 3), (3, 2, 1), np.uint8))
+    pictures = view_pictures(MODEL, tmp_path)
+    assert next(pictures)[0, 0].tolist() == [1, 2, 3], "red first"
+    refused(r"cannot read .*view_1\.png: run `mrbokeh capture poses --overwrite`", next, pictures)
+    both = ScaleRequest(BOARD, ("view_0", "view_1", 0.5), overwrite=True)
+    monkeypatch.setattr("capture.scale.metric_scale.board_scale", lambda *_: ScaleAnswer("board", 0.2, 0.0003))
+    assert [each.method for each in scale_scene(tmp_path, both).result.answers] == ["board", "distance"]
+
+
+def test_stacks_of_unknown_focus_give_no_scale() -> None:
+    nothing = sample(np.full(len(FOCUS_DIOPTRES), np.nan))
+    result = _answers(MODEL, Path(), {"view_0": nothing}, ScaleRequest(distance=("view_0", "view_1", 0.5)))
+    assert result.missing["focus"] == "the focus distances of the stacks are unknown"
+
+
+def test_a_stack_without_focus_gets_its_camera_in_metres_and_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Calibration is refused, as for a stack with too few points; the camera of the view goes into stack.json all the same."""
+    write_sparse_model(tmp_path / "reconstruction", MODEL)
+    write_focal_stack(FocalStack(tmp_path / "view_1", (Slice("0.exr", 1.0), Slice("1.exr", 2.0)), registered=True, merged=True))
+    write_focal_stack(FocalStack(tmp_path / "view_2", (Slice("0.exr", 1.0),), registered=True))
+
+    def refuse(*_: object) -> None:
+        raise InputError("too few points")
+
+    monkeypatch.setattr("capture.scale.metric_scale.focus_sample", lambda *_: sample(np.full(len(FOCUS_DIOPTRES), np.nan)))
+    monkeypatch.setattr("capture.scale.metric_scale.focus_start", refuse)
+    scaled = scale_scene(tmp_path, ScaleRequest(distance=("view_0", "view_1", 0.5)))
+    assert scaled.uncalibrated == {"view_1": "too few points"}, "view_2 is not merged"
+    assert not scaled.calibrated and not scaled.calibrations and not (tmp_path / "lens_calibration.json").exists()
+    camera = read_focal_stack(tmp_path / "view_1").camera
+    assert camera is not None and camera.focal_px == (900.0, 900.0)
+    assert camera.camera_from_world[2, 3] == pytest.approx(5.0 * scaled.result.used.metres_per_unit)
