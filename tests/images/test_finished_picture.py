@@ -2,6 +2,7 @@
 
 from fractions import Fraction
 from pathlib import Path
+from unittest.mock import Mock
 
 import cv2
 import numpy as np
@@ -106,6 +107,16 @@ def test_an_opaque_plate_stays_without_alpha(files: Path) -> None:
     put_in(files, "opaque.exr", "out.png")
     assert stored(files / "out.png").shape == (*SIZE, 3)
     assert read_alpha(files / "opaque.exr") is None and read_alpha(files / "out.png") is None
+
+
+@pytest.mark.parametrize(("channels", "reads"), [("RGB", 0), ("RGBA", 1)])
+def test_exr_without_alpha_is_not_read_for_it(files: Path, monkeypatch: pytest.MonkeyPatch, channels: str, reads: int) -> None:
+    """Its header tells; pixels are read, once, only where there is alpha."""
+    read = Mock(side_effect=read_exr)
+    write_exr(files / "half.exr", ExrPart(dict.fromkeys(channels, half_covered())))
+    monkeypatch.setattr("mrbokeh.images.alpha_io.read_exr", read)
+    assert (read_alpha(files / "half.exr") is not None) == bool(reads)
+    assert read.call_count == reads
 
 
 def test_alpha_turns_with_the_picture(files: Path) -> None:

@@ -1,12 +1,16 @@
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from mrbokeh.depth.open_depth import DepthSettings, read_number_map
 from mrbokeh.images.color import linear_to_srgb
 from mrbokeh.images.exr_io import ExrPart, read_exr, write_exr
-from mrbokeh.images.image_io import read_image, read_layer, write_image, write_layer, write_preview
+from mrbokeh.images.image_io import read_depth, read_image, read_layer, write_image, write_layer, write_preview
 from mrbokeh.images.layer import Layer
+from mrbokeh.images.picture_codec import write_stored
+from mrbokeh.stacks.exr_layers.render_channels import RenderChannels, layer_of
 from mrbokeh.system.errors import InputError
 from tests.support.refusals import refused
 
@@ -138,3 +142,35 @@ def test_a_failed_write_leaves_the_old_file_and_no_rest(tmp_path: Path) -> None:
 def test_preview_is_an_8_bit_picture(tmp_path: Path) -> None:
     write_preview(tmp_path / "a.png", picture(3.0))
     assert read_image(tmp_path / "a.png").shape == (13, 17, 3)
+
+
+def layer_file(path: Path, depth_m: np.ndarray) -> None:
+    write_exr(path, ExrPart(dict.fromkeys("RGBA", np.ones_like(depth_m)) | {"Z": depth_m}))
+
+
+@pytest.mark.parametrize(("nearest", "told"), [(99.0, False), (100.0, True)])
+@pytest.mark.parametrize(
+    ("name", "write", "read", "divided"),
+    [
+        ("depth.exr", lambda path, depth: write_exr(path, ExrPart({"Z": depth})), read_depth, "it"),
+        (
+            "steps.png",
+            lambda path, depth: write_stored(path, (10 * depth).astype(np.uint16)),
+            lambda path: read_number_map(path, DepthSettings(metres_per_unit=0.1)).depth_m,
+            "the metres per step",
+        ),
+        ("layer.exr", layer_file, lambda path: layer_of(RenderChannels.read(path)).depth_m, "it"),
+    ],
+    ids=["depth", "numbers", "layer"],
+)
+def test_depth_of_files_is_doubted_where_nothing_is_nearer_than_100_m(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str, write: Any, read: Any, divided: str, nearest: float, told: bool
+) -> None:
+    """0 is background and not near. Metres stay as they are; the sentence names the file and what to divide."""
+    depth, path = np.array([[nearest, 500.0, 0.0]], np.float32), tmp_path / name
+    write(path, depth)
+    np.testing.assert_allclose(read(path), [[nearest, 500.0, np.inf]], rtol=1e-6)
+    sentence = (
+        f"warning: nothing in {path} is nearer than 100 m: is its depth in metres? If it is in millimetres, divide {divided} by 1000\n"
+    )
+    assert capsys.readouterr().err == (sentence if told else "")

@@ -283,9 +283,11 @@ def test_merging_anew_says_what_was_told_before(
         return told
 
     assert "without what was told" not in run("merge", tmp_path)
+    assert run("merge", tmp_path).startswith(f"all of {tmp_path} was merged before and stays as it is (--overwrite merges it again)")
     run("scale", tmp_path, "--nearest", "last", "--distance-at", "100.5,90,0.35")
     run("scale", tmp_path, "--ruler", "70,60,130,140,0.125")
     told = run("merge", tmp_path, "--overwrite")
+    assert "stays as it is" not in told
     assert f"capture scale {tmp_path} --distance-at 100.5,90,0.35 --ruler 70,60,130,140,0.125 --nearest last`" in told
     assert "without what was told" not in run("merge", tmp_path, "--overwrite")
 

@@ -339,7 +339,7 @@ def test_the_guide_names_every_option() -> None:
 
 def test_a_busy_machine_has_frames_and_not_only_seconds_to_show_its_scene(monkeypatch: pytest.MonkeyPatch) -> None:
     """After the scene is drawn: 5 seconds and 100 frames without anything virtual, then nobody waits for it any longer."""
-    now_s = 0.0
+    now_s, nothing = 0.0, SimpleNamespace(rgb=np.zeros((0, 0, 3)))
     monkeypatch.setattr("time.monotonic", lambda: now_s)
     compositor = Mock(spec=LiveCompositor, overlays=SimpleNamespace(status=SimpleNamespace(busy=True)), last=None)
     preparing = Preparing(compositor)
@@ -348,9 +348,19 @@ def test_a_busy_machine_has_frames_and_not_only_seconds_to_show_its_scene(monkey
     compositor.overlays.status.busy = False
     for _ in range(100):
         now_s += 1.0
-        compositor.last = SimpleNamespace(overlay=SimpleNamespace(rgb=np.zeros((0, 0, 3))))
+        compositor.last = SimpleNamespace(overlay=nothing)
         assert preparing() and preparing()
-    compositor.last = SimpleNamespace(overlay=SimpleNamespace(rgb=np.zeros((0, 0, 3))))
+    compositor.last = SimpleNamespace(overlay=nothing)
+    assert not preparing()
+    # A fast machine has its 100 frames and more within the seconds: these count then.
+    compositor.overlays.status.busy = True
+    assert preparing(), "another scene is drawn"
+    compositor.overlays.status.busy = False
+    for _ in range(150):
+        compositor.last = SimpleNamespace(overlay=nothing)
+        now_s += 4.9 / 150
+        assert preparing()
+    now_s += 0.2
     assert not preparing()
 
 
