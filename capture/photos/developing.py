@@ -11,9 +11,10 @@ from capture.photos.metadata import read_metadata
 from capture.photos.raw import RAW_SUFFIXES, DecodedPhoto, Photosites, decode_raw
 from mrbokeh.images.color import convert
 from mrbokeh.images.exif import cut_from_px, known_orientation, quarter_turns, stored_orientation, upright
-from mrbokeh.images.image_io import ENCODED_SUFFIXES, read_image
+from mrbokeh.images.image_io import ENCODED_SUFFIXES, LINEAR_SUFFIXES, read_image
 from mrbokeh.images.picture_codec import linear_from_codes, stored_rgb
 from mrbokeh.stacks.photograph import Photograph
+from mrbokeh.system.errors import InputError
 
 _LARGEST_HALF = 65504.0
 _FULL = 1.0 - 1e-6
@@ -34,6 +35,12 @@ def develop(
     if is_raw(path):
         decoded = decode_raw(path, white_balance, half_size=half_size)
     else:
+        suffixes = (*LINEAR_SUFFIXES, *ENCODED_SUFFIXES)
+        if path.is_file() and path.suffix.lower() not in suffixes:
+            raise InputError(
+                f"{path}: expected a photograph, RAW (such as .dng, .nef, .cr3, .arw) or one of {', '.join(suffixes)}, not "
+                f"{path.suffix or 'a file without suffix'}"
+            )
         decoded = _picture(path)
         if half_size:
             decoded = _no_wider(decoded, max(1, decoded.rgb.shape[1] // 2))

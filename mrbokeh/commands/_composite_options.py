@@ -66,6 +66,7 @@ class PlateOptions(shared.NearOptions):
 
     def require_meant(self, photo: Path) -> None:
         """Raise InputError where options of depth contradict one another, or go without a second photograph that they are of."""
+        shared.require_depth_file(self.depth)
         if self.baseline is not None and self.stereo is None:
             raise InputError(f"--baseline {self.baseline:g} says how far the camera moved to a second photograph: give that as --stereo")
         if self.baseline is not None and not 0.0 < self.baseline < math.inf:
@@ -128,7 +129,8 @@ class ObjectOptions:
         typer.Option(
             metavar="METRES|PIXELSpx",
             help="Height of the object in metres, or such as 120px: as long as so many pixels are where it stands. Once for all, or once "
-            "for each --object. Default: as in the file, or a quarter of the picture where the metres of the stack are guessed.",
+            "for each --object. Default: as in the file, or a quarter of the picture in a photograph without "
+            "depth or metres.",
         ),
     ] = None
     turn: Annotated[
@@ -301,7 +303,10 @@ def typed_sun(text: str) -> tuple[float, float]:
     """Return degrees to the right and above the horizon of --sun."""
     right_deg, above_deg = numbers_in(text, "--sun expects degrees to the right and above the horizon, such as -60,40", (2,))
     if not 0.0 < above_deg <= 90.0 or abs(right_deg) > 360.0:
-        raise InputError(f"--sun: expected a light within a turn, above 0 and up to 90 degrees over the horizon, got {text!r}")
+        raise InputError(
+            f"--sun: expected RIGHT,ABOVE in degrees, an azimuth of -360 to 360 to the right of the view and an elevation above 0 and up "
+            f"to 90 over the horizon, got {text!r}"
+        )
     return right_deg, above_deg
 
 

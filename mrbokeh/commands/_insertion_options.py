@@ -145,6 +145,21 @@ def typed_place(text: str) -> tuple[int, ...]:
     return numbers_in(text, "--focus-at: expected X,Y or X,Y,RADIUS in whole pixels", (2, 3), number=int)
 
 
+def require_depth_file(depth: Path | None) -> None:
+    """Raise InputError where --depth names a file that surely holds no depth, such as a 3D object."""
+    import cv2
+
+    from mrbokeh.images.image_io import ENCODED_SUFFIXES
+
+    if depth is None or not depth.is_file() or depth.suffix.lower() in (*ENCODED_SUFFIXES, ".exr", ".npz", ".npy", ".onnx"):
+        return
+    if not cv2.haveImageReader(str(depth)):
+        raise InputError(
+            f"--depth {depth}: expected an EXR with Z, a PNG or TIFF, an array (.npz), a phone's photograph (.jpg, .heic) or a depth "
+            f"network (.onnx), got {depth.suffix or 'a file without suffix'}"
+        )
+
+
 def near_far_of(disparity: str | None, depth: Path | None) -> tuple[float, float] | None:
     """Return NEAR and FAR of --disparity in metres, or None. depth: the file whose numbers it explains; None is refused."""
     from mrbokeh.depth.depth_map import parse_near_far
@@ -172,9 +187,9 @@ def require_one_focus(**given: object) -> None:
 class LensFacts:
     """Facts of the lens in place of those of --lens or of the photograph; None leaves them."""
 
-    focal_length_mm: Annotated[float | None, typer.Option("--focal-length", max=10_000.0, metavar="MM", help="Focal length in mm.")] = None
+    focal_length_mm: Annotated[float | None, typer.Option("--focal-length", metavar="MM", help="Focal length in mm.")] = None
     f_number: Annotated[float | None, typer.Option(metavar="N", help="f-number.")] = None
-    sensor_width_mm: Annotated[float | None, typer.Option("--sensor-width", max=500.0, metavar="MM", help="Sensor width in mm.")] = None
+    sensor_width_mm: Annotated[float | None, typer.Option("--sensor-width", metavar="MM", help="Sensor width in mm.")] = None
 
     @property
     def given(self) -> dict[str, float]:
@@ -250,9 +265,9 @@ class LookGroup:
             metavar="KELVIN", help="Light that the plate was balanced for: above 6504 virtual light gets warmer, below it cooler."
         ),
     ] = None
-    match_black: Annotated[str | None, typer.Option(metavar="auto|X,Y[,R]", help="Virtual blacks are lifted to the plate's.")] = None
+    match_black: Annotated[str | None, typer.Option(metavar="auto|off|X,Y[,R]", help="Virtual blacks are lifted to the plate's.")] = None
     vignetting: Annotated[str | None, typer.Option(metavar="auto|K1,K2,K3|FLAT.png", help="The lens darkens virtual light too.")] = None
-    grain: Annotated[str | None, typer.Option(metavar="auto|FILE", help="Grain as measured in the plate, on virtual light.")] = None
+    grain: Annotated[str | None, typer.Option(metavar="auto|off|FILE", help="Grain as measured in the plate, on virtual light.")] = None
     light_wrap: Annotated[str | None, typer.Option(metavar="STRENGTH[,SIGMA]", help="Light of the plate over virtual edges.")] = None
     seed: Annotated[int, typer.Option(min=0, help="Of the grain.")] = 0
 

@@ -209,9 +209,10 @@ def _camera_height_m(plate: Plate, told_m: float | None, nearest_m: float) -> tu
         return _EYES_M, f"the camera to be {_EYES_M:g} m above the ground (--camera-height METRES)"
     height_m = focus_m / nearest_m
     if plate.rough_focus_m is not None and plate.rough_focus_m[0] <= _EYES_M * nearest_m <= plate.rough_focus_m[1]:
-        told = f"the camera to be {_EYES_M:g} m above the ground (--camera-height METRES) and the focus on the object"
         near_m, far_m = plate.rough_focus_m
-        return _EYES_M, f"{told}, as the photograph tells {near_m:.2g} to {far_m:.2g} m of it (--focus METRES)"
+        focus = f"beyond {near_m:.2g} m" if math.isinf(far_m) else f"between {near_m:.2g} and {far_m:.2g} m"
+        told = f"the camera to be {_EYES_M:g} m above the ground (--camera-height METRES)"
+        return _EYES_M, f"{told} and focused on the object: the photograph tells a focus {focus} (--focus METRES)"
     if _LOWEST_M <= height_m <= _HIGHEST_M:
         told = f"the object to stand where the lens is focused, {focus_m:.3g} m away and {height_m:.2g} m below the camera"
         return height_m, f"{told} (--camera-height METRES, --focus METRES)"
@@ -246,7 +247,7 @@ def _told(plate: Plate, solved: SolvedCamera) -> str:
 def held_told(world_from_camera: Float[np.ndarray, "3 3"]) -> str:
     """Return in words how far a camera looks down or up, and is turned."""
     down_deg, roll_deg = _down_deg(world_from_camera), rolled_deg(world_from_camera)
-    turned = f", turned by {roll_deg:.1f}" if abs(roll_deg) >= 0.5 else ""
+    turned = f", turned {'anti' * (roll_deg < 0.0)}clockwise by {abs(roll_deg):.1f} degrees" if abs(roll_deg) >= 0.5 else ""
     return f"looks {'up' if down_deg < 0.0 else 'down'} by {abs(down_deg):.0f} degrees{turned}"
 
 

@@ -3,11 +3,13 @@
 And how `--f-number` is read: as lenses have it written, f/1.4, in all commands.
 """
 
+import math
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
 from mrbokeh.optics.lens_library import names
+from mrbokeh.system.errors import InputError
 from mrbokeh.system.typed_numbers import without_f
 
 FEW = 9
@@ -125,6 +127,14 @@ CHOICES = {
 """Values that the shell completes, of an option in all commands or in one; where none fits, it completes files."""
 
 
+SIZES = {
+    "focal-length": ("millimetres above 0 and up to 10000, such as 50", 10_000.0),
+    "sensor-width": ("millimetres above 0 and up to 500, such as 36", 500.0),
+    "f-number": ("a number above 0, such as 2.8", math.inf),
+}
+"""Sizes of a lens, which all are above 0 and finite: what is expected in words, and the largest."""
+
+
 def _by_name(table: dict[str, str]) -> dict[str, str]:
     return {name: word for word, names in table.items() for name in names.split()}
 
@@ -143,6 +153,8 @@ def with_words(command: Any, path: str) -> None:
             parameter.metavar = metavars.get(name, parameter.metavar)
             if name == "f-number":
                 parameter.process_value = _of_f_number(parameter.process_value)
+            if name in SIZES:
+                parameter.process_value = _within(name, parameter.process_value)
             if len(command.params) > FEW and name not in first:
                 parameter.rich_help_panel = panels.get(name, "More")
     order = {name: place for place, name in enumerate(first)}
@@ -151,6 +163,19 @@ def with_words(command: Any, path: str) -> None:
 
 def _of_f_number(process: Callable[[Any, Any], Any]) -> Any:
     return lambda context, value: process(context, without_f(value))
+
+
+def _within(name: str, process: Callable[[Any, Any], Any]) -> Any:
+    """Refuse a size of a lens that none has, before any file is opened."""
+    expected, largest = SIZES[name]
+
+    def processed(context: Any, value: Any) -> Any:
+        size = process(context, value)
+        if isinstance(size, float) and not (0.0 < size <= largest and math.isfinite(size)):
+            raise InputError(f"--{name}: expected {expected}, got {size:g}")
+        return size
+
+    return processed
 
 
 def _completing(choices: Callable[[], list[str]]) -> Any:

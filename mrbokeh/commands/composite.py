@@ -1,5 +1,6 @@
 """`mrbokeh composite`: virtual objects into a photograph, or into all slices of a focal stack."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,12 +14,15 @@ from mrbokeh.system.messages import guess, say, tell, warn
 
 if TYPE_CHECKING:
     from mrbokeh.compositing.plate import Plate
-    from mrbokeh.compositing.plate_look.finishing import Finishing
+    from mrbokeh.compositing.plate_look.finishing import Finishing, LookOptions
     from mrbokeh.optics.lens import Lens
     from mrbokeh.renderers.base import Renderer
     from mrbokeh.stacks.capture_bundle import CaptureBundle
 
 app = typer.Typer(add_completion=False)
+
+_MODES_TOLD = {"front": "before everything"}
+"""How the last line says the way by which layers went in, where the mode's name does not say it."""
 
 
 @app.command()
@@ -79,7 +83,7 @@ def composite(options: CompositeOptions, out: OutOption) -> None:
     carry_exif(options.photo, out, plate.rgb.shape[1::-1])
     if lost := alpha_lost(out, plate):
         warn(lost)
-    tell(f"wrote {out} ({mode}; {told})", known, mode=mode, **figures)
+    tell(f"wrote {out} ({_MODES_TOLD.get(mode, mode)}; {told})", known, mode=mode, **figures)
 
 
 def _opened(options: CompositeOptions, bundle: "CaptureBundle | None", lens: "Lens | None") -> "Plate":
@@ -103,10 +107,19 @@ def _finishing(options: CompositeOptions, plate: "Plate", out: Path) -> "Finishi
         return finishing_of(wanted, plate.rgb, None if photo.is_dir() else photo)
     uncompressed = options.result.preview or options.colour.of_plate is not None or options.colour.of_result is not None
     finishing, matched = matched_finishing(wanted, plate.rgb, photo, uncompressed=uncompressed)
-    guess(
-        f"black, grain and compression are the photograph's, as far as they can be told ({' off, '.join(matched)} off)" if matched else ""
-    )
+    guess(_matched_told(wanted, matched))
     return finishing
+
+
+def _matched_told(wanted: "LookOptions", matched: Sequence[str]) -> str:
+    """Say which looks of the photograph the object gets unasked, how to leave them out, and which could not be measured."""
+    sought = {"--match-black": "black", "--grain": "grain or compression"}
+    given = {"--match-black": wanted.match_black or wanted.match_grey, "--grain": wanted.grain}
+    found = " and ".join(sought[each].replace(" or ", " and ") for each in matched)
+    missed = " and no ".join(word for name, word in sought.items() if name not in matched and given[name] is None)
+    put_on = f"the object gets the {found} of the photograph (to leave out: {', '.join(f'{each} off' for each in matched)})"
+    left_off = f"no {missed} could be measured in the photograph, so none is put on it"
+    return "; ".join([put_on] * bool(matched) + [left_off] * bool(missed))
 
 
 def _tell_metres(options: CompositeOptions, lens: "Lens | None") -> None:

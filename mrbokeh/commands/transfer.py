@@ -22,6 +22,7 @@ from mrbokeh.commands._insertion_options import (
     FocusAtOption,
     LensFacts,
     focused_at_pixel,
+    require_depth_file,
     require_one_focus,
 )
 from mrbokeh.commands._option_groups import grouped
@@ -147,6 +148,7 @@ def transfer(
     from mrbokeh.video.picture_source import parse_rate
 
     _require_outputs(out, result, (photo, lens, depth.depth))
+    require_depth_file(depth.depth)
     settings = depth.settings
     given, blurs = lens_and_renderer(lens, blur.renderer)
     sharp = open_sharp(photo, depth.depth, settings)

@@ -11,7 +11,7 @@ from tempfile import TemporaryFile
 from typing import Any
 
 from mrbokeh.system.errors import InputError, require_file
-from mrbokeh.system.messages import finished, unfinished
+from mrbokeh.system.messages import finished, say, unfinished
 
 
 @contextmanager
@@ -65,11 +65,13 @@ def writing_alone(path: Path | None) -> Iterator[None]:
 
     None, and a place where nothing can be written, are not locked.
     """
+    missing: list[Path] = []
     with ExitStack() as held:
         if path is not None and (name := Path(os.path.realpath(path)).name):
             lock = Path(os.path.realpath(path)).with_name(f".{name}.lock")
             with suppress(OSError):
-                for folder in reversed([each for each in lock.parents if not each.exists()]):
+                missing = [each for each in lock.parents if not each.exists()]
+                for folder in reversed(missing):
                     held.callback(_tried, folder.rmdir)  # where nothing was written
                 lock.parent.mkdir(parents=True, exist_ok=True)
                 file = held.enter_context(lock.open("a+"))
@@ -86,6 +88,8 @@ def writing_alone(path: Path | None) -> Iterator[None]:
                 file.write(str(os.getpid()))
                 file.flush()
         yield
+        if path is not None and missing and path.exists():
+            say(f"the folder {path.parent} did not exist and was made")
 
 
 def _lock(file: Any) -> bool:

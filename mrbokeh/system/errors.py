@@ -8,6 +8,7 @@ import sys
 import tempfile
 import traceback
 from contextlib import suppress
+from difflib import get_close_matches
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -96,6 +97,10 @@ def mistake_in(error: Exception) -> str:
 
 
 _PARSERS_WORDS = {
+    "Input should be less than or equal to": "expected at most",
+    "Input should be greater than or equal to": "expected at least",
+    "Input should be less than": "expected less than",
+    "Input should be greater than": "expected more than",
     "Input should be a valid number, unable to parse string as a number": "expected a number",
     "Input should be a valid integer, unable to parse string as an integer": "expected a whole number",
 }
@@ -103,6 +108,9 @@ _PARSERS_WORDS = {
 
 def _of_parser(error: Any) -> str:
     """Return the sentence of the command line's parser, with what was typed and where it is told what may be."""
+    if getattr(error, "possibilities", None):
+        typed_name = str(error.option_name).lstrip("-")
+        error.possibilities = ["--" + each for each in get_close_matches(typed_name, [each.lstrip("-") for each in error.possibilities])]
     text = str(error.format_message()).rstrip(".")
     for theirs, ours in _PARSERS_WORDS.items():
         text = text.replace(theirs, ours)
