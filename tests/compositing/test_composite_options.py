@@ -470,6 +470,7 @@ def test_an_object_in_a_black_and_white_photograph_has_no_colours(tmp_path: Path
         done = mrbokeh("composite", *words, *more, "--out", tmp_path / f"{name}_out.png")
         assert done.returncode == 0, done.stderr
         assert ("black and white" in done.stdout) == (name == "grey")
+        assert "_out.png (before everything; 35 mm f/8" in done.stdout
     apart = {name: np.ptp(cv2.imread(str(tmp_path / f"{name}_out.png")), axis=2).max() for name in ("grey", "plain")}
     assert apart["grey"] <= 1 and apart["plain"] > 20
 
@@ -495,3 +496,26 @@ def test_a_matte_that_cannot_be_meant_is_told(files: Path) -> None:
     for mode in ("front", "matte"):
         done = mrbokeh("composite", *words, "--mode", mode, "--out", files / f"{mode}.exr")
         assert done.returncode == 2 and f"the mode {mode} does not look at" in done.stderr and len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.parametrize(("more", "told"), [
+    (("--f-number", -2), "--f-number: expected a number above 0, such as 2.8, got -2"),
+    (("--sensor-width", 23500), "--sensor-width: expected millimetres above 0 and up to 500, such as 36, got 23500"),
+    (("--focal-length", "nan"), "--focal-length: expected millimetres above 0 and up to 10000, such as 50, got nan"),
+    (("--paths", 0), "'--paths': expected at least 1, got '0'"),
+    (("--shadow", 3), "'--shadow': expected at most 1, got '3'"),
+    (("--sun", "900,400"), "an azimuth of -360 to 360 to the right of the view and an elevation above 0 and up to 90"),
+    (("--to-slice", 3), "No such option: --to-slice (Possible options: --all-slices, --slice): see"),
+    (("--depth", CAKE), "expected an EXR with Z, a PNG or TIFF, an array (.npz), a phone's photograph (.jpg, .heic) or a depth network"),
+])  # fmt: skip
+def test_a_value_that_nobody_means_is_refused_in_words_of_the_option(
+    files: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, more: tuple[object, ...], told: str
+) -> None:
+    words = (files / "photo.exr", "--object", CAKE, "--at-pixel", "70,60", *more, "--out", files / "refused.png")
+    code, refused_by = said(capsys, monkeypatch, "composite", *words)
+    assert code == 2 and told in refused_by, refused_by
+
+
+def test_a_file_that_is_no_photograph_is_told_what_is_one(tmp_path: Path) -> None:
+    (tmp_path / "run.sh").write_text("echo")
+    refused(r"run\.sh: expected a photograph, RAW \(such as \.dng, .* or one of \.exr, .*, not \.sh", open_plate, tmp_path / "run.sh", None)

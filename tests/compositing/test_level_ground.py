@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from mrbokeh.commands._composite_options import ObjectOptions
-from mrbokeh.commands._level_ground import focused_on_foot, on_level_ground, sun_by_shadow, with_camera_of_file
+from mrbokeh.commands._level_ground import focused_on_foot, held_told, on_level_ground, sun_by_shadow, with_camera_of_file
 from mrbokeh.compositing.plate import Plate, plate_of
 from mrbokeh.optics.lens import Lens
 from mrbokeh.scene.staging.scene_description import looking_down
@@ -61,13 +61,26 @@ def test_the_focus_tells_the_distance_unless_the_camera_would_float() -> None:
     assert place_m(standing)[2] == pytest.approx(1.5 * plate_focal_px() / 150.0, rel=1e-3)
 
 
-def test_a_rough_focus_gives_way_to_a_camera_in_the_hand() -> None:
+@pytest.mark.parametrize(("roll_deg", "told"), [(3.0, "clockwise"), (-0.7, "anticlockwise")])
+def test_the_way_that_a_camera_is_turned_is_told(roll_deg: float, told: str) -> None:
+    """The horizon of a camera turned clockwise rises to the right: the photograph shows it turned the other way."""
+    world_from_camera = looking_down(np.radians(10.0), np.radians(roll_deg))
+    assert held_told(world_from_camera) == f"looks down by 10 degrees, turned {told} by {abs(roll_deg):g} degrees"
+    far_m = np.array([[-3.0, 0.0, 9.0], [3.0, 0.0, 9.0]]) @ world_from_camera
+    left_px, right_px = photograph().camera.project(far_m)[0]
+    assert (right_px[1] < left_px[1]) == (told == "clockwise")
+
+
+def test_a_rough_focus_gives_way_to_a_camera_in_the_hand(capsys: pytest.CaptureFixture[str]) -> None:
     """A zone of 1.4 m to infinity allows 1.5 m of height, which is 8.1 m away at that pixel; one of 1.4 to 3 m does not."""
     rough = replace(photograph(5.0), rough_focus_m=(1.4, float("inf")))
     plate, standing = on_level_ground(rough, replace(FOOT, pitch=0.0))
     expected_m = 1.5 * rough.camera.focal_px[1] / 150.0
     assert place_m(standing)[2] == pytest.approx(expected_m)
     assert plate.lens.focus_distance_m == pytest.approx(expected_m)
+    assert "focused on the object: the photograph tells a focus beyond 1.4 m (--focus METRES)" in capsys.readouterr().out
+    on_level_ground(replace(rough, rough_focus_m=(1.4, 20.0)), replace(FOOT, pitch=0.0))
+    assert "the photograph tells a focus between 1.4 and 20 m" in capsys.readouterr().out
     plate, standing = on_level_ground(replace(rough, rough_focus_m=(1.4, 6.0)), replace(FOOT, pitch=0.0))
     assert place_m(standing)[2] == plate.lens.focus_distance_m == pytest.approx(5.0)
 

@@ -96,7 +96,7 @@ def test_two_at_once_wait_for_one_another(connection: str, scene: tuple[np.ndarr
         ({"lens": "none.json"}, "expected a lens"),
         ({"lens": {"focal_length_mm": -1}}, "lens of the request"),
         ({"f_number": "two"}, "expected a number"),
-        ({"f_number": -2}, "positive"),
+        ({"f_number": -2}, "must be above 0"),
         ({"focus": 0.01}, "cannot focus at 0.01 m"),
         ({"focus": [900, 900]}, "cannot focus at pixel"),
         ({"renderer": "magic"}, "expected a renderer"),

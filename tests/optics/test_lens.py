@@ -34,7 +34,7 @@ def test_sign_zero_and_infinity() -> None:
 def test_nothing_but_positive_numbers(field: str) -> None:
     for wrong in (0.0, -2.0, float("nan"), float("inf")):
         values = {"focal_length_mm": 35.0, "f_number": 2.0, "focus_distance_m": 1.0, "sensor_width_mm": 36.0} | {field: wrong}
-        with pytest.raises(InputError, match="positive"):
+        with pytest.raises(InputError, match="must be above 0"):
             Lens(**values)
 
 

@@ -48,7 +48,7 @@ def replaced(words: tuple[str, ...], option: str, value: str) -> tuple[str, ...]
     ("words", "told"),
     [
         (replaced(RENDER, "--rgb", "loop.exr"), "expected a picture at loop.exr, but it is a link to loop.exr, which leads nowhere"),
-        ((*RENDER, "--f-number", "0"), "positive focal_length_mm, f_number"),
+        ((*RENDER, "--f-number", "0"), "--f-number: expected a number above 0"),
         (
             ("composite", "photo.png", "--focus", "1", "--f-number", "2", "--layer", "layer.exr", "--out", "out.exr"),
             "unknown: focal length, sensor width): give --focal-length MM --sensor-width MM, or --lens",
