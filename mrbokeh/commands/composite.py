@@ -107,15 +107,15 @@ def _finishing(options: CompositeOptions, plate: "Plate", out: Path) -> "Finishi
         return finishing_of(wanted, plate.rgb, None if photo.is_dir() else photo)
     uncompressed = options.result.preview or options.colour.of_plate is not None or options.colour.of_result is not None
     finishing, matched = matched_finishing(wanted, plate.rgb, photo, uncompressed=uncompressed)
-    guess(_matched_told(wanted, matched))
+    guess(matched_told(wanted, matched))
     return finishing
 
 
-def _matched_told(wanted: "LookOptions", matched: Sequence[str]) -> str:
+def matched_told(wanted: "LookOptions", matched: Sequence[str]) -> str:
     """Say which looks of the photograph the object gets unasked, how to leave them out, and which could not be measured."""
     sought = {"--match-black": "black", "--grain": "grain or compression"}
     given = {"--match-black": wanted.match_black or wanted.match_grey, "--grain": wanted.grain}
-    found = " and ".join(sought[each].replace(" or ", " and ") for each in matched)
+    found = ", ".join(sought[each] for each in matched).replace(" or ", " and ")
     missed = " and no ".join(word for name, word in sought.items() if name not in matched and given[name] is None)
     put_on = f"the object gets the {found} of the photograph (to leave out: {', '.join(f'{each} off' for each in matched)})"
     left_off = f"no {missed} could be measured in the photograph, so none is put on it"

@@ -65,7 +65,7 @@ def test_the_focus_tells_the_distance_unless_the_camera_would_float() -> None:
 def test_the_way_that_a_camera_is_turned_is_told(roll_deg: float, told: str) -> None:
     """The horizon of a camera turned clockwise rises to the right: the photograph shows it turned the other way."""
     world_from_camera = looking_down(np.radians(10.0), np.radians(roll_deg))
-    assert held_told(world_from_camera) == f"looks down by 10 degrees, turned {told} by {abs(roll_deg):g} degrees"
+    assert held_told(world_from_camera) == f"looks down by 10 degrees, turned {told} by {abs(roll_deg):.1f} degrees"
     far_m = np.array([[-3.0, 0.0, 9.0], [3.0, 0.0, 9.0]]) @ world_from_camera
     left_px, right_px = photograph().camera.project(far_m)[0]
     assert (right_px[1] < left_px[1]) == (told == "clockwise")

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mrbokeh.commands.composite import matched_told
 from mrbokeh.compositing.plate_look.finishing import Finishing, LightWrap, LookOptions, finishing_of
 from mrbokeh.compositing.plate_look.grain import measured_grain, write_grain
 from mrbokeh.compositing.plate_look.vignetting import CameraAndLens, FlatField, RadialFalloff, lensfun_falloff
@@ -106,3 +107,14 @@ def test_photographs_that_name_no_lens_are_refused(tmp_path: Path, frames: tuple
     refused("name camera and lens", finishing_of, options, frames[0], shared_data / "exif" / "canon_450d_4.6m.jpg")
     (tmp_path / "text.jpg").write_text("no picture")
     refused("expected a photograph with Exif", finishing_of, options, frames[0], tmp_path / "text.jpg")
+
+
+@pytest.mark.parametrize(("wanted", "matched", "told"), [
+    ({}, ["--match-black", "--grain"], "the object gets the black, grain and compression of the photograph"),
+    ({}, ["--grain"], "(to leave out: --grain off); no black could be measured in the photograph, so none is put on it"),
+    ({"grain": "off"}, ["--match-black"], "the object gets the black of the photograph (to leave out: --match-black off)"),
+    ({"match_black": "off"}, [], "no grain or compression could be measured in the photograph, so none is put on it"),
+])  # fmt: skip
+def test_what_an_object_gets_of_the_photograph_unasked_is_told(wanted: dict[str, str], matched: list[str], told: str) -> None:
+    said = matched_told(LookOptions(**wanted), matched)  # type: ignore[arg-type]
+    assert told in said and ("could be measured" in said) == ("could be measured" in told)

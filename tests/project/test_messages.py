@@ -139,9 +139,13 @@ def test_two_runs_into_one_output(tmp_path: Path) -> None:
     assert mrbokeh("lens", "new", out, *NEW).returncode == 0 and [each.name for each in tmp_path.iterdir()] == ["lens.json"]
 
 
-def test_a_lock_leaves_no_folder_and_reaches_through_links(tmp_path: Path) -> None:
+def test_a_lock_leaves_no_folder_and_reaches_through_links(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     refused("a mistake", raising_while_writing, tmp_path / "new" / "deep" / "out.png")
-    assert not list(tmp_path.iterdir())
+    assert not list(tmp_path.iterdir()) and not capsys.readouterr().out
+    for _ in range(2):  # the folder is made, and told of, once
+        with writing_alone(tmp_path / "made" / "out.png"):
+            (tmp_path / "made" / "out.png").touch()
+    assert capsys.readouterr().out == f"the folder {tmp_path / 'made'} did not exist and was made\n"
     (tmp_path / "scene").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "scene")
     with writing_alone(tmp_path / "scene"):
