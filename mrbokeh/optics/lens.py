@@ -48,13 +48,9 @@ class Lens:
     spread_by: Path | None = None
 
     def __post_init__(self) -> None:
-        for name, size, unit in (
-            ("focal length", self.focal_length_mm, " mm"),
-            ("f-number", self.f_number, ""),
-            ("sensor width", self.sensor_width_mm, " mm"),
-        ):
-            if not 0.0 < size < math.inf:
-                raise InputError(f"the {name} of a lens must be above 0{unit} and finite, got {size:g}{unit}")
+        for name in ("focal_length_mm", "f_number", "sensor_width_mm"):
+            if not 0.0 < (size := getattr(self, name)) < math.inf:
+                raise InputError(f"{name} of a lens must be above 0 and finite, got {size:g}")
         if self.sensor_height_mm is not None and not 0.0 < self.sensor_height_mm < np.inf:
             raise InputError(f"sensor_height_mm must be a positive length or left out, got {self.sensor_height_mm}")
         if not self.focus_distance_m * MM_PER_M > self.focal_length_mm:

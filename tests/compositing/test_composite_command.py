@@ -184,7 +184,7 @@ def test_objects_are_placed_in_camera_axes_wherever_the_camera_stood(tmp_path: P
     ({"--object": "cake", "--at": "0,0,1", "--at-pixel": "10,80"}, "--at and --at-pixel both say where the object stands"),
     ({"--object": "cake", "--at-pixel": "10,80", "--sun": "0,40", "--environment": "sky.hdr"}, "a panorama has its own sun"),
     ({"--object": "cake", "--at-pixel": "10,80", "--sun": "0,40", "--plain": True}, "needs the light that --plain leaves out"),
-    ({"--object": "cake", "--at-pixel": "10,80", "--sun": "0,95"}, "above 0 and up to 90 degrees over the horizon"),
+    ({"--object": "cake", "--at-pixel": "10,80", "--sun": "0,95"}, "elevation above 0 and up to 90 over the horizon"),
     ({"--object": "cake", "--at-pixel": "10,80", "--pitch": "95"}, "--pitch: expected how far the camera looks down, between -90"),
     ({"--object": "cake", "--at-pixel": "10,80", "--roll": "180"}, "--roll: expected how far the camera is turned clockwise, between -90"),
     ({"--object": "cake", "--at-pixel": "10,80", "--height": "high"}, "--height: expected metres above 0"),

@@ -145,7 +145,14 @@ def test_a_lens_file_without_surfaces_is_told(tmp_path: Path, damaged: object) -
         read_prescription(tmp_path / "lens.json")
 
 
-@pytest.mark.parametrize(("option", "why"), [("--blades=2", "iris_blades from 3"), ("--sensor-width=nan", "from 2 to 400 mm")])
+@pytest.mark.parametrize(
+    ("option", "why"),
+    [
+        ("--blades=2", "iris_blades from 3"),
+        ("--sensor-width=450", "from 2 to 400 mm"),
+        ("--sensor-width=nan", "expected millimetres above 0"),
+    ],
+)
 def test_describe_refuses_before_it_traces(tmp_path: Path, option: str, why: str) -> None:
     done = mrbokeh("lens", "describe", "biotar-58", option, "--out", tmp_path / "lens.json")
     assert done.returncode == 2 and why in done.stderr and not (tmp_path / "lens.json").exists(), done.stderr
