@@ -368,9 +368,9 @@ def _as_shipped() -> None:
 
 
 def _as_optimised() -> None:
-    """Let LLVM optimise at level 2, unless NUMBA_OPT says another: level 3 took a quarter longer to compile, for kernels as fast.
+    """Let LLVM optimise at level 2, unless NUMBA_OPT says another: level 3 took a tenth longer to compile all kernels.
 
-    Pictures were the same bit for bit. This holds for the whole process too.
+    Of four renderers none was slower for it, and their pictures were the same bit for bit. This holds for the whole process too.
     """
     if "NUMBA_OPT" not in os.environ:
         _config.OPT = type(_config.OPT)(2)
