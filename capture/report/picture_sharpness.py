@@ -129,8 +129,7 @@ class PictureEvidence:
 
     def add(self, rgb: Rgb, camera_rgb: Rgb, valid: Mask) -> None:
         """Add a slice at the size of its file, in Rec.709 and as it is stored; blocks in which it lacks data do not count as sharp."""
-        unlike = cv2.absdiff(self._coded, _coded(rgb)).max(axis=2)
-        self._unlike = np.where(valid, np.minimum(self._unlike, unlike), self._unlike)
+        np.minimum(self._unlike, cv2.absdiff(self._coded, _coded(rgb)).max(axis=2), out=self._unlike, where=valid)
         self._seen |= valid
         self._details.append(block_detail(rgb, valid))
         self._brightest.append(_largest_of_blocks(camera_rgb))

@@ -129,8 +129,7 @@ class ObjectOptions:
         typer.Option(
             metavar="METRES|PIXELSpx",
             help="Height of the object in metres, or such as 120px: as long as so many pixels are where it stands. Once for all, or once "
-            "for each --object. Default: as in the file, or a quarter of the picture in a photograph without "
-            "depth or metres.",
+            "for each --object. Default: as in the file, or a quarter of the picture in a photograph without depth or metres.",
         ),
     ] = None
     turn: Annotated[

@@ -124,7 +124,7 @@ def composite(
     elif known_lens is None:
         raise InputError("a photograph as an array does not tell its lens: give lens, such as mrbokeh.Lens(focal_length_mm=50, f_number=2)")
     else:
-        plate = plate_of(_rgb(np.asarray(photo), "photo"), known_lens if focus_m is None else known_lens.focused_at(focus_m))
+        plate = plate_of(_rgb(photo, "photo"), known_lens if focus_m is None else known_lens.focused_at(focus_m))
     if all_in_focus is not None:
         plate = replace(plate, sharp_rgb=_rgb(all_in_focus, "all_in_focus"))
     if isinstance(depth_m, (str, Path)):

@@ -129,8 +129,8 @@ def held_lens(photo: Path, photograph: Photograph, phone: PhonePhoto | None, wis
         guess(f"{photo} does not tell its lens, which is guessed: {guesses}" if guesses else "")
         focus_known = focus_m is not None or photograph.focus_distance_m is not None
         photograph = photograph if focus_known else replace(photograph, focus_distance_m=float("inf"))
-    portrait = phone.focus if lens is None and phone is not None and phone.focus is not None else None
-    portrait = None if portrait is None or portrait.blur_at_infinity is None else portrait
+    phone_focus = None if phone is None else phone.focus
+    portrait = phone_focus if lens is None and phone_focus is not None and phone_focus.blur_at_infinity is not None else None
     if portrait is not None and not wishes.facts:
         photograph, blur_from = _with_the_phones_blur(photograph, portrait, photo), _OWN_BLUR
     elif portrait is not None and portrait.f_number is not None and wishes.facts.keys() == {"f_number"}:
@@ -138,8 +138,8 @@ def held_lens(photo: Path, photograph: Photograph, phone: PhonePhoto | None, wis
         assert own.f_number is not None
         photograph = replace(own, f_number=own.f_number * wished / portrait.f_number)
         blur_from = f"blur of full frame at f/{wished:g} in place of the phone's, at f/{portrait.f_number:g}"
-    elif phone is not None and phone.focus is not None and photograph.focus_distance_m is None:
-        photograph = replace(photograph, focus_distance_m=phone.focus.focus_distance_m)
+    elif phone_focus is not None and photograph.focus_distance_m is None:
+        photograph = replace(photograph, focus_distance_m=phone_focus.focus_distance_m)
     lens = photograph.lens(photo, focus_m) if lens is None else lens_for_photograph(lens, photograph, photo)
     rough_m = photograph.rough_focus_m if phone is None and focus_m is None and wishes.lens is None else None
     focused = lens if focus_m is None else lens.focused_at(focus_m)
