@@ -58,6 +58,7 @@ def scattered(mode: str, depth_m: float, lens: Lens) -> Inserted:
     return insertion_of(mode).insert(replace(plate(post_m=0.7), lens=lens), [card(depth_m)], ScatterReference())
 
 
+@pytest.mark.slow
 @each_mode
 def test_the_laws_hold_through_a_bank(mode: str, by_bank: Renderer) -> None:
     """No layers and pixels without virtual light: the plate bit for bit; opaque in focus: the layer; twice the light: twice the picture.
@@ -99,6 +100,7 @@ def test_a_bank_of_an_opening_inserts_as_the_opening_does(mode: str, depth_m: fl
     assert found_db > max(45.0, round_db + 6.0), (found_db, round_db)
 
 
+@pytest.mark.slow
 def test_a_bank_is_as_near_the_traced_truth_as_its_opening(bank: Path) -> None:
     """Measured 37.6 to 42.8 dB, 0.25 dB below the opening at most, where the truth was made with twice as many places of the pupil."""
     by_bank, way = lens_and_renderer(bank, None)[1], insertion_of("between")

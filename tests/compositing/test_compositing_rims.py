@@ -28,6 +28,7 @@ def mean_db(cases: Sequence[MixedCase], *, refine_edges: bool) -> float:
     return float(np.mean([found_db(case, refine_edges=refine_edges) for case in cases]))
 
 
+@pytest.mark.slow
 def test_exact_depth_loses_nothing_and_a_pixel_too_wide_costs_less() -> None:
     """Mean of three focus distances. Colours of these cards say little; on the traced sets, which no test can carry, it is two thirds."""
     cards = small_card_cases()

@@ -136,6 +136,7 @@ def test_two_frames_tell_grain_from_texture_but_not_what_an_encoder_copied() -> 
     refused("12 or more smooth places", measured_grain_of_pair, first, first)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sigma_px", [0.0, 0.6, 1.0])
 def test_the_texture_has_the_measured_statistics(sigma_px: float) -> None:
     """A million values: 0.001 times the square root of how many hang together (13 for 1 px), times 3."""
@@ -193,6 +194,7 @@ def standard_deviation(grain: Grain, level: float) -> float:
     return float(np.sqrt(grain.level.variance(np.full(3, level))).mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "factor"), [("ducks_720p.mp4", 1.35), ("iphone_xr_chart.mov", 1.35)])
 def test_one_frame_and_two_of_a_real_clip_agree(shared_data: Path, name: str, factor: float) -> None:
     """The camera moves in both clips and both are compressed, which takes grain away now here, now there: they agree to a factor only."""

@@ -332,6 +332,7 @@ def test_committed_views_are_complete_and_finite(view: Path) -> None:
         assert np.isfinite(layer.rgb).all() and layer.alpha.min() >= 0.0 and layer.alpha.max() <= 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("view", VIEWS, ids=lambda view: view.parent.name)
 def test_what_committed_views_say_of_their_blur_is_what_lens_says(view: Path) -> None:
     meta = json.loads((view / "meta.json").read_text())

@@ -87,6 +87,7 @@ def edge_scene(z_edge_m: float) -> Scene:
     return Scene((black, *wall(1.0, plain_texture((1.0, 1.0, 1.0))).quads))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("shape", ["square", "disc"])
 def test_profile_of_a_straight_occluder(shape: str) -> None:
     """Share of the pupil on the free side of the edge: linear for a square, 1/2 + (t sqrt(1-t^2) + asin t) / pi for a disc."""

@@ -54,7 +54,8 @@ def errors(second_rgb: np.ndarray, baseline_m: float) -> tuple[float, float, flo
     return float(np.median(measured)), float((measured < 0.05).mean()), float((wrong < 0.05).mean())
 
 
-@pytest.mark.parametrize("way", ["right", *(pytest.param(each, marks=pytest.mark.slow) for each in WAYS_M if each != "right")])
+@pytest.mark.slow
+@pytest.mark.parametrize("way", WAYS_M)
 def test_depth_is_that_of_the_scene_in_whatever_direction_the_camera_moved(way: str) -> None:
     """A pixel of shift is 1.8 to 5 % of depth here, and matching is good to a fifth of one: 1 %; 0.4 to 0.8 % were measured, 98 % of
     what both see within 5 %, and 90 to 96 % of the whole. Edges, and strips that the second does not see, are the rest.
@@ -65,6 +66,7 @@ def test_depth_is_that_of_the_scene_in_whatever_direction_the_camera_moved(way: 
     assert whole > 0.85
 
 
+@pytest.mark.slow
 def test_another_exposure_and_white_balance_match_as_well() -> None:
     """Half the light and a lamp's colour, with noise of a phone."""
     rgb, _ = seen_from(*WAYS_M["right"])

@@ -71,6 +71,7 @@ def test_a_bent_picture_has_depth_at_its_own_pixels(views: TracedViews, scene: S
     assert shares_right(scene.depth_of(picture).depth, views.depth_m[3][row, column]) > 0.92
 
 
+@pytest.mark.slow
 def test_what_moves_by_itself_has_the_depth_behind_it() -> None:
     """A grey card that stands elsewhere in each view is nowhere in space: it gets about the wall's 1.6 m, which others see."""
     still_m = traced((wall(1.6), card(0.8, -0.4, -0.15)), (PLACES_M[3],)).depth_m[0]
@@ -85,6 +86,7 @@ def test_what_moves_by_itself_has_the_depth_behind_it() -> None:
     assert np.median(found.depth[on_card]) == pytest.approx(1.6, abs=0.1)
 
 
+@pytest.mark.slow
 def test_what_is_too_far_for_parallax_lies_far_behind() -> None:
     """A wall at 60 m, before which 22 cm give 0.6 px of parallax: it was part of the card at 0.8 m while no plane so far was swept."""
     behind = replace(wall(1.6), corner_m=(-75.0, -75.0, 60.0), edge_u_m=(150.0, 0.0, 0.0), edge_v_m=(0.0, 150.0, 0.0))

@@ -164,6 +164,7 @@ def _close_cracks(seen: dict[tuple[int, int], tuple[float, np.ndarray, tuple[int
                     seen[row, column] = ends[0]
 
 
+@pytest.mark.slow
 def test_a_round_thing_in_a_layer_lets_nothing_of_the_picture_through() -> None:
     """Its blur grows from pixel to pixel, so that points of the pupil see it drawn apart; one grey is one grey all the same."""
     y, x = np.indices((96, 208))  # two blocks

@@ -278,6 +278,7 @@ def test_refusals(tmp_path: Path) -> None:
         refused(said, fit_lens, stacks, [], ONE)
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_bank_that_renders(tmp_path: Path) -> None:
     """A bank is read back, drawn, exported and used; re-blurring with it is nearer to the slice than not blurring at all."""
     stack = make_stack(tmp_path / "stack", HEPTAGON)

@@ -96,6 +96,7 @@ def test_heptagon_turned_by_12_degrees(side: int) -> None:
     assert opening.squeeze == pytest.approx(1.0, rel=0.02) and opening.cat_eye == pytest.approx(0.0, abs=0.05)
 
 
+@pytest.mark.slow
 def test_nine_curved_blades_and_a_heptagon_seen_from_the_wrong_side() -> None:
     """180 is 25.7 degrees more than whole sevenths of a turn; what an odd number of blades shows does not tell the side by itself."""
     picture = linear(photograph(HEPTAGON, side=-1))
@@ -120,6 +121,7 @@ def test_a_round_opening_has_no_blades_and_its_discs_are_found_where_they_are() 
     assert float(np.median(found.own[:, 2])) == pytest.approx(0.5 * COC_PX, abs=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("aperture", "squeeze", "cat_eye"), [(replace(DISC, cat_eye=0.6), 1.0, 0.6), (Aperture.disc().squeezed(1.33), 1.33, 0.0)]
 )

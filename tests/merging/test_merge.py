@@ -129,6 +129,7 @@ def test_a_registration_is_used_again(desk: FocalStack, tmp_path: Path) -> None:
     np.testing.assert_allclose(read_registration(scene / "registration.json").reference_from_slice[3], transforms[3])
 
 
+@pytest.mark.slow
 def test_a_stack_too_large_to_be_held_is_read_again(desk: FocalStack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Streaming from files gives what holding in memory gives: both hold half floats."""
     monkeypatch.setattr("capture.merging.registration.registered_slices.LARGEST_HELD_BYTES", 0.0)

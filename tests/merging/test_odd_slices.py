@@ -35,6 +35,7 @@ def sweep(folder: Path, count: int = 5, seed: int = 0) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["keyboard_defocus", "button_macro", "pcb_oblique"])
 def test_all_slices_of_a_real_stack_belong(shared_data: Path, name: str) -> None:
     """Strong defocus, 2 % of breathing, drifting exposure."""

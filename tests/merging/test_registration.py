@@ -55,7 +55,8 @@ def test_a_camera_that_moved_between_slices(moved: JitteredStack, lens_is_known:
     assert registration.breathing.source == ("lens" if lens_is_known else "pictures")
 
 
-@pytest.mark.parametrize("lens_is_known", [pytest.param(True, marks=pytest.mark.slow), False])
+@pytest.mark.slow
+@pytest.mark.parametrize("lens_is_known", [True, False])
 def test_a_camera_that_turned_in_the_hand(lens_is_known: bool) -> None:
     """0.8 degrees from slice to slice, 4 in all: similarities leave a corner of the picture more than 2 px off."""
     turned = jittered_stack(size_px=MOVED_PX, turn_rad=np.deg2rad(0.8))

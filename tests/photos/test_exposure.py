@@ -35,6 +35,7 @@ def refocused(rgb: Picture, focus: float, gain: float) -> Picture:
     return np.minimum(vignetted * gain, 1.0).astype(np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "focus", "gain"), [(1, 0.25, 0.8), (2, 0.5, 1.3), (3, 0.75, 0.97), (1, 1.0, 0.55)])
 def test_known_gains_are_found_within_a_percent(seed: int, focus: float, gain: float) -> None:
     """The first slice is the reference; blur, breathing, vignetting and lamps that saturate must not pass for exposure."""

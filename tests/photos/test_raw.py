@@ -266,11 +266,8 @@ def test_real_files_agree_with_libraws_own_colours(shared_data: Path, name: str)
     assert np.abs(rec709(decoded) - theirs)[unclipped].max() < 2.5 * largest / 65535.0
 
 
-@pytest.mark.parametrize(
-    ("name", "size"),
-    [pytest.param(*each, marks=pytest.mark.slow if each[0].startswith("canon_g2") else ()) for each in REAL_FILES.items()],
-    ids=REAL_FILES,
-)
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "size"), REAL_FILES.items(), ids=REAL_FILES)
 def test_real_files_decode_whole(shared_data: Path, name: str, size: tuple[int, int]) -> None:
     decoded = decode_raw(shared_data / "raw" / name)
     assert decoded.rgb.shape == (*size, 3)

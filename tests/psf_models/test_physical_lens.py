@@ -313,6 +313,7 @@ def test_wavelengths_are_spread_over_their_band() -> None:
     assert len(np.unique(places[:, :, 0])) == 12 and weights.min() > 0.0
 
 
+@pytest.mark.slow
 def test_prefiltering_is_the_mean_over_the_box() -> None:
     model = lens()
     box = np.array([[3.0, 4.0], [0.3, 0.5]])

@@ -213,6 +213,7 @@ def still(coc_px: float) -> Layer:
     return with_motion(opaque(rgb, depth_m(coc_px)), np.zeros((*SIZE, 2), np.float32))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("coc_px", [0.0, 9.0, -13.0])
 @pytest.mark.parametrize("motion_px", [(12.0, 0.0), (-5.0, 9.0), (0.0, -36.0)])
 def test_kernels_that_hold_motion_are_motion_drawn_out(combined: PsfBank, coc_px: float, motion_px: tuple[float, float]) -> None:

@@ -57,6 +57,7 @@ def test_the_network_puts_it_behind_the_post_as_the_exact_renderer_does(network:
     assert (np.diff(across) < 0.01).all() and across[0] > 0.99 and 0.3 < across[6] < 0.9  # the post's soft rim
 
 
+@pytest.mark.slow
 def test_pixels_that_no_virtual_light_reaches_stay_bit_for_bit(network: OnnxNetwork) -> None:
     photo, _ = plate()
     found = insertion_of("between").insert(photo, [card()], network)

@@ -200,6 +200,7 @@ LIGHTS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", LIGHTS)
 def test_whole_numbers_are_as_good_as_double_precision(name: str) -> None:
     """To 1e-5 of what each channel is without lamps and the rounding of the result; coverage far brighter than colour costs nothing."""

@@ -58,7 +58,7 @@ def test_a_sharp_still_plane_is_reproduced_and_few_sharp_samples_are_not_swallow
     [
         pytest.param((Plane(checker(12.0, angle_rad=0.3), motion_px=(14.0, 9.0)),), 9.0, marks=pytest.mark.slow),
         pytest.param((Plane(checker(12.0, angle_rad=0.3), 10.0),), 12.0, marks=pytest.mark.slow),
-        (MOVING_WAVES, 12.0),
+        pytest.param(MOVING_WAVES, 12.0, marks=pytest.mark.slow),
         (FENCE, 6.0),
     ],
 )
@@ -88,6 +88,7 @@ def test_merging_and_sparse_statistics_cost_at_most_1_db() -> None:
         assert 1.0 <= counts.after < 0.8 * counts.before and counts.before <= full_counts.before
 
 
+@pytest.mark.slow
 def test_a_lamp_that_no_chosen_sample_saw_is_there() -> None:
     """One pixel of light at its own depth, 4 samples among 4096 of a tile: its light is kept."""
     lamp = Plane(even(100.0), -6.0, covers=lambda x, y: (np.abs(x - 30.5) < 0.5) & (np.abs(y - 12.5) < 0.5))
@@ -112,6 +113,7 @@ def test_a_resting_lamp_among_leaves_that_move_at_its_depth_stays_round() -> Non
     assert np.abs(split[8:21, 44:] - 0.1).max() < 0.05, "beyond 11.5 + 4 px from its middle there is no light of the lamp"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at_px", [30.1, 30.5, 30.9])
 def test_a_small_lamp_lies_where_it_is_within_its_pixel(at_px: float) -> None:
     """Its light is shared out among the nearest pixels; counted in one alone it would lie at 30.5, 0.4 px away."""
@@ -148,6 +150,7 @@ def test_parts_are_merged_where_that_shows_least() -> None:
     assert psnr(merged, exact) > psnr(coarse, exact) > psnr(whole, exact) + 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("parts", "gain_db"), [(2, 5.0), (4, 9.0)])
 def test_what_a_fence_hides_depends_on_the_place_in_the_pupil(parts: int, gain_db: float) -> None:
     """A texture 9 px out of focus behind bars 14 px out of focus, on the same side: each place of the pupil sees other pieces of it.

@@ -89,6 +89,7 @@ def test_four_look_ups_come_nearer_to_the_gaussian_than_one(v: tuple[float, floa
     assert errors[4] < 0.6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("v", [(9.0, 0.0, 9.0), (60.0, 0.0, 4.0)])
 def test_a_look_up_is_as_wide_along_both_axes(v: tuple[float, float, float]) -> None:
     """A box of the width w = alpha sigma and the tent of the interpolation have w^2/4 = 1.25 sigma^2; trilinear blends of two
@@ -118,6 +119,7 @@ def filtered(planes: np.ndarray, spans: np.ndarray, scale: float, length: tuple[
     return out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("scale", "length"), [(-5.3, (7.0, 3.0)), (1.7, (-4.0, 11.5)), (9.0, (0.0, 0.0))])
 @pytest.mark.parametrize(("across", "cell", "when"), [(1, 0, WHOLE), (2, 1, (-0.5, -0.25)), (2, 2, (0.25, 0.5)), (3, 4, (0.0, 0.5))])
 def test_the_window_filter_is_chance_through_a_part_of_pupil_and_shutter(

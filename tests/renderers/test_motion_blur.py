@@ -127,6 +127,7 @@ def fixture_combined(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bank
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", ["fence_1", "whirl_1"])
 def test_ray_traced_scenes_by_kernels_that_hold_motion(scene: str, combined: Path) -> None:
     """The bounds of the test above, from picture, depth and motion and from layers, and within 0.005 of motion drawn out."""

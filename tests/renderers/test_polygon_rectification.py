@@ -85,6 +85,7 @@ def is_image(polygon: np.ndarray, element: np.ndarray) -> bool:
     return bool((distances.min(axis=1) < 1e-9).all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FIGURE_6)
 def test_the_shapes_of_figure_6_are_enclosed_ever_more_tightly(name: str) -> None:
     """Section 6.1: "the approximation of the input kernel steadily improves as the number of output edges N increases"."""
@@ -142,6 +143,7 @@ def enumerated(outline: np.ndarray, directions: tuple[tuple[int, int], ...], max
                 yield polygon
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "directions", "max_edges"), [
     ("dart", PAPER_DIRECTIONS, 4), ("dart", EIGHTHS, 5), ("dart", EIGHTHS, 7),
     ("blunt heart", PAPER_DIRECTIONS, 4), ("blunt heart", EIGHTHS, 7), ("blunt heart", UPRIGHT, 8),
@@ -203,6 +205,7 @@ def test_the_circle_is_circumscribed_and_symmetry_kept_without_mirrors() -> None
     assert not is_image(rectify(outline, ((1, 0), (0, 1), (1, 1)), 12), MIRRORS["x"]), "directions that have no such mirror"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "elements"), [
     ("circle", [*MIRRORS.values(), QUARTER]), ("hexagon", [MIRRORS["x"], MIRRORS["y"]]), ("small heart", [MIRRORS["x"]]),
     ("large heart", [MIRRORS["x"]]), ("clover", [*MIRRORS.values(), QUARTER]), ("pentagram", [MIRRORS["x"]]),

@@ -90,6 +90,7 @@ def test_every_setting_means_the_same(changed: dict) -> None:
     assert np.abs(found - known).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_lamps_and_pixels_without_samples_are_the_same() -> None:
     """A lamp of 1e4, and a corner that nothing was sampled in; relative to the lamp single precision is good for 1e-6."""
     whole = fence_samples()
@@ -146,6 +147,7 @@ def test_a_gpu_gives_the_same_picture(screen_filter: str) -> None:
     np.testing.assert_array_equal(found.depth_m, known.depth_m)
 
 
+@pytest.mark.slow
 def test_how_much_is_done_at_a_time_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = by_torch(fence_samples())
     monkeypatch.setitem(AT_ONCE, DEVICE.type, (3000, 6000, 2000))

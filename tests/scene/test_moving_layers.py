@@ -142,7 +142,8 @@ def agreement(filmed: FilmedScene, samples: int) -> tuple[float, float, bool]:
     return scores[0], scores[1], MOTION in layer.extra
 
 
-@pytest.mark.parametrize("name", [pytest.param(each, marks=pytest.mark.slow if each in ("object", "pan") else ()) for each in CASES])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
 def test_one_picture_with_motion_is_as_many_pictures_averaged(name: str, alien: Scene) -> None:
     """Margins of about 3 dB below what was measured; what is left are light that moves over the surface, surfaces that come to
     be seen during the shutter, and the half pixel by which drawing out along a path softens."""
@@ -249,6 +250,7 @@ def test_rows_are_seen_one_after_the_other_within_overscan_as_well() -> None:
     assert shutter.row_delay_s(0.0, wide.height_px) < 0.0
 
 
+@pytest.mark.slow
 def test_rolled_rows_of_a_board_are_as_bands_of_one_row() -> None:
     """Even light, so that only the geometry counts: every row of the truth at its own time. Where light lies and how much there
     is agrees; edges are softer, by the half pixel of reading the picture once more and drawing it out."""

@@ -83,6 +83,7 @@ def test_joined_parts_are_the_file_written_in_one_go(tmp_path: Path, encoding: s
     assert sorted(file.name for file in tmp_path.iterdir()) == ["even.mkv", f"out{suffix}", f"whole{suffix}"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("encoding", "suffix"), INTER)
 def test_joined_groups_of_pictures_keep_pictures_and_times(tmp_path: Path, encoding: str, suffix: str) -> None:
     """Every joined picture is the one that its part shows, at its uneven time; the file can be entered at each segment."""

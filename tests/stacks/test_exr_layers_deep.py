@@ -209,6 +209,7 @@ def test_a_sequence_of_deep_files_is_read_as_such(tmp_path: Path) -> None:
     assert [len(found.layers(frame)) for frame in found.frames] == [2, 2]
 
 
+@pytest.mark.slow
 def test_real_deep_files(shared_data: Path) -> None:
     """Balls and Trunks are two of the four deep layers whose composite lies beside them (openexr-images, LowResLeftView).
 

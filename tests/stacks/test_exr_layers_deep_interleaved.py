@@ -88,6 +88,7 @@ def test_sizes_are_compared(tmp_path: Path) -> None:
     refused("expected a deep picture", interleaved, [], [sheet(1.0)])
 
 
+@pytest.mark.slow
 def test_real_deep_pictures_by_the_command(shared_data: Path, tmp_path: Path) -> None:
     """Balls among trunks, in both orders of arguments, are the flat picture of all their samples.
 

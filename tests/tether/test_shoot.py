@@ -184,6 +184,7 @@ def test_a_shoot_goes_on_only_as_it_was(tmp_path: Path) -> None:
     refused("damaged", taken, FEW, camera, tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("bump_gaps", "warned"), [(0.0, False), (0.1, False), (0.5, True), (-0.6, True)])
 def test_slice_0_shot_again_tells_a_bumped_ring(tmp_path: Path, bump_gaps: float, warned: bool) -> None:
     """The lens slips on its gear before the last shot. The error comes out in gaps between slices, with its sign.

@@ -103,6 +103,7 @@ def test_a_turning_camera_is_found_with_its_focal_length(moving: float) -> None:
     assert np.median([fit.fitting for fit in solve.fits.values()]) == pytest.approx(1.0 - moving, abs=0.08)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moving", [0.0, 0.25])
 def test_a_flat_scene_is_found_with_focal_length_and_way(moving: float) -> None:
     """Seen from -25 to 25 degrees: the focal length to 2 %, the way of 1.6 m, at the unit that it is in, to 1 cm."""

@@ -107,6 +107,7 @@ def test_deepfocus_learns_to_blur_keeps_what_is_in_focus_and_has_no_favourite_co
     assert _psnr_db(network(x[:, [*order, 3]]), target[:, order]) == pytest.approx(learnt_db, abs=0.5)
 
 
+@pytest.mark.slow
 def test_neural_camera_blurs_every_colour_alike_and_keeps_a_light_far_above_white() -> None:
     """Colours exchanged before or after: the same, with one mixture for all of them."""
     x, _ = _picture(100, (0.0, 1.0))

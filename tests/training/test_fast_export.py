@@ -64,6 +64,7 @@ def test_coarse_taps_spread_like_the_kernel_and_keep_its_sum(factor: int) -> Non
     assert tent(factor).sum() == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 def test_the_budget_holds_for_pictures_it_was_not_chosen_on() -> None:
     """A loss of 0.2 dB for a network 42 dB from the truth is a difference of at most 42 + 13.3 dB: 10 lg(10^0.02 - 1) = -13.3."""
     largest_px = 21.0

@@ -137,6 +137,7 @@ def _trained_snr_db(settings: NetworkSettings, pairs: list[tuple[Tensor, Tensor]
     return 10.0 * math.log10(float(signal / noise))
 
 
+@pytest.mark.slow
 def test_a_network_that_knows_the_place_learns_cat_eyes() -> None:
     """Discs clipped by a rim that moves with the place: one kernel can only learn their mean (8.3 dB, against 13.4 with four)."""
     pairs = [_lights(seed) for seed in range(16)]

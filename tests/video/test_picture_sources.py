@@ -42,7 +42,8 @@ def checksums(path: Path) -> list[tuple[int, int]]:
         return [(frame.pts, luma_hash(frame)) for frame in container.decode(video=0)]
 
 
-@pytest.mark.parametrize("step", [29, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("step", [29, 1])
 @pytest.mark.parametrize("name", CLIPS)
 def test_real_clips_are_entered_anywhere_at_the_exact_frame(shared_data: Path, name: str, step: int) -> None:
     """Every frame (or every 29th) is entered at, B-frames and uneven times included; decoded bytes are compared."""
@@ -65,6 +66,7 @@ def test_real_clips_are_entered_anywhere_at_the_exact_frame(shared_data: Path, n
             assert entered == expected[start : start + 2], f"entered at frame {start}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CLIPS)
 def test_a_stretch_of_a_real_clip_is_what_reading_it_all_gives(shared_data: Path, name: str) -> None:
     path = shared_data / "video" / name

@@ -120,6 +120,7 @@ def receiver_of(source: BrowserCameraSource) -> Any:
     return found
 
 
+@pytest.mark.slow
 async def test_loss_and_reordering_on_the_way_cost_no_torn_picture(caplog: pytest.LogCaptureFixture) -> None:
     """Each tenth packet is lost once and some arrive late: pictures go on in order, and the decoder never gets a broken one."""
     draw, noisy = random.Random(4), Canvas(RED)

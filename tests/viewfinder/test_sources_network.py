@@ -173,6 +173,7 @@ def opened(source: NetworkStreamSource) -> Iterator[tuple[Iterator[CameraFrame],
     assert not [each for each in threading.enumerate() if each.name.startswith("decode ")]
 
 
+@pytest.mark.slow
 def test_udp_comes_goes_and_comes_again(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tagged BT.709: its matrix is used although so small a picture would be BT.601 untagged (up to 12 codes apart)."""
     monkeypatch.setattr("viewfinder.sources.playback.READ_TIMEOUT_S", 1.0)

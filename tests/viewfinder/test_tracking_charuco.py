@@ -67,6 +67,7 @@ def assert_exact(poses: list[TrackedPose | None]) -> None:
         assert error.turn_deg < 0.15 and error.place_mm < 1.5 and error.object_px < 1.0
 
 
+@pytest.mark.slow
 def test_corners_are_found_without_an_offset() -> None:
     """A slip between conventions of pixels would show as half a pixel."""
     frame, true = small_clip()[0]

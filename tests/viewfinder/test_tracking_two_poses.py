@@ -121,6 +121,7 @@ def test_no_pose_that_is_far_off_is_called_certain_in_many_shots(track: Tracking
     assert_no_flip_is_called_certain(track, tuple(range(10, 20)))
 
 
+@pytest.mark.slow
 def test_the_same_frames_jump_without_it() -> None:
     """The frames are hard: taking the nearer pose shows wrong ones in more than 1 of 25 of all, tens of degrees off; in these alone."""
     off_deg = errors(nearest_to_before, (0,), range(5, 12))[:, 0]
@@ -198,6 +199,7 @@ def traced(distance_m: float, elevation_deg: float, frames: int) -> Iterator[tup
     return camera_frames(clip)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("distance_m", "elevation_deg", "least_shown", "least_certain"), [(1.8, 88.0, 9, 0), (1.5, 70.0, 11, 9)], ids=["head_on", "tilted"]
 )

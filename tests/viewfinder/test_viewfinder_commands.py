@@ -174,6 +174,7 @@ opening.open_source = slowly
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no SIGINT for another process")
 def test_ctrl_c_while_it_starts_ends_it_cleanly(folder: Path) -> None:
     """While the camera is being opened; the tracker's and the layer's threads run by then."""

@@ -104,6 +104,7 @@ async def test_the_object_stands_where_it_must_and_the_plate_stays(clip: LiveCli
     assert np.all(np.diff([(each.sequence, each.status["captured_ms"]) for each in seen], axis=0) >= 0)
 
 
+@pytest.mark.slow
 async def test_a_slow_camera_is_tracked_although_its_pictures_are_shown_twice(clip: LiveClip, tmp_path: Path) -> None:
     """At 6 frames per second each is composited again after 0.1 s; that is no step of the camera for a tracker that follows points."""
     async with shown(clip, tmp_path, ClipCamera(clip, fps=6.0)) as (_, watch):
@@ -113,6 +114,7 @@ async def test_a_slow_camera_is_tracked_although_its_pictures_are_shown_twice(cl
     assert max(off_px(each, clip) for each in well_tracked(seen)) < REGISTERED_PX
 
 
+@pytest.mark.slow
 async def test_three_viewers_share_one_encoding_and_slow_ones_hold_up_nobody(clip: LiveClip, tmp_path: Path) -> None:
     """Beside them one of the JPEG stream that took one picture and never says that it has shown it."""
     async with (

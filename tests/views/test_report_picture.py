@@ -317,6 +317,7 @@ def test_a_picture_too_small_to_be_judged_never_passes(tmp_path: Path) -> None:
     assert "Not passed: not all gates of the all-in-focus pictures could be judged." in page and "nobody looked" not in page
 
 
+@pytest.mark.slow
 def test_strict_asks_for_every_gate_and_fails_on_a_fault_whatever_is_allowed(tmp_path: Path) -> None:
     """A right stack without lens: 1 for the gates that could not be judged, 0 where each of them was allowed, 1 where one was not."""
     write_made(tmp_path / "view_0", right())

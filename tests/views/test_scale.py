@@ -220,6 +220,7 @@ def test_focus_distances_give_the_scale_with_wrong_points_and_an_offset() -> Non
     assert answer.facts["metres_per_unit_without_offset"] / METRES_PER_UNIT > 1.03
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("phase", [0.0, 0.25, 0.5, 0.75])
 def test_coarse_distances_are_known_to_be_coarse(phase: float) -> None:
     """Nikon's d = 0.01 m * 10^(v / 40) has steps of 5.9 %, which the intervals of the stated distances tell."""
