@@ -63,7 +63,7 @@ def merge_aloud(
     scene: Path, registration: Path | None = None, prefer: Literal["near", "far"] | None = None, *, overwrite: bool
 ) -> "list[FocalStack]":
     """Merge the stacks of a scene and tell of those that are new, or of all where none is."""
-    from capture.merging.merge import merge_scene
+    from capture.merging.merge import ghosts_text, merge_scene
     from capture.merging.metres.known_metres import scale_options
     from capture.merging.metres.relative_stack import ORDER
     from capture.merging.preferred_side import preferred_lines, preferred_side
@@ -87,7 +87,7 @@ def merge_aloud(
             continue
         _tell(stack)
         guess(metres_note(stack))
-        for told in (stack.metadata.get(ORDER), metres_facts(stack).get("why") if not metres_note(stack) else None):
+        for told in (ghosts_text(stack), stack.metadata.get(ORDER), metres_facts(stack).get("why") if not metres_note(stack) else None):
             if told:
                 say(f"  {told}")
         for line in preferred_lines(stack):

@@ -15,6 +15,7 @@ from capture.merging.all_in_focus import NARROW_CROSSOVER, crossover_of, sharp_a
 from capture.merging.depth_edges import with_edges_of_light
 from capture.merging.depth_from_focus import focus_map, vetoed
 from capture.merging.focus_volume import focus_volume
+from capture.merging.ghosts import Mended, without_ghosts
 from capture.merging.lights import Extremes, no_lights, spread_light
 from capture.merging.merged_pictures import depth_m_of, write_readable_pictures
 from capture.merging.metres.relative_stack import as_stated, in_focus_order, with_solved_blur
@@ -41,6 +42,9 @@ _IN_COMMON = 0.2
 """Neighbours that correlate less show nothing in common: two sheets of white reach 0, hand-held slices with people walking 0.93."""
 HIGHLIGHTS = "highlights"
 """Key in a stack's metadata: how many lights were drawn anew, and the largest value that their measured flux supports."""
+
+GHOSTS = "ghosts"
+"""Key in a stack's metadata: share of the picture that was unlike every slice, that is now, and that was taken from one slice each."""
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
@@ -78,10 +82,13 @@ def _merged(stack: FocalStack, overwrite: bool, registration: Path | None, prefe
     volume = volume.without(spread_light(volume.lights))
     merged, focus = _with_registration(stack, slices), focus_map(volume, no_lights(volume.shape), slices.saturated)
     sharp = sharp_all_in_focus(slices.stored, focus.focus_index, volume, _crossover(merged, volume.shape[1]))
+    mended = without_ghosts(sharp, slices.stored, slices.valid, merged.to_rec709)
+    sharp = mended.picture if mended else sharp
     lights, restored = restored_lights(slices.stored, sharp, extremes, opening=known_opening(stack.lens))
     if restored:
         sharp, focus = with_restored_lights(sharp, restored), focus_map(volume, lights, slices.saturated)
-    merged = _with_highlights(merged, restored)
+    focus = mended.placed(focus) if mended else focus
+    merged = _with_findings(merged, restored, mended)
     if stack.is_metric:
         placed = with_edges_of_light(focus, sharp, near_first=is_near_first(stack))
         depth_m = depth_m_of(merged, placed.focus_index)
@@ -100,9 +107,19 @@ def _merged(stack: FocalStack, overwrite: bool, registration: Path | None, prefe
     return merged
 
 
-def _with_highlights(stack: FocalStack, restored: Sequence[RestoredLight]) -> FocalStack:
-    found = {"drawn": len(restored), "largest_supported": max((each.supported for each in restored), default=0.0)}
-    return replace(stack, metadata=stack.metadata | {HIGHLIGHTS: found})
+def _with_findings(stack: FocalStack, restored: Sequence[RestoredLight], mended: Mended | None) -> FocalStack:
+    found: dict[str, object] = {
+        HIGHLIGHTS: {"drawn": len(restored), "largest_supported": max((each.supported for each in restored), default=0.0)}
+    }
+    if mended is not None:
+        found[GHOSTS] = {"before": mended.before, "after": mended.after, "share": float((mended.chosen >= 0).mean())}
+    return replace(stack, metadata={key: value for key, value in stack.metadata.items() if key != GHOSTS} | found)
+
+
+def ghosts_text(stack: FocalStack) -> str:
+    """Say how much of a merged picture was cut anew because something moved; empty where nothing was."""
+    found = stack.metadata.get(GHOSTS)
+    return f"something moved between the slices: {found['share']:.0%} of the picture is taken whole from one slice each" if found else ""
 
 
 def _require_a_sweep(stack: FocalStack) -> None:

@@ -22,7 +22,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
-from capture.report.picture_sharpness import KEPT_DETAIL, UNLIKE
+from capture.merging.ghosts import UNLIKE
+from capture.report.picture_sharpness import KEPT_DETAIL
 
 LARGEST_LOST = 0.002
 LARGEST_FLAT = 1.1

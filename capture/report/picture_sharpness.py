@@ -13,17 +13,14 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float32, Int, Shaped
 
+from capture.merging.ghosts import UNLIKE, Likeness
 from capture.stacks.slice_looks import BLOCK_PX, detail_of_blocks
-from mrbokeh.images.color import linear_to_srgb, srgb_codes
+from mrbokeh.images.color import linear_to_srgb
 
 BORDER_BLOCKS = 2
 """Blocks at the border of the picture that are left out: slices have no data there, or mirrored data."""
 KEPT_DETAIL = 0.6
 FLAT_PERCENTILE = 30.0
-UNLIKE = 0.05
-"""A pixel that differs more from every slice, as shares of display white around it, is a mixture that none shows."""
-_SAME_PX, _AROUND_PX = 1.0, 8.0
-"""Standard deviations: noise and borders between slices within the first are no difference; differences are averaged over the second."""
 FEWEST_FLAT = 20
 """Fewer blocks have no 95th percentile; a picture of 288 x 312 pixels has as many."""
 
@@ -121,16 +118,13 @@ class PictureEvidence:
 
     def __init__(self, picture: Rgb) -> None:
         """Take the all-in-focus picture, of the size of the slices' files."""
-        self._coded = _coded(picture)
-        self._unlike = np.full(picture.shape[:2], 255, np.uint8)
-        self._seen = np.zeros(picture.shape[:2], bool)
+        self._likeness = Likeness(picture)
         self._details: list[Blocks] = []
         self._brightest: list[AllBlocks] = []
 
     def add(self, rgb: Rgb, camera_rgb: Rgb, valid: Mask) -> None:
         """Add a slice at the size of its file, in Rec.709 and as it is stored; blocks in which it lacks data do not count as sharp."""
-        np.minimum(self._unlike, cv2.absdiff(self._coded, _coded(rgb)).max(axis=2), out=self._unlike, where=valid)
-        self._seen |= valid
+        self._likeness.add(rgb, valid)
         self._details.append(block_detail(rgb, valid))
         self._brightest.append(_largest_of_blocks(camera_rgb))
 
@@ -139,9 +133,8 @@ class PictureEvidence:
         of_slices = np.stack(self._brightest)
         sharpest = SharpestSlices.of_details(self._details, float(of_slices.max()))
         sharpness = sharpest.measure(picture) if sharpest.detail.size else None
-        unlike = np.where(self._seen, self._unlike, 0).astype(np.float32) / np.float32(255.0)
         return PictureLook(
-            unlike=cv2.GaussianBlur(unlike, (0, 0), _AROUND_PX),
+            unlike=self._likeness.unlike(),
             sharpest=sharpest,
             sharpness=sharpness,
             picture=picture,
@@ -186,11 +179,6 @@ class PictureLook:
         """Return x, y of the first pixel of a block of `sharpest`."""
         border = border_blocks(self.picture.shape)
         return (column + border) * BLOCK_PX, (row + border) * BLOCK_PX
-
-
-def _coded(rgb: Rgb) -> Shaped[np.ndarray, "height width 3"]:
-    """Return a picture as displayed, in 8 bits, without what noise and the border of a pixel change."""
-    return cv2.GaussianBlur(srgb_codes(rgb, np.uint8), (0, 0), _SAME_PX)
 
 
 def display_luminance(rgb: Rgb) -> Float32[np.ndarray, "height width"]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from capture.merging.merge import HIGHLIGHTS
+from capture.merging.merge import HIGHLIGHTS, ghosts_text
 from capture.poses.sparse_model import POSES_NAME, SCALE_NAME, SparseModel, read_sparse_model
 from capture.report import gates as rules
 from capture.report.exclusion import FEWEST_SLICES
@@ -95,8 +95,9 @@ def _seams(findings: StackFindings) -> Gate:
 
 
 def _ghosts(findings: StackFindings) -> Gate:
-    unlike = findings.picture.unlike
-    return rules.GHOSTS.judge(findings.name, unlike, f"{unlike:.2%} of the picture is unlike every slice", unlike <= rules.LARGEST_UNLIKE)
+    unlike, told = findings.picture.unlike, ghosts_text(findings.stack)
+    measured = f"{unlike:.2%} of the picture is unlike every slice" + (f"; {told}" if told else "")
+    return rules.GHOSTS.judge(findings.name, unlike, measured, unlike <= rules.LARGEST_UNLIKE)
 
 
 def _light(findings: StackFindings) -> Gate:
