@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Float32, Int, Int16, Shaped, UInt8
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-from capture.merging.all_in_focus import painted
+from capture.merging.all_in_focus import BANDS, painted
 from capture.merging.depth_from_focus import FocusMap
 from mrbokeh.images.color import srgb_codes
 
@@ -41,7 +41,6 @@ _KEPT_DETAIL, _LOST_DETAIL, _MOST_TEXTURED = 0.8, 0.4, 3.0
 _GHOST = 20.0
 _NO_DATA = 1e3
 _SWEEPS = 3
-_BANDS = 3
 _PER_UNIT = 1000.0
 """Costs become whole numbers, for the maximal flow."""
 
@@ -110,9 +109,10 @@ def without_ghosts(picture: Rgb, slices: Slices, valid: Callable[[int], Mask], t
     before = float((unlike > UNLIKE).mean())
     if before <= LEAST_SHARE:
         return None
-    chosen = _Cells.of(unlike).chosen(picture, slices, valid, to_rec709)
+    cells = _Cells.of(unlike)
+    chosen = cells.chosen(picture, slices, valid, to_rec709)
     shares = ((rgb, (chosen == index).astype(np.float32)) for index, rgb in enumerate(slices()))
-    mended = painted(picture, shares, (chosen >= 0).astype(np.float32), _BANDS)
+    mended = painted(picture, shares, (chosen >= 0).astype(np.float32), cells.bands)
     after = float((_unlike(mended, slices, valid, to_rec709) > UNLIKE).mean())
     if after > 0.5 * before:
         return None
@@ -141,6 +141,11 @@ class _Cells:
         side_px = max(_LEAST_CELL_PX, -(-max(height, width) // (_CELLS * _PARTS)) * _PARTS)
         grid = cls(side_px, (-(-height // side_px), -(-width // side_px)), (height, width), np.zeros(0, np.float32))
         return replace(grid, ghosts=grid._parts(unlike / np.float32(UNLIKE), 1).max(axis=(1, 2)))
+
+    @property
+    def bands(self) -> int:
+        """Return over how many bands slices go over into one another: brightness within about two cells."""
+        return BANDS + round(np.log2(self.side_px / _LEAST_CELL_PX))
 
     def chosen(
         self, picture: Rgb, slices: Slices, valid: Callable[[int], Mask], to_rec709: Callable[[Rgb], Rgb]
