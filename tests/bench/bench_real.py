@@ -2,7 +2,8 @@
 
 Every stack and pair in DATA goes through `mrbokeh capture` with no option set, each command a process of its own. Measured, without truth
 (capture.report.picture_sharpness): lost, the share of textured blocks with less than 60 % of the detail of their sharpest slice; flat, how
-much flat blocks are raised by seams and noise; top, the largest value over that of the slices. The same of FocusWeave and of enfuse after
+much flat blocks are raised by seams and noise; top, the largest value over that of the slices; unlike, the share that no slice shows
+(capture.merging.ghosts). The same of FocusWeave and of enfuse after
 align_image_stack where they are installed (on the path, or where FOCUSWEAVE, ENFUSE and ALIGN_IMAGE_STACK say), CPU seconds and memory of
 all, slices left out and made again by refocusing, focus positions beside stated ones, and the rank of fused pairs among published methods.
 
@@ -99,7 +100,8 @@ def _words(figures: Figures) -> str:
     if figures.lost is None or figures.flat is None or figures.top is None:
         return figures.said
     cost = "" if figures.cpu_s is None or figures.memory_mb is None else f" {figures.cpu_s:5.1f} s {figures.memory_mb:4.0f} MB"
-    return f"lost {100 * figures.lost:5.2f} % flat {figures.flat:4.2f} top {figures.top:5.2f}{cost}"
+    unlike = "" if figures.unlike is None else f" unlike {100 * figures.unlike:5.3f} %"
+    return f"lost {100 * figures.lost:5.2f} % flat {figures.flat:4.2f} top {figures.top:5.2f}{unlike}{cost}"
 
 
 def _ranking(data: Path, measuring: Measuring, results: list[StackResult]) -> Ranking | None:

@@ -148,7 +148,7 @@ def _kind(met: bool | None) -> str:
 def _stack_table(bench: Bench) -> str:
     headings = ["stack", "slices", "size"]
     for name in (OURS, *bench.peers):
-        headings += [f"{name}: lost %", "flat", "top", "CPU s", "MB"]
+        headings += [f"{name}: lost %", "flat", "top", "unlike %", "CPU s", "MB"]
     headings += ["report CPU s", "gates judged", "failed", "left out dB", "with residuals", "focus"]
     return table(headings, [_stack_row(result, bench.peers) for result in bench.results])
 
@@ -173,6 +173,7 @@ def _figure_cells(figures: Figures, met: tuple[bool | None, bool | None, bool | 
     lost = None if figures.lost is None else 100.0 * figures.lost
     for value, style, verdict in zip((lost, figures.flat, figures.top), (".2f", ".2f", ".2f"), met, strict=True):
         yield cell(_number(value, style), _kind(verdict) if verdict is not None else "number")
+    yield cell(_number(None if figures.unlike is None else 100.0 * figures.unlike, ".3f"), "number")
     yield cell(_number(figures.cpu_s, ".1f"), "number")
     yield cell(_number(figures.memory_mb, ".0f"), "number")
 

@@ -20,7 +20,7 @@ from mrbokeh.system.errors import InputError
 from tests.bench.real_crops import Crop, Place, worst_places, write_crops
 from tests.bench.real_peers import features_of_slices, on_slices, peer_result
 from tests.bench.real_sets import RealStack
-from tests.bench.real_stack import Captured, Figures, Rgb, capture, covered_blocks, gate_facts, measured_where
+from tests.bench.real_stack import Captured, Figures, Rgb, capture, covered_blocks, gate_facts, measured_where, unlike_share
 
 ROOT = Path(__file__).resolve().parents[2]
 OURS = "mrbokeh"
@@ -126,7 +126,10 @@ class Measuring:
     def _beside_peers(self, stack: RealStack, captured: Captured, made: FocalStack, picture: Rgb) -> tuple[dict[str, Figures], list[Shown]]:
         sharpest = SharpestSlices.of(made.iter_rgb(), (made.slice_masks(index).valid for index in range(len(made))))
         own = sharpest.measure(picture)
-        figures, pictures = {OURS: Figures(own.lost, own.flat, own.top, *captured.making)}, {OURS: picture}
+        figures, pictures = (
+            {OURS: Figures(own.lost, own.flat, own.top, *captured.making, unlike=unlike_share(made, picture))},
+            {OURS: picture},
+        )
         slices = features_of_slices(made.iter_rgb(), len(made)) if self.peers else []
         for name, version in self.peers.items():
             peer = peer_result(name, version, stack, self.cache)
@@ -136,7 +139,8 @@ class Measuring:
                 continue
             measured = sharpest.measure(laid[0])
             lost, flat = measured_where(sharpest, measured, covered_blocks(laid[1]))
-            figures[name], pictures[name] = Figures(lost, flat, measured.top, peer.cpu_s, peer.memory_mb), laid[0]
+            unlike = unlike_share(made, *laid)
+            figures[name], pictures[name] = Figures(lost, flat, measured.top, peer.cpu_s, peer.memory_mb, unlike=unlike), laid[0]
         places = worst_places(sharpest, own, picture, TOP_BAR)
         stems = [f"{stack.file_name}_{number}" for number in range(len(places))]
         crops = [write_crops(self.crop_folder(), stem, place, made.slice_rgb, pictures) for stem, place in zip(stems, places, strict=True)]

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
+from capture.merging.ghosts import UNLIKE, Likeness
 from capture.report.picture_sharpness import SharpestSlices, Sharpness, inner_blocks
 from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks
 from mrbokeh.system.atomic_files import read_json
@@ -17,6 +19,7 @@ from tests.bench.real_sets import RealStack
 
 Rgb = Float32[np.ndarray, "height width 3"]
 BlockMask = Bool[np.ndarray, "rows columns"]
+Mask = Bool[np.ndarray, "height width"]
 
 TIMEOUT_S = 3600.0
 STAGES = ("ingest", "merge", "process")
@@ -33,6 +36,7 @@ class Figures:
     cpu_s: float | None = None
     memory_mb: float | None = None
     said: str = ""
+    unlike: float | None = None
 
 
 @dataclass(frozen=True)
@@ -99,6 +103,16 @@ def gate_facts(scene: Path) -> dict[str, Any]:
 def covered_blocks(covered: Bool[np.ndarray, "height width"]) -> BlockMask:
     """Blocks whose pixels a picture covers all, laid out as those of `block_detail`."""
     return np.asarray(inner_blocks(covered).all(axis=(1, 3)))
+
+
+def unlike_share(made: FocalStack, picture: Rgb, covered: Mask | None = None) -> float:
+    """Return the share of a picture that is unlike every slice, where it covers them: ghosts. Its border is left out."""
+    likeness = Likeness(picture)
+    for index, rgb in enumerate(made.iter_rgb()):
+        likeness.add(rgb, made.slice_masks(index).valid)
+    known = np.ones(picture.shape[:2], np.uint8) if covered is None else covered.astype(np.uint8)
+    inside = cv2.erode(known, np.ones((65, 65), np.uint8), borderValue=0) > 0
+    return float((likeness.unlike()[inside] > UNLIKE).mean()) if inside.any() else 0.0
 
 
 def measured_where(sharpest: SharpestSlices, measured: Sharpness, known: BlockMask) -> tuple[float, float]:
