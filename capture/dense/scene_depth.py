@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32
 
+from capture.merging.merge import GHOSTS
 from capture.merging.merged_pictures import write_readable_pictures
 from capture.merging.preferred_side import PREFERRED
 from capture.merging.retouch import RETOUCHES
@@ -303,7 +304,7 @@ def write_deepened(stack: FocalStack, found: DenseDepth, record: dict[str, objec
 
     record: what the depth was made from.
     """
-    kept = {key: value for key, value in stack.metadata.items() if key not in (RETOUCHES, PREFERRED)}
+    kept = {key: value for key, value in stack.metadata.items() if key not in (RETOUCHES, PREFERRED, GHOSTS)}
     deepened = replace(stack, metadata=kept | {DEPTH_SOURCE: record})
     write_merged(
         stack.folder,

@@ -17,29 +17,35 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from capture.merging.all_in_focus import BANDS, painted
 from capture.merging.depth_from_focus import FocusMap
 from mrbokeh.images.color import srgb_codes
+from mrbokeh.system.console import track
 
 UNLIKE = 0.05
 """A pixel that differs more from every slice, as shares of display white around it, is a mixture that none shows."""
 _SAME_PX, _AROUND_PX = 1.0, 8.0
 """Standard deviations: noise and borders between slices within the first are no difference; differences are averaged over the second."""
 LEAST_SHARE = 0.0003
-"""Of 19 photographed stacks those without ghosts have at most a third of this share beyond UNLIKE, the others five times as much."""
-MOVED_CONFIDENCE = 0.5
-"""Confidence of the depth of what moved: the slice that shows it is known, and where it would have been sharpest is not."""
+"""Share of the picture beyond UNLIKE: 35 photographed stacks without ghosts have at most 0.4 of it, five with some at least three times."""
+MOVED_CONFIDENCE = 0.25
+"""Largest confidence of the depth of what moved: the slice that shows it is known, and where it would have been sharpest is not."""
 
-# Cells are cut apart or not; the finest are 8 px, and the long side has about so many of them.
 _LEAST_CELL_PX, _CELLS = 8, 160
+"""Sides of the cells that are taken from one slice each, and how many lie along the long side of a large picture, at least."""
 _PARTS = 4
-"""Slices are compared in so many parts of a cell along each side, over this many of them."""
-_PARTS_SIGMA = 1.0
+"""Two slices are compared in this many parts of a cell along each side, blurred by a part."""
 _SEAM = 0.03
-"""A cut between cells in which two slices differ by this share of white costs 1, and a little for its length, as each new cell does."""
+"""A seam between cells in which two slices differ by this share of white costs 1."""
 _LENGTH, _TAKEN = 0.02, 0.05
-_BLURRED = 3.5
-"""What a cell costs that loses most of its detail, where it has as much as the median cell."""
-_KEPT_DETAIL, _LOST_DETAIL, _MOST_TEXTURED = 0.8, 0.4, 3.0
-_GHOST = 20.0
-_NO_DATA = 1e3
+"""What any seam costs for its length, and a cell that does not stay as it was."""
+_BLURRED, _MOST_TEXTURED = 3.0, 3.0
+"""What a cell costs in a slice without its detail, times its detail in that of the median cell, up to the second."""
+_KEPT_DETAIL, _LOST_DETAIL = 0.8, 0.4
+"""Shares of a cell's detail: with the first nothing is lost, with the second everything."""
+_GHOST, _LEAST_UNLIKE, _MOST_UNLIKE = 20.0, 0.4, 2.4
+"""What a cell costs that stays unlike every slice, for each UNLIKE from the second to the third."""
+_NO_DATA, _MISSING = 1e3, 0.1
+"""What a cell costs in a slice that lacks more than the second of it."""
+_CHANGED = 0.5
+"""Where the mended picture differs from the picture by more than this share of UNLIKE, something else is seen."""
 _SWEEPS = 3
 _PER_UNIT = 1000.0
 """Costs become whole numbers, for the maximal flow."""
@@ -48,6 +54,7 @@ Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
 Mask = Bool[np.ndarray, "height width"]
 Slices = Callable[[], Iterable[Rgb]]
+Seen = Callable[[], Iterable[tuple[Rgb, Mask]]]
 Codes = UInt8[np.ndarray, "height width 3"]
 Labels = Int[np.ndarray, " cells"]
 Borders = Int[np.ndarray, " borders"]
@@ -84,102 +91,104 @@ class Mended:
     """A picture without its ghosts.
 
     before, after: share of the picture that is unlike every slice. chosen: (H, W) index of the slice that a place was taken from, -1
-    where the picture stayed. moved: (H, W) where ghosts were.
+    where the picture stayed. changed: (H, W) where something else is seen than before.
     """
 
     picture: Rgb
     before: float
     after: float
     chosen: Int16[np.ndarray, "height width"]
-    moved: Mask
+    changed: Mask
 
     def placed(self, focus: FocusMap) -> FocusMap:
-        """Return depth from focus with what moved in the slice that shows it."""
-        there = self.moved & (self.chosen >= 0)
+        """Return depth from focus with what is seen anew in the slice that shows it."""
+        there = self.changed & (self.chosen >= 0)
         index = np.where(there, self.chosen.astype(np.float32), focus.focus_index)
-        return replace(focus, focus_index=index, confidence=np.where(there, np.float32(MOVED_CONFIDENCE), focus.confidence))
+        sure = np.where(there, np.minimum(focus.confidence, np.float32(MOVED_CONFIDENCE)), focus.confidence)
+        return replace(focus, focus_index=index, confidence=sure)
 
 
-def without_ghosts(picture: Rgb, slices: Slices, valid: Callable[[int], Mask], to_rec709: Callable[[Rgb], Rgb]) -> Mended | None:
+def without_ghosts(picture: Rgb, slices: Slices, seen: Seen, to_rec709: Callable[[Rgb], Rgb]) -> Mended | None:
     """Take the places around ghosts from one slice each; None where there are none, or where that does not halve them.
 
-    picture: all in focus, in the RGB of the slices. slices: gives a fresh pass over them. valid: where one has data.
+    picture: all in focus, in the RGB of the slices. slices, seen: give fresh passes over them, the second in linear Rec.709 and with where
+    each has data.
     """
-    unlike = _unlike(picture, slices, valid, to_rec709)
+    unlike = unlike_slices(to_rec709(picture), seen())
     before = float((unlike > UNLIKE).mean())
     if before <= LEAST_SHARE:
         return None
-    cells = _Cells.of(unlike)
-    chosen = cells.chosen(picture, slices, valid, to_rec709)
-    shares = ((rgb, (chosen == index).astype(np.float32)) for index, rgb in enumerate(slices()))
-    mended = painted(picture, shares, (chosen >= 0).astype(np.float32), cells.bands)
-    after = float((_unlike(mended, slices, valid, to_rec709) > UNLIKE).mean())
+    cells = _Cells.over(unlike)
+    chosen = cells.chosen(unlike, to_rec709(picture), seen())
+    taken = ((rgb, (chosen == index).astype(np.float32)) for index, rgb in enumerate(slices()))
+    mended = painted(picture, taken, (chosen >= 0).astype(np.float32), cells.bands)
+    after = float((unlike_slices(to_rec709(mended), seen()) > UNLIKE).mean())
     if after > 0.5 * before:
         return None
-    return Mended(picture=mended, before=before, after=after, chosen=chosen, moved=unlike > 0.5 * UNLIKE)
+    everywhere = np.ones(chosen.shape, bool)
+    changed = unlike_slices(to_rec709(picture), [(to_rec709(mended), everywhere)]) > _CHANGED * UNLIKE
+    return Mended(picture=mended, before=before, after=after, chosen=chosen, changed=changed)
 
 
-def _unlike(picture: Rgb, slices: Slices, valid: Callable[[int], Mask], to_rec709: Callable[[Rgb], Rgb]) -> Plane:
-    likeness = Likeness(to_rec709(picture))
-    for index, rgb in enumerate(slices()):
-        likeness.add(to_rec709(rgb), valid(index))
+def unlike_slices(picture: Rgb, seen: Iterable[tuple[Rgb, Mask]]) -> Plane:
+    """Return how unlike all slices a picture is, as `Likeness` does. seen: slices in linear Rec.709, and where each has data."""
+    likeness = Likeness(picture)
+    for rgb, valid in seen:
+        likeness.add(rgb, valid)
     return likeness.unlike()
 
 
 @dataclass(frozen=True)
 class _Cells:
-    """Grid of square cells over a picture. ghosts: (cells,) how unlike every slice the worst pixel of each is, in UNLIKE."""
+    """Grid of square cells over a picture of (H, W); the last ones reach beyond it."""
 
     side_px: int
     shape: tuple[int, int]
-    picture_shape: tuple[int, int]
-    ghosts: OfCells
 
     @classmethod
-    def of(cls, unlike: Plane) -> "_Cells":
-        height, width = unlike.shape
-        side_px = max(_LEAST_CELL_PX, -(-max(height, width) // (_CELLS * _PARTS)) * _PARTS)
-        grid = cls(side_px, (-(-height // side_px), -(-width // side_px)), (height, width), np.zeros(0, np.float32))
-        return replace(grid, ghosts=grid._parts(unlike / np.float32(UNLIKE), 1).max(axis=(1, 2)))
+    def over(cls, plane: Plane) -> "_Cells":
+        height, width = plane.shape
+        side_px = max(_LEAST_CELL_PX, max(height, width) // (_CELLS * _PARTS) * _PARTS)
+        return cls(side_px, (-(-height // side_px), -(-width // side_px)))
 
     @property
     def bands(self) -> int:
-        """Return over how many bands slices go over into one another: brightness within about two cells."""
+        """Return over how many bands slices go over into one another: brightness within four to six cells."""
         return BANDS + round(np.log2(self.side_px / _LEAST_CELL_PX))
 
-    def chosen(
-        self, picture: Rgb, slices: Slices, valid: Callable[[int], Mask], to_rec709: Callable[[Rgb], Rgb]
-    ) -> Int16[np.ndarray, "height width"]:
-        """Return the slice that each pixel is taken from, -1 where the picture stays."""
-        seen, details, missing = [self._seen(picture, to_rec709)[0]], [], []
-        for index, rgb in enumerate(slices()):
-            small, detail = self._seen(rgb, to_rec709)
-            seen.append(small)
-            details.append(detail)
-            missing.append(self._parts((~valid(index)).astype(np.float32), 1).max(axis=(1, 2)) > 0)
-        lost = _TAKEN + _lost_detail(np.stack(details)) + _NO_DATA * np.stack(missing)
-        costs = np.concatenate([_GHOST * np.clip(self.ghosts - 0.4, 0.0, 2.0)[None], lost])
-        labels = _Cut(self.shape, costs, np.stack(seen)).labels()
-        grown = np.kron(labels.reshape(self.shape), np.ones((self.side_px,) * 2, int))
-        return (grown[: self.picture_shape[0], : self.picture_shape[1]] - 1).astype(np.int16)
-
-    def _seen(self, rgb: Rgb, to_rec709: Callable[[Rgb], Rgb]) -> tuple[UInt8[np.ndarray, "cells parts 3"], OfCells]:
-        """Return the light of the parts of each cell, in codes, and the detail of the cell."""
-        codes = _coded(to_rec709(rgb))
-        fine = np.abs(cv2.Laplacian(cv2.cvtColor(codes, cv2.COLOR_RGB2GRAY), cv2.CV_32F, ksize=3))
-        detail = self._parts(fine, 1).mean(axis=(1, 2)).reshape(self.shape)
-        part_px = self.side_px // _PARTS
-        smooth = cv2.GaussianBlur(codes, (0, 0), _PARTS_SIGMA * part_px)
-        parts = self._parts(smooth.astype(np.float32), 3).reshape(len(self.ghosts), _PARTS, part_px, _PARTS, part_px, 3).mean(axis=(2, 4))
-        return np.rint(parts).astype(np.uint8).reshape(len(parts), -1, 3), cv2.GaussianBlur(detail, (0, 0), 1.0).reshape(-1)
-
-    def _parts(self, plane: Shaped[np.ndarray, "height width ..."], channels: int) -> Shaped[np.ndarray, "cells side_px side_px ..."]:
-        """Return a picture cut into cells; the last ones are filled with its border."""
+    def chosen(self, unlike: Plane, picture: Rgb, seen: Iterable[tuple[Rgb, Mask]]) -> Int16[np.ndarray, "height width"]:
+        """Return the slice that each pixel is taken from, -1 where the picture stays. All are linear Rec.709."""
         (rows, columns), side = self.shape, self.side_px
-        missing = [(0, rows * side - plane.shape[0]), (0, columns * side - plane.shape[1])] + [(0, 0)] * (plane.ndim - 2)
-        cut = np.pad(plane, missing, "edge").reshape(rows, side, columns, side, channels).swapaxes(1, 2)
-        cells = cut.reshape(rows * columns, side, side, channels)
-        return cells if plane.ndim > 2 else cells[..., 0]
+        worst = self._padded(unlike).reshape(rows, side, columns, side).max(axis=(1, 3)).reshape(-1) / np.float32(UNLIKE)
+        shown, details, missing = [self._parts(_coded(picture))], [], []
+        for rgb, valid in seen:
+            codes = _coded(rgb)
+            shown.append(self._parts(codes))
+            details.append(self._detail(codes))
+            missing.append(self._means((~valid).astype(np.float32)) > _MISSING)
+        lost = _TAKEN + _lost_detail(np.stack(details)) + _NO_DATA * np.stack(missing)
+        stays = _GHOST * (np.clip(worst, _LEAST_UNLIKE, _MOST_UNLIKE) - _LEAST_UNLIKE)
+        labels = _Cut(self.shape, np.concatenate([stays[None], lost]), np.stack(shown)).labels().astype(np.int16) - 1
+        grown = labels.reshape(self.shape).repeat(side, axis=0).repeat(side, axis=1)
+        return grown[: unlike.shape[0], : unlike.shape[1]]
+
+    def _detail(self, codes: Codes) -> OfCells:
+        fine = np.abs(cv2.Laplacian(cv2.cvtColor(codes, cv2.COLOR_RGB2GRAY), cv2.CV_32F, ksize=3))
+        return cv2.GaussianBlur(self._means(fine).reshape(self.shape), (0, 0), 1.0).reshape(-1)
+
+    def _means(self, plane: Plane) -> OfCells:
+        return cv2.resize(self._padded(plane), self.shape[::-1], interpolation=cv2.INTER_AREA).reshape(-1)
+
+    def _parts(self, codes: Codes) -> UInt8[np.ndarray, "cells parts 3"]:
+        """Return the light of the parts of each cell, in codes."""
+        rows, columns = self.shape
+        small = cv2.resize(self._padded(codes), (columns * _PARTS, rows * _PARTS), interpolation=cv2.INTER_AREA)
+        parts = cv2.GaussianBlur(small, (0, 0), 1.0).reshape(rows, _PARTS, columns, _PARTS, 3).swapaxes(1, 2)
+        return parts.reshape(rows * columns, _PARTS * _PARTS, 3)
+
+    def _padded(self, plane: Shaped[np.ndarray, "height width ..."]) -> Shaped[np.ndarray, "padded_height padded_width ..."]:
+        down, right = (count * self.side_px - size for count, size in zip(self.shape, plane.shape, strict=False))
+        return cv2.copyMakeBorder(plane, 0, down, 0, right, cv2.BORDER_REPLICATE)
 
 
 def _lost_detail(details: Float32[np.ndarray, "slices cells"]) -> Float[np.ndarray, "slices cells"]:
@@ -193,20 +202,20 @@ def _lost_detail(details: Float32[np.ndarray, "slices cells"]) -> Float[np.ndarr
 class _Cut:
     """Labels of cells that cost the least together.
 
-    shape: rows and columns. costs: of each label in each cell. seen: (labels, cells, parts, 3) what a label shows there, in codes.
+    shape: rows and columns. costs: of each label in each cell. shown: (labels, cells, parts, 3) what a label shows there, in codes.
     Neighbours of two labels cost by how much these differ in both cells, which is a metric of the labels, as expansion asks.
     """
 
     shape: tuple[int, int]
     costs: Float[np.ndarray, "labels cells"]
-    seen: UInt8[np.ndarray, "labels cells parts 3"]
+    shown: UInt8[np.ndarray, "labels cells parts 3"]
 
     def labels(self) -> Labels:
         """Expand one label after the other, beginning with 0 everywhere, until nothing gets cheaper."""
         labels = np.zeros(self.costs.shape[1], int)
         for _ in range(_SWEEPS):
             before = labels
-            for label in range(len(self.costs)):
+            for label in track(range(len(self.costs)), "what moved"):
                 labels = self._expanded(labels, label)
             if (labels == before).all():
                 break
@@ -247,7 +256,7 @@ class _Cut:
         cut = np.flatnonzero(ours != theirs)
         cost = np.zeros(len(first))
         for cells in (first[cut], second[cut]):
-            apart = np.abs(self.seen[ours[cut], cells].astype(np.int16) - self.seen[theirs[cut], cells])
+            apart = np.abs(self.shown[ours[cut], cells].astype(np.int16) - self.shown[theirs[cut], cells])
             cost[cut] += apart.max(axis=-1).mean(axis=-1) / (255.0 * _SEAM)
         cost[cut] += _LENGTH
         return cost

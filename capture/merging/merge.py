@@ -82,7 +82,10 @@ def _merged(stack: FocalStack, overwrite: bool, registration: Path | None, prefe
     volume = volume.without(spread_light(volume.lights))
     merged, focus = _with_registration(stack, slices), focus_map(volume, no_lights(volume.shape), slices.saturated)
     sharp = sharp_all_in_focus(slices.stored, focus.focus_index, volume, _crossover(merged, volume.shape[1]))
-    mended = without_ghosts(sharp, slices.stored, slices.valid, merged.to_rec709)
+    to_rec709 = merged.to_rec709
+    mended = without_ghosts(
+        sharp, slices.stored, lambda: ((to_rec709(rgb), slices.valid(index)) for index, rgb in enumerate(slices.stored())), to_rec709
+    )
     sharp = mended.picture if mended else sharp
     lights, restored = restored_lights(slices.stored, sharp, extremes, opening=known_opening(stack.lens))
     if restored:
@@ -98,7 +101,8 @@ def _merged(stack: FocalStack, overwrite: bool, registration: Path | None, prefe
         merged = with_solved_blur(merged, slices, sharp, focus)
     if prefer is not None:
         rims = vetoed(lights.slice_index(), slices.saturated)
-        merged, sharp = with_preferred(merged, sharp, slices.stored, volume, focus.focus_index, rims, prefer)
+        excluded = rims | mended.changed if mended else rims  # what moved and what it hid have a peak each
+        merged, sharp = with_preferred(merged, sharp, slices.stored, volume, focus.focus_index, excluded, prefer)
     shutil.rmtree(stack.folder / FIRST_PASS_FOLDER, ignore_errors=True)
     codes = depth_codes(merged)
     write_readable_pictures(merged, sharp, codes)
@@ -113,13 +117,13 @@ def _with_findings(stack: FocalStack, restored: Sequence[RestoredLight], mended:
     }
     if mended is not None:
         found[GHOSTS] = {"before": mended.before, "after": mended.after, "share": float((mended.chosen >= 0).mean())}
-    return replace(stack, metadata={key: value for key, value in stack.metadata.items() if key != GHOSTS} | found)
+    return replace(stack, metadata=stack.metadata | found)
 
 
 def ghosts_text(stack: FocalStack) -> str:
     """Say how much of a merged picture was cut anew because something moved; empty where nothing was."""
     found = stack.metadata.get(GHOSTS)
-    return f"something moved between the slices: {found['share']:.0%} of the picture is taken whole from one slice each" if found else ""
+    return f"something moved between the slices: {found['share']:.1%} of the picture is taken whole from one slice each" if found else ""
 
 
 def _require_a_sweep(stack: FocalStack) -> None:
@@ -167,7 +171,8 @@ def _registered(stack: FocalStack, ingested: IngestedSlices, sources: Sequence[P
 def _with_registration(stack: FocalStack, slices: RegisteredSlices) -> FocalStack:
     """Return the merged stack in the geometry of its reference: lens focused there, camera of that focus."""
     reference = slices.registration.reference
-    metadata = {key: value for key, value in stack.metadata.items() if key not in (RETOUCHES, PREFERRED)} | {DEPTH_SOURCE: FROM_FOCUS}
+    kept = {key: value for key, value in stack.metadata.items() if key not in (RETOUCHES, PREFERRED, GHOSTS)}
+    metadata = kept | {DEPTH_SOURCE: FROM_FOCUS}
     changed = replace(stack, slices=slices.descriptions(), registered=True, merged=True, reference=reference, metadata=metadata)
     if stack.lens is None or stack.slices[reference].focus_distance_m is None:
         return changed

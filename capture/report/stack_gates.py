@@ -82,7 +82,8 @@ def _sharp(findings: StackFindings) -> Gate:
     lost = findings.picture.lost
     if lost is None:
         return rules.SHARP.absent(findings.name, rules.NO_BLOCKS)
-    return rules.SHARP.judge(findings.name, lost, f"{lost:.2%} of the textured blocks are lost", lost <= rules.LARGEST_LOST)
+    measured = f"{lost:.2%} of the textured blocks are lost{_moved(findings)}"
+    return rules.SHARP.judge(findings.name, lost, measured, lost <= rules.LARGEST_LOST)
 
 
 def _seams(findings: StackFindings) -> Gate:
@@ -95,9 +96,14 @@ def _seams(findings: StackFindings) -> Gate:
 
 
 def _ghosts(findings: StackFindings) -> Gate:
-    unlike, told = findings.picture.unlike, ghosts_text(findings.stack)
-    measured = f"{unlike:.2%} of the picture is unlike every slice" + (f"; {told}" if told else "")
+    unlike = findings.picture.unlike
+    measured = f"{unlike:.2%} of the picture is unlike every slice{_moved(findings)}"
     return rules.GHOSTS.judge(findings.name, unlike, measured, unlike <= rules.LARGEST_UNLIKE)
+
+
+def _moved(findings: StackFindings) -> str:
+    told = ghosts_text(findings.stack)
+    return f"; {told}" if told else ""
 
 
 def _light(findings: StackFindings) -> Gate:

@@ -2,8 +2,8 @@
 
 Every stack and pair in DATA goes through `mrbokeh capture` with no option set, each command a process of its own. Measured, without truth
 (capture.report.picture_sharpness): lost, the share of textured blocks with less than 60 % of the detail of their sharpest slice; flat, how
-much flat blocks are raised by seams and noise; top, the largest value over that of the slices; unlike, the share that no slice shows
-(capture.merging.ghosts). The same of FocusWeave and of enfuse after
+much flat blocks are raised by seams and noise; top, the largest value over that of the slices; unlike, the share of ours that no
+slice shows (capture.merging.ghosts). The first three of FocusWeave and of enfuse after
 align_image_stack where they are installed (on the path, or where FOCUSWEAVE, ENFUSE and ALIGN_IMAGE_STACK say), CPU seconds and memory of
 all, slices left out and made again by refocusing, focus positions beside stated ones, and the rank of fused pairs among published methods.
 

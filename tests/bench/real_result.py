@@ -139,8 +139,7 @@ class Measuring:
                 continue
             measured = sharpest.measure(laid[0])
             lost, flat = measured_where(sharpest, measured, covered_blocks(laid[1]))
-            unlike = unlike_share(made, *laid)
-            figures[name], pictures[name] = Figures(lost, flat, measured.top, peer.cpu_s, peer.memory_mb, unlike=unlike), laid[0]
+            figures[name], pictures[name] = Figures(lost, flat, measured.top, peer.cpu_s, peer.memory_mb), laid[0]
         places = worst_places(sharpest, own, picture, TOP_BAR)
         stems = [f"{stack.file_name}_{number}" for number in range(len(places))]
         crops = [write_crops(self.crop_folder(), stem, place, made.slice_rgb, pictures) for stem, place in zip(stems, places, strict=True)]

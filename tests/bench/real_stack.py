@@ -6,11 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float32
 
-from capture.merging.ghosts import UNLIKE, Likeness
+from capture.merging.ghosts import UNLIKE, unlike_slices
 from capture.report.picture_sharpness import SharpestSlices, Sharpness, inner_blocks
 from mrbokeh.stacks.focal_stack import FocalStack, find_focal_stacks
 from mrbokeh.system.atomic_files import read_json
@@ -19,7 +18,6 @@ from tests.bench.real_sets import RealStack
 
 Rgb = Float32[np.ndarray, "height width 3"]
 BlockMask = Bool[np.ndarray, "rows columns"]
-Mask = Bool[np.ndarray, "height width"]
 
 TIMEOUT_S = 3600.0
 STAGES = ("ingest", "merge", "process")
@@ -105,14 +103,10 @@ def covered_blocks(covered: Bool[np.ndarray, "height width"]) -> BlockMask:
     return np.asarray(inner_blocks(covered).all(axis=(1, 3)))
 
 
-def unlike_share(made: FocalStack, picture: Rgb, covered: Mask | None = None) -> float:
-    """Return the share of a picture that is unlike every slice, where it covers them: ghosts. Its border is left out."""
-    likeness = Likeness(picture)
-    for index, rgb in enumerate(made.iter_rgb()):
-        likeness.add(rgb, made.slice_masks(index).valid)
-    known = np.ones(picture.shape[:2], np.uint8) if covered is None else covered.astype(np.uint8)
-    inside = cv2.erode(known, np.ones((65, 65), np.uint8), borderValue=0) > 0
-    return float((likeness.unlike()[inside] > UNLIKE).mean()) if inside.any() else 0.0
+def unlike_share(made: FocalStack, picture: Rgb) -> float:
+    """Return the share of our picture that is unlike every slice: ghosts. A peer's lies on the slices too coarsely for that."""
+    seen = ((rgb, made.slice_masks(index).valid) for index, rgb in enumerate(made.iter_rgb()))
+    return float((unlike_slices(picture, seen) > UNLIKE).mean())
 
 
 def measured_where(sharpest: SharpestSlices, measured: Sharpness, known: BlockMask) -> tuple[float, float]:
