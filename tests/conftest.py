@@ -142,28 +142,35 @@ LONG_FILES = (
     "training/test_fast_export.py",
     "training/test_export_onnx.py",
 )
-"""Files with tests or fixtures of many seconds, in a fresh clone: they begin, in turn with one worker and the next. The first two compile
-most kernels, and not the same ones, so that no worker waits for a kernel of another."""
+"""Files with tests or fixtures of many seconds: they begin."""
+COMPILING = ("renderers", "compositing", "layering", "psf_models")
+"""Folders that need most kernels in a fresh clone, a third of all tests: one worker takes them. Whoever compiles a kernel also compiles
+what it needs of numba's own, a third of the work, and that is not kept: three workers would do it three times."""
+LATE = ("viewfinder", "video", "shots", "scene", "project", "training", "hosts", "refocus", "datasets_scripts")
+"""Folders that need kernels of those as well, which are there by then."""
 
 
 @pytest.hookimpl(trylast=True)  # once those that do not run are left out
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Give each worker some of the long files at the beginning: a long one at the end would leave the others without work.
+    """Give the first worker what compiles, and the others some of the long files: one at the end would leave the rest without work.
 
     Workers get consecutive shares of all tests, of equal number (pytest-xdist, worksteal).
     """
     workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     if workers == 1:
         return
-    order = {ROOT / "tests" / name: place for place, name in enumerate(LONG_FILES)}
-    long = sorted((item for item in items if item.path in order), key=lambda item: order[item.path])
-    short = [item for item in items if item.path not in order]
-    arranged: list[pytest.Item] = []
-    for worker in range(workers):
-        arranged += [item for item in long if order[item.path] % workers == worker]
-        room = max(0, len(items) * (worker + 1) // workers - len(arranged))
-        arranged, short = arranged + short[:room], short[room:]
-    items[:] = arranged
+    files: dict[Path, list[pytest.Item]] = {}
+    for item in items:
+        files.setdefault(item.path, []).append(item)
+    long = [ROOT / "tests" / name for name in LONG_FILES if ROOT / "tests" / name in files]
+    waiting = long + sorted((path for path in files if path not in long), key=lambda path: path.parent.name in LATE)
+    shares: list[list[pytest.Item]] = [[] for _ in range(workers)]
+    others = 0
+    for path in waiting:
+        compiles = path.parent.name in COMPILING
+        shares[0 if compiles else 1 + others % (workers - 1)] += files[path]
+        others += not compiles
+    items[:] = [item for share in shares for item in share]
 
 
 def pytest_terminal_summary(terminalreporter: Any) -> None:

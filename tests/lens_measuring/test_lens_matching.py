@@ -110,6 +110,7 @@ def test_nine_curved_blades_and_a_heptagon_seen_from_the_wrong_side() -> None:
     assert 0.0 < errors["curvature"] < 0.1 and 0.0 < np.degrees(errors["rotation_rad"]) < 2.0
 
 
+@pytest.mark.slow
 def test_a_round_opening_has_no_blades_and_its_discs_are_found_where_they_are() -> None:
     found = matched(DISC)
     discs, wanted = find_discs(linear(photograph(DISC)).max(axis=2), 1.0), np.array(places(COUNT))[:, ::-1] + 0.5

@@ -43,7 +43,8 @@ def prior_errors_px(stack: JitteredStack) -> list[float]:
     return stack.errors_px(0, tuple(about_centre(scales[0] / each, *stack.size_px) for each in scales))
 
 
-@pytest.mark.parametrize("lens_is_known", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("lens_is_known", [True, False])
 def test_a_camera_that_moved_between_slices(moved: JitteredStack, lens_is_known: bool) -> None:
     registration = register_stack(moved.slices.__getitem__, SLICES, moved.image_distances if lens_is_known else None)
     assert registration.reference == 0, "the nearest focus sees the narrowest field"

@@ -66,6 +66,7 @@ def test_pixels_that_no_virtual_light_reaches_stay_bit_for_bit(network: OnnxNetw
     np.testing.assert_array_equal(found.rgb[untouched], photo.rgb[untouched])
 
 
+@pytest.mark.slow
 def test_rims_that_are_a_pixel_off_are_found_by_the_network_too(network: OnnxNetwork) -> None:
     photo, near = plate()
     fat = np.zeros_like(near)

@@ -119,6 +119,7 @@ def test_a_flat_scene_is_found_with_focal_length_and_way(moving: float) -> None:
     assert np.abs(scale * away[1] - away[0]).max() < 0.01
 
 
+@pytest.mark.slow
 def test_a_rolling_shutter_does_not_pass_for_a_tilt() -> None:
     """A camera that looks square at a wall and slides along it, up and down, read out over half a frame's time: rows shift by up to 2 px,
     which a wall tilted by 31 degrees fits to 0.17 px and the true one to 0.26."""

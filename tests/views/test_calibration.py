@@ -81,6 +81,7 @@ def blur_samples(points: np.ndarray, growth: np.ndarray, noise_px: float = 0.1, 
 POINTS = np.random.default_rng(7).uniform(0.5, 1.6, 300)
 
 
+@pytest.mark.slow
 def test_focus_is_found_from_blur_stated_or_not() -> None:
     """Nikon's 8-bit code: stated up to 0.04 dioptres off, found within 0.003, and the growth of blur, nominally 7 % off, within 1 %."""
     stated = 1.0 / (0.01 * 10 ** (np.round(40 * np.log10(100.0 / FOCUS)) / 40))
