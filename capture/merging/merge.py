@@ -3,13 +3,13 @@
 `depth_from_focus` chooses the sharpest slice at each pixel."""
 
 import shutil
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Bool, Float32
 
 from capture.merging.all_in_focus import NARROW_CROSSOVER, crossover_of, sharp_all_in_focus
 from capture.merging.depth_edges import with_edges_of_light
@@ -48,6 +48,7 @@ GHOSTS = "ghosts"
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Plane = Float32[np.ndarray, "height width"]
+Mask = Bool[np.ndarray, "height width"]
 
 
 def merge_scene(scene: Path, overwrite: bool = False, registration: Path | None = None, prefer: Side | None = None) -> list[FocalStack]:
@@ -82,10 +83,7 @@ def _merged(stack: FocalStack, overwrite: bool, registration: Path | None, prefe
     volume = volume.without(spread_light(volume.lights))
     merged, focus = _with_registration(stack, slices), focus_map(volume, no_lights(volume.shape), slices.saturated)
     sharp = sharp_all_in_focus(slices.stored, focus.focus_index, volume, _crossover(merged, volume.shape[1]))
-    to_rec709 = merged.to_rec709
-    mended = without_ghosts(
-        sharp, slices.stored, lambda: ((to_rec709(rgb), slices.valid(index)) for index, rgb in enumerate(slices.stored())), to_rec709
-    )
+    mended = without_ghosts(sharp, slices.stored, partial(_seen, merged, slices), merged.to_rec709)
     sharp = mended.picture if mended else sharp
     lights, restored = restored_lights(slices.stored, sharp, extremes, opening=known_opening(stack.lens))
     if restored:
@@ -109,6 +107,12 @@ def _merged(stack: FocalStack, overwrite: bool, registration: Path | None, prefe
     write_focal_stack(merged)
     write_merge_sheet(merged, sharp, codes)
     return merged
+
+
+def _seen(stack: FocalStack, slices: RegisteredSlices) -> Iterator[tuple[Rgb, Mask]]:
+    """Yield the slices in linear Rec.709, and where each has data."""
+    for index, rgb in enumerate(track(slices.stored(), f"{stack.folder.name}: what moved", len(stack))):
+        yield stack.to_rec709(rgb), slices.valid(index)
 
 
 def _with_findings(stack: FocalStack, restored: Sequence[RestoredLight], mended: Mended | None) -> FocalStack:
