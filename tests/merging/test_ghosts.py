@@ -183,12 +183,13 @@ def test_the_cut_is_among_the_cheapest() -> None:
 
 
 def test_merging_cuts_it_out_and_says_so(tmp_path: Path) -> None:
+    """What is preferred where two things are sharp does not bring it back: who moved and what he hid are two."""
     for index, rgb in enumerate(walked()):
         write_image(tmp_path / "shoot" / f"{index}.png", rgb)
     stack = only_stack(ingest([tmp_path / "shoot"], tmp_path / "scene"))
     identity = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     write_registration(tmp_path / "unmoved.json", Registration(0, (identity,) * 3, (1.0,) * 2, (0.0,) * 3))
-    told = printed_by(app, "merge", str(stack.folder), "--registration", str(tmp_path / "unmoved.json"))
+    told = printed_by(app, "merge", str(stack.folder), "--registration", str(tmp_path / "unmoved.json"), "--prefer", "near")
     done = read_focal_stack(stack.folder)
     found = done.metadata[GHOSTS]
     assert found["before"] > LEAST_SHARE > found["after"] and 0.0 < found["share"] < 0.8
