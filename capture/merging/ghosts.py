@@ -91,19 +91,21 @@ class Mended:
     """A picture without its ghosts.
 
     before, after: share of the picture that is unlike every slice. chosen: (H, W) index of the slice that a place was taken from, -1
-    where the picture stayed. changed: (H, W) where something else is seen than before.
+    where the picture stayed. sharp: (H, W) where that slice has detail that the sharpest one has. changed: (H, W) where something else is
+    seen than before.
     """
 
     picture: Rgb
     before: float
     after: float
     chosen: Int16[np.ndarray, "height width"]
+    sharp: Mask
     changed: Mask
 
     def placed(self, focus: FocusMap) -> FocusMap:
-        """Return depth from focus with what is seen anew in the slice that shows it."""
+        """Return depth from focus with what is seen anew in the slice that shows it sharp; nowhere there it is sure."""
         there = self.changed & (self.chosen >= 0)
-        index = np.where(there, self.chosen.astype(np.float32), focus.focus_index)
+        index = np.where(there & self.sharp, self.chosen.astype(np.float32), focus.focus_index)
         sure = np.where(there, np.minimum(focus.confidence, np.float32(MOVED_CONFIDENCE)), focus.confidence)
         return replace(focus, focus_index=index, confidence=sure)
 
@@ -119,7 +121,7 @@ def without_ghosts(picture: Rgb, slices: Slices, seen: Seen, to_rec709: Callable
     if before <= LEAST_SHARE:
         return None
     cells = _Cells.over(unlike)
-    chosen = cells.chosen(unlike, to_rec709(picture), seen())
+    chosen, sharp = cells.chosen(unlike, to_rec709(picture), seen())
     taken = ((rgb, (chosen == index).astype(np.float32)) for index, rgb in enumerate(slices()))
     mended = painted(picture, taken, (chosen >= 0).astype(np.float32), cells.bands)
     after = float((unlike_slices(to_rec709(mended), seen()) > UNLIKE).mean())
@@ -127,7 +129,7 @@ def without_ghosts(picture: Rgb, slices: Slices, seen: Seen, to_rec709: Callable
         return None
     everywhere = np.ones(chosen.shape, bool)
     changed = unlike_slices(to_rec709(picture), [(to_rec709(mended), everywhere)]) > _CHANGED * UNLIKE
-    return Mended(picture=mended, before=before, after=after, chosen=chosen, changed=changed)
+    return Mended(picture=mended, before=before, after=after, chosen=chosen, sharp=sharp, changed=changed)
 
 
 def unlike_slices(picture: Rgb, seen: Iterable[tuple[Rgb, Mask]]) -> Plane:
@@ -156,8 +158,10 @@ class _Cells:
         """Return over how many bands slices go over into one another: brightness within four to six cells."""
         return BANDS + round(np.log2(self.side_px / _LEAST_CELL_PX))
 
-    def chosen(self, unlike: Plane, picture: Rgb, seen: Iterable[tuple[Rgb, Mask]]) -> Int16[np.ndarray, "height width"]:
-        """Return the slice that each pixel is taken from, -1 where the picture stays. All are linear Rec.709."""
+    def chosen(
+        self, unlike: Plane, picture: Rgb, seen: Iterable[tuple[Rgb, Mask]]
+    ) -> tuple[Int16[np.ndarray, "height width"], Bool[np.ndarray, "height width"]]:
+        """Return the slice that each pixel is taken from, -1 where the picture stays, and where that slice is sharp. All are Rec.709."""
         (rows, columns), side = self.shape, self.side_px
         worst = self._padded(unlike).reshape(rows, side, columns, side).max(axis=(1, 3)).reshape(-1) / np.float32(UNLIKE)
         shown, details, missing = [self._parts(_coded(picture))], [], []
@@ -166,11 +170,17 @@ class _Cells:
             shown.append(self._parts(codes))
             details.append(self._detail(codes))
             missing.append(self._means((~valid).astype(np.float32)) > _MISSING)
-        lost = _TAKEN + _lost_detail(np.stack(details)) + _NO_DATA * np.stack(missing)
+        kept = np.stack(details) / np.maximum(np.max(details, axis=0), 1e-6)
+        lost = _TAKEN + _lost_detail(np.stack(details), kept) + _NO_DATA * np.stack(missing)
         stays = _GHOST * (np.clip(worst, _LEAST_UNLIKE, _MOST_UNLIKE) - _LEAST_UNLIKE)
         labels = _Cut(self.shape, np.concatenate([stays[None], lost]), np.stack(shown)).labels().astype(np.int16) - 1
-        grown = labels.reshape(self.shape).repeat(side, axis=0).repeat(side, axis=1)
-        return grown[: unlike.shape[0], : unlike.shape[1]]
+        sharp = np.take_along_axis(kept, np.maximum(labels, 0)[None], axis=0)[0] >= 0.5 * (_KEPT_DETAIL + _LOST_DETAIL)
+        return self._grown(labels, unlike.shape), self._grown(sharp, unlike.shape)
+
+    def _grown(self, cells: Shaped[np.ndarray, " cells"], shape: tuple[int, ...]) -> Shaped[np.ndarray, "height width"]:
+        """Return the pixels of cells, in a picture of (H, W)."""
+        pixels = cells.reshape(self.shape).repeat(self.side_px, axis=0).repeat(self.side_px, axis=1)
+        return pixels[: shape[0], : shape[1]]
 
     def _detail(self, codes: Codes) -> OfCells:
         fine = np.abs(cv2.Laplacian(cv2.cvtColor(codes, cv2.COLOR_RGB2GRAY), cv2.CV_32F, ksize=3))
@@ -191,11 +201,13 @@ class _Cells:
         return cv2.copyMakeBorder(plane, 0, down, 0, right, cv2.BORDER_REPLICATE)
 
 
-def _lost_detail(details: Float32[np.ndarray, "slices cells"]) -> Float[np.ndarray, "slices cells"]:
-    """Return what it costs to see a cell in a slice in which it is blurred."""
+def _lost_detail(
+    details: Float32[np.ndarray, "slices cells"], kept: Float32[np.ndarray, "slices cells"]
+) -> Float[np.ndarray, "slices cells"]:
+    """Return what it costs to see a cell in a slice in which it is blurred. kept: details as shares of those of the sharpest slice."""
     sharpest = details.max(axis=0)
     textured = np.minimum(sharpest / max(float(np.median(sharpest)), 1e-6), _MOST_TEXTURED)
-    return _BLURRED * textured * np.clip((_KEPT_DETAIL - details / np.maximum(sharpest, 1e-6)) / (_KEPT_DETAIL - _LOST_DETAIL), 0.0, 1.0)
+    return _BLURRED * textured * np.clip((_KEPT_DETAIL - kept) / (_KEPT_DETAIL - _LOST_DETAIL), 0.0, 1.0)
 
 
 @dataclass(frozen=True)

@@ -107,7 +107,11 @@ def test_what_is_seen_anew_has_the_depth_of_its_slice() -> None:
     assert found is not None and (found.chosen[there] % 2 == 0).all()
     placed = found.placed(FocusMap(np.full(SHAPE, 0.5, np.float32), np.where(there, 1.0, 0.9).astype(np.float32)))
     inside = cv2.erode(there.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
-    np.testing.assert_array_equal(placed.focus_index[inside], found.chosen[inside])
+    np.testing.assert_array_equal(placed.focus_index[inside], np.where(found.sharp, found.chosen, 0.5)[inside])
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    its_own = np.where((x // TILE_PX + y // TILE_PX) % 2 == 0, 0, 2)
+    within = inside & (np.minimum(x % TILE_PX, y % TILE_PX) >= 16) & (np.maximum(x % TILE_PX, y % TILE_PX) < TILE_PX - 16)
+    np.testing.assert_array_equal(found.sharp[within], (found.chosen == its_own)[within])
     assert (placed.confidence[inside] == np.float32(MOVED_CONFIDENCE)).all()
     stays = found.chosen < 0
     assert (placed.focus_index[stays] == 0.5).all() and placed.confidence[stays].min() > 0.8
