@@ -142,12 +142,12 @@ LONG_FILES = (
     "training/test_fast_export.py",
     "training/test_export_onnx.py",
 )
-"""Files with tests or fixtures of many seconds: they begin."""
+"""Files with tests or fixtures of many seconds: they begin among those of their kind."""
 COMPILING = ("renderers", "compositing", "layering", "psf_models")
 """Folders that need most kernels in a fresh clone, a third of all tests: one worker takes them. Whoever compiles a kernel also compiles
 what it needs of numba's own, a third of the work, and that is not kept: three workers would do it three times."""
-LATE = ("viewfinder", "video", "shots", "scene", "project", "training", "hosts", "refocus", "datasets_scripts")
-"""Folders that need kernels of those as well, which are there by then."""
+LATE = ("depth", "views", "scene", "viewfinder", "video", "shots", "project", "training", "hosts", "refocus", "datasets_scripts")
+"""Folders that need some of those kernels as well, which are there by then."""
 
 
 @pytest.hookimpl(trylast=True)  # once those that do not run are left out
@@ -163,7 +163,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         files.setdefault(item.path, []).append(item)
     long = [ROOT / "tests" / name for name in LONG_FILES if ROOT / "tests" / name in files]
-    waiting = long + sorted((path for path in files if path not in long), key=lambda path: path.parent.name in LATE)
+    waiting = sorted([*long, *(path for path in files if path not in long)], key=lambda path: path.parent.name in LATE)
     shares: list[list[pytest.Item]] = [[] for _ in range(workers)]
     others = 0
     for path in waiting:
