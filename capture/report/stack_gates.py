@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from capture.merging.merge import HIGHLIGHTS, ghosts_text
+from capture.merging.retouch import retouches_text
 from capture.poses.sparse_model import POSES_NAME, SCALE_NAME, SparseModel, read_sparse_model
 from capture.report import gates as rules
 from capture.report.exclusion import FEWEST_SLICES
@@ -102,8 +103,9 @@ def _ghosts(findings: StackFindings) -> Gate:
 
 
 def _moved(findings: StackFindings) -> str:
-    told = ghosts_text(findings.stack)
-    return f"; {told}" if told else ""
+    """Say what was taken from slices on purpose, by merging or by hand."""
+    retouched = retouches_text(findings.stack)
+    return "".join(f"; {told}" for told in (ghosts_text(findings.stack), f"retouched: {retouched}" if retouched else "") if told)
 
 
 def _light(findings: StackFindings) -> Gate:

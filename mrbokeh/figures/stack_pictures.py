@@ -31,7 +31,7 @@ def write_merge_sheet(stack: FocalStack, camera_rgb: Rgb | None = None, depth_rg
 
     camera_rgb: the all-in-focus picture as it is stored. depth_rgb8: `depth_codes`. What is None is read.
     """
-    slices = {f"slice {index}{_focus_text(stack, index)}": _small(stack.slice_camera_rgb(index)) for index in shown_slices(stack)}
+    slices = {_slice_text(stack, index): _small(stack.slice_camera_rgb(index)) for index in shown_slices(stack)}
     slices["all in focus"] = _small(stack.all_in_focus_camera_rgb() if camera_rgb is None else camera_rgb)
     depth = _small(depth_codes(stack) if depth_rgb8 is None else depth_rgb8)
     pictures = {caption: stack.to_rec709(rgb) for caption, rgb in slices.items()} | {"depth": _shown_alike(depth)}
@@ -108,6 +108,12 @@ def nearness_codes(nearness: Plane, confidence: Plane) -> UInt8[np.ndarray, "hei
     colours = cv2.cvtColor(cv2.applyColorMap(level, cv2.COLORMAP_TURBO), cv2.COLOR_BGR2RGB)
     trust = np.clip(confidence[..., None] / np.float32(TRUSTED), _LEAST_COLOUR, 1.0).astype(np.float32)
     return np.rint(_GREY + trust * (colours.astype(np.float32) - _GREY)).astype(np.uint8)
+
+
+def _slice_text(stack: FocalStack, index: int) -> str:
+    """Return the number of a slice, by which retouching and compositing know it, its focus, and the photograph that it was."""
+    source = stack.slices[index].metadata.get("source")
+    return f"slice {index}{_focus_text(stack, index)}" + (f", {Path(source).name}" if source else "")
 
 
 def _focus_text(stack: FocalStack, index: int) -> str:

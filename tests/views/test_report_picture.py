@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -184,6 +185,20 @@ def test_each_fault_fails_its_gate_and_is_shown(
     x, y = shown[0].at_px
     assert abs(x + BLOCK_PX / 2 - around[0]) <= reach_px + BLOCK_PX and abs(y + BLOCK_PX / 2 - around[1]) <= reach_px + BLOCK_PX
     assert f"x {x}, y {y}" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_what_was_taken_on_purpose_is_told_where_pictures_are_judged(tmp_path: Path) -> None:
+    """By merging, where something moved, and by hand."""
+    stack = write_made(tmp_path / "view_0", right())
+    taken = {
+        "ghosts": {"before": 0.02, "after": 0.0, "share": 0.125},
+        "retouches": [{"slice": 2, "source": "b.png", "mask": "man.png", "share": 0.1}],
+    }
+    write_focal_stack(replace(stack, metadata=stack.metadata | taken))
+    report = report_scene(tmp_path)
+    told = "; something moved between the slices: 12.5% of the picture is taken whole from one slice each; retouched: slice 2 by man.png"
+    assert gate(report, SHARP.name).measured.endswith(told) and gate(report, GHOSTS.name).measured.endswith(told)
+    assert "moved" not in gate(report, SEAMS.name).measured
 
 
 def test_crops_are_at_100_percent_beside_the_slices_on_both_sides_of_a_seam(tmp_path: Path) -> None:
