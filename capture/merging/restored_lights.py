@@ -28,6 +28,8 @@ Kernel = Float32[np.ndarray, "rows columns"]
 # Slices that tell one light's flux may differ by this share; what differs more is no single light.
 LARGEST_SPREAD = 0.25
 RING_PX = 3.0
+# Of slices that tell no common flux, so many tell the largest; blur does not add light, and a full sensor only takes some away.
+FEWEST_BRIGHTEST = 2
 # Slices in which a light is seen whole.
 FEWEST_SLICES = 3
 # A drawn light explains its slices, to this share of the light in them, and leaves at most this share of the ordinary merge's error.
@@ -172,9 +174,12 @@ class Discs:
         """Slices in which the light is whole, below saturation and about as bright as in the others."""
         flux = self.flux.sum(axis=1)
         good = self.whole & (self.peak < UNSATURATED_SHARE * self.peak.max()) & (flux > 0)
-        if good.any():
-            good &= np.abs(flux - np.median(flux[good])) < LARGEST_SPREAD * np.median(flux[good])
-        return good
+        if not good.any():
+            return good
+        alike = good & (np.abs(flux - np.median(flux[good])) < LARGEST_SPREAD * np.median(flux[good]))
+        # Channels are full at different values, below the peak of the brightest: the light that is lost there is missing in its slices.
+        widest = good & (flux > (1.0 - LARGEST_SPREAD) * flux[good].max())
+        return alike if alike.any() or widest.sum() < FEWEST_BRIGHTEST else widest
 
 
 def measured_discs(patches: Patches, zone: Mask, centre_px: Float[np.ndarray, "2"], areas_px: Float[np.ndarray, " slices"]) -> Discs:

@@ -6,7 +6,7 @@ import pytest
 from capture.merging.depth_from_focus import focus_map
 from capture.merging.focus_volume import focus_volume
 from capture.merging.lights import Lights, find_lights, no_lights
-from capture.merging.restored_lights import restored_lights, with_restored_lights
+from capture.merging.restored_lights import Discs, restored_lights, with_restored_lights
 from capture.photos.libraw import neutral_where_full
 from mrbokeh.images.layer import opaque
 from mrbokeh.optics.aperture import Aperture
@@ -99,3 +99,20 @@ def test_energy_lost_to_saturation_is_found_in_the_discs_and_light_that_fits_lef
 def test_full_channels_do_not_take_the_tint_of_the_white_balance(pixel: tuple[float, ...], expected: tuple[float, ...]) -> None:
     result = neutral_where_full(np.full((2, 2, 3), pixel, np.float32), (2.0, 1.0, 1.6))
     np.testing.assert_allclose(result[0, 0], expected, rtol=1e-6)
+
+
+def test_of_a_light_that_is_full_in_most_slices_the_brightest_are_believed() -> None:
+    """Flux and peaks of a lamp of the traced card in 12 slices: its channels are full at 1.5 to 2, so that only wide discs hold all."""
+    flux = np.array([193.6, 199.3, 192.0, 174.4, 138.7, 114.6, 59.4, 51.8, 44.2, 45.0, 62.1, 100.3])
+    peak = np.array([0.93, 1.19, 1.59, 2.0, 2.0, 1.94, 1.48, 1.9, 2.0, 1.72, 1.77, 2.0])
+
+    def believed(flux: np.ndarray) -> list[int]:
+        colours = np.repeat(flux[:, None] / 3.0, 3, axis=1)
+        discs = Discs(flux=colours, xy_px=np.zeros((12, 2)), covariance_px2=np.zeros((12, 2, 2)), peak=peak, whole=np.ones(12, bool))
+        return np.flatnonzero(discs.believable).tolist()
+
+    assert believed(flux) == [0, 1, 2]
+    alone = flux.copy()
+    alone[1:3] = 120.0, 119.0
+    assert believed(alone) == [], "one that is brighter than all others tells nothing"
+    assert believed(np.where(np.arange(12) == 5, 70.0, 190.0)) == [0, 1, 2, 6, 9, 10]
