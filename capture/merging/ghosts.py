@@ -233,11 +233,6 @@ class _Cut:
                 break
         return labels
 
-    def cost(self, labels: Labels) -> float:
-        """Return what labels cost together."""
-        first, second = self._neighbours()
-        return float(self.costs[labels, np.arange(len(labels))].sum() + self._seam(labels, labels, first, second).sum())
-
     def _expanded(self, labels: Labels, label: int) -> Labels:
         """Let the cells take a label that are cheaper with it, all at once: the least cut between those that stay and those that change."""
         count = len(labels)
