@@ -23,7 +23,7 @@ Mask = Bool[np.ndarray, "height width"]
 Patches = Float32[np.ndarray, "slices height width 3"]
 Flux = Float[np.ndarray, "3"]
 Matrix = Float[np.ndarray, "2 2"]
-Kernel = Float32[np.ndarray, "rows columns"]
+Kernel = Float32[np.ndarray, "_ _"]
 
 # Slices that tell one light's flux may differ by this share; what differs more is no single light.
 LARGEST_SPREAD = 0.25
@@ -33,10 +33,14 @@ FEWEST_BRIGHTEST = 2
 # Slices in which a light is seen whole.
 FEWEST_SLICES = 3
 # A drawn light explains its slices, to this share of the light in them, and leaves at most this share of the ordinary merge's error.
-LEAST_EXPLAINED = 0.7
+LEAST_EXPLAINED = 0.9
 LARGEST_ERROR_SHARE = 0.7
 # Slices to which a drawn light is blurred again: from the sharpest to the widest.
 COMPARED_SLICES = 5
+# A disc is as much larger than what is seen of it above its surroundings.
+RIM_SHARE = 1.15
+# Demosaicing and resampling spread what is full: in slices that lose light, what is brighter than this, and beside it, is a lower bound.
+LOSING_RANGE = 0.45
 # Small lights that hold less than this share of their flux in focus do not show their shape: a disc is drawn, unless another way explains
 # the slices clearly better.
 LARGEST_DRAWN_PX = 30.0
@@ -44,7 +48,7 @@ LARGEST_DRAWN_SHARE = 0.65
 CLEARLY = 1.3
 # Lights are small, and what else there is within their reach has at most this share of their contrast (squared).
 LARGEST_LIGHT_PX = 120.0
-LARGEST_SHARE_AROUND = 0.1
+LARGEST_SHARE_AROUND = 0.5
 # What is brighter than the light's own slice by this share of its widest disc was added by a disc.
 RING_SHARE = 0.3
 # Lights that hold this share of their flux in focus need no restoring.
@@ -178,8 +182,9 @@ class Discs:
             return good
         alike = good & (np.abs(flux - np.median(flux[good])) < LARGEST_SPREAD * np.median(flux[good]))
         # Channels are full at different values, below the peak of the brightest: the light that is lost there is missing in its slices.
-        widest = good & (flux > (1.0 - LARGEST_SPREAD) * flux[good].max())
-        return alike if alike.any() or widest.sum() < FEWEST_BRIGHTEST else widest
+        widest = self.whole & (flux > (1.0 - LARGEST_SPREAD) * flux[self.whole].max())
+        agree = widest & good
+        return agree if agree.sum() >= FEWEST_SLICES or (not alike.any() and widest.sum() >= FEWEST_BRIGHTEST) else alike
 
 
 def measured_discs(patches: Patches, zone: Mask, centre_px: Float[np.ndarray, "2"], areas_px: Float[np.ndarray, " slices"]) -> Discs:
@@ -286,11 +291,14 @@ def _mostly_lost(discs: Discs, areas_px: Float[np.ndarray, " slices"], sharpest:
 
 @dataclass(frozen=True)
 class _Comparison:
-    """The slices around a light, against which proposals are held. blurs: (luminance of the slice, kernel of its blur)."""
+    """The slices around a light, against which proposals are held.
+
+    looks: slice, where it tells only a lower bound, and its blur twice: of a point, and of a light as large as in its sharpest slice.
+    light: all that these slices hold of it, squared.
+    """
 
     zone: Mask
-    full: float
-    blurs: tuple[tuple[Plane, Float32[np.ndarray, "_ _"]], ...]
+    looks: tuple[tuple[Rgb, Mask, tuple[Kernel, Kernel]], ...]
     light: float
 
     @classmethod
@@ -300,24 +308,33 @@ class _Comparison:
         """Choose slices in which the disc is whole, evenly from the sharpest to the widest."""
         whole = np.flatnonzero(discs.whole)
         by_area = whole[np.argsort(areas_px[whole])]
-        chosen = by_area[np.unique(np.linspace(0, len(by_area) - 1, COMPARED_SLICES).round().astype(int))]
-        radii_px, shape = np.sqrt(np.maximum(areas_px - areas_px[sharpest], 0.0) / np.pi), discs.blur_shape(sharpest)
-        if opening is None:
-            kernels = [_disc_kernel(float(radii_px[i]), shape) for i in chosen]
-        else:
-            radii_px /= np.sqrt(_open_share(opening))
-            kernels = [opening_kernel(opening, float(radii_px[i])) for i in chosen]
-        blurs = [(_grey(patches[i]), kernel) for i, kernel in zip(chosen, kernels, strict=True)]
-        light = sum(float(((grey - np.median(grey[~zone] if (~zone).any() else grey)) ** 2)[zone].sum()) for grey, _ in blurs)
-        return cls(zone, float(discs.peak.max()), tuple(blurs), light)
+        chosen = by_area[np.unique(np.linspace(0, len(by_area) - 1, COMPARED_SLICES).round().astype(int))].tolist()
+        flux, shape = np.median(discs.flux[discs.believable].sum(axis=1)), discs.blur_shape(sharpest)
+        open_share = 1.0 if opening is None else _open_share(opening)
+
+        def kernel(index: int, own_area_px: float) -> Kernel:
+            area_px = 0.0 if index == sharpest else max(RIM_SHARE * areas_px[index] - own_area_px, 0.0)
+            radius_px = float(np.sqrt(area_px / open_share / np.pi))
+            return _disc_kernel(radius_px, shape) if opening is None else opening_kernel(opening, radius_px)
+
+        looks, light = [], 0.0
+        for index in chosen:
+            full = LOSING_RANGE if discs.flux[index].sum() < LARGEST_HELD_SHARE * flux else OVER_RANGE
+            least = cv2.dilate((patches[index].max(axis=2) > full).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+            looks.append((patches[index], least, (kernel(index, 0.0), kernel(index, RIM_SHARE * areas_px[sharpest]))))
+            grey = _grey(patches[index])
+            light += float(((grey - np.median(grey[~zone] if (~zone).any() else grey)) ** 2)[zone].sum())
+        return cls(zone, tuple(looks), light)
 
     def error(self, picture: Rgb) -> float:
         """Return the squared difference, in the light's zone, between the slices and a picture blurred as they are; full is full."""
-        total = 0.0
-        for grey, kernel in self.blurs:
-            blurred = cv2.merge([cv2.filter2D(each, -1, kernel) for each in cv2.split(picture)])
-            total += float(((_grey(np.minimum(blurred, self.full)) - grey)[self.zone] ** 2).sum())
-        return total
+        errors = [[self._missed(seen, least, kernel, picture) for kernel in kernels] for seen, least, kernels in self.looks]
+        return float(np.min(np.sum(errors, axis=0)))
+
+    def _missed(self, seen: Rgb, least: Mask, kernel: Kernel, picture: Rgb) -> float:
+        blurred = cv2.merge([cv2.filter2D(each, -1, kernel) for each in cv2.split(picture)])
+        too_dark = np.minimum(np.minimum(blurred, OVER_RANGE) - np.minimum(seen, OVER_RANGE), 0.0)
+        return float((np.where(least[..., None], too_dark, blurred - seen)[self.zone] ** 2).sum() / 3.0)
 
 
 def _grey(rgb: Rgb) -> Plane:

@@ -1,5 +1,6 @@
 """Lights in a focal stack: found, given to their sharp slice, and their energy read where they are out of focus."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -101,18 +102,53 @@ def test_full_channels_do_not_take_the_tint_of_the_white_balance(pixel: tuple[fl
     np.testing.assert_allclose(result[0, 0], expected, rtol=1e-6)
 
 
+def believed(flux: list[float], peak: list[float]) -> list[int]:
+    count = len(flux)
+    colours = np.repeat(np.array(flux)[:, None] / 3.0, 3, axis=1)
+    nothing = np.zeros((count, 2, 2))
+    discs = Discs(flux=colours, xy_px=nothing[:, 0], covariance_px2=nothing, peak=np.array(peak), whole=np.ones(count, bool))
+    return np.flatnonzero(discs.believable).tolist()
+
+
 def test_of_a_light_that_is_full_in_most_slices_the_brightest_are_believed() -> None:
-    """Flux and peaks of a lamp of the traced card in 12 slices: its channels are full at 1.5 to 2, so that only wide discs hold all."""
-    flux = np.array([193.6, 199.3, 192.0, 174.4, 138.7, 114.6, 59.4, 51.8, 44.2, 45.0, 62.1, 100.3])
-    peak = np.array([0.93, 1.19, 1.59, 2.0, 2.0, 1.94, 1.48, 1.9, 2.0, 1.72, 1.77, 2.0])
+    """Flux and peaks of lamps of the traced card in 12 slices: its channels are full at 1.5 to 2, so that only wide discs hold all."""
+    flux = [193.6, 199.3, 192.0, 174.4, 138.7, 114.6, 59.4, 51.8, 44.2, 45.0, 62.1, 100.3]
+    peak = [0.93, 1.19, 1.59, 2.0, 2.0, 1.94, 1.48, 1.9, 2.0, 1.72, 1.77, 2.0]
+    assert believed(flux, peak) == [0, 1, 2]
+    assert believed([flux[0], 120.0, 119.0, *flux[3:]], peak) == [0], "slice 3 is full and still has nine tenths of it"
+    assert believed([flux[0], 120.0, 119.0, 118.0, *flux[4:]], peak) == [], "one that is brighter than all others tells nothing"
+    assert believed([70.0 if index == 5 else 190.0 for index in range(12)], peak) == [0, 1, 2, 6, 9, 10]
 
-    def believed(flux: np.ndarray) -> list[int]:
-        colours = np.repeat(flux[:, None] / 3.0, 3, axis=1)
-        discs = Discs(flux=colours, xy_px=np.zeros((12, 2)), covariance_px2=np.zeros((12, 2, 2)), peak=peak, whole=np.ones(12, bool))
-        return np.flatnonzero(discs.believable).tolist()
 
-    assert believed(flux) == [0, 1, 2]
-    alone = flux.copy()
-    alone[1:3] = 120.0, 119.0
-    assert believed(alone) == [], "one that is brighter than all others tells nothing"
-    assert believed(np.where(np.arange(12) == 5, 70.0, 190.0)) == [0, 1, 2, 6, 9, 10]
+def test_few_slices_that_hold_all_of_a_light_outweigh_more_that_have_lost_as_much_of_it() -> None:
+    """A lamp of the traced card: four slices hold 171, three below the peak of the brightest have lost two thirds and are alike too."""
+    flux = [176.0, 173.0, 168.0, 167.0, 138.0, 103.0, 62.0, 52.0, 26.0, 34.0, 65.0, 95.0]
+    peak = [0.95, 1.0, 1.25, 1.78, 2.0, 2.0, 1.83, 1.61, 1.35, 1.52, 1.81, 1.96]
+    assert believed(flux, peak) == [0, 1, 2, 3]
+
+
+def mosaicked(rgb: np.ndarray) -> np.ndarray:
+    """What a sensor with Bayer's pattern tells of a picture, full at 1; its blue counts twice after white balance."""
+    gain = np.array([1.5, 1.0, 2.0], np.float32)
+    raw = np.zeros(rgb.shape[:2], np.float32)
+    for channel, (row, column) in ((0, (0, 0)), (1, (0, 1)), (1, (1, 0)), (2, (1, 1))):
+        raw[row::2, column::2] = rgb[row::2, column::2, channel] / gain[channel]
+    codes = (np.minimum(raw, 1.0) * 65535 + 0.5).astype(np.uint16)
+    return cv2.cvtColor(codes, cv2.COLOR_BayerRGGB2RGB).astype(np.float32) / 65535 * gain
+
+
+def test_lamps_behind_a_mosaic_are_drawn_and_their_discs_go() -> None:
+    """Near focus the channels of a lamp are full at different values, and demosaicing spreads that: only wide discs tell what is true."""
+    index, truth = np.full(SIZE, 3.0, np.float32), texture() * np.float32(0.2)
+    lamps = {(40, 60): 20.0, (41, 161): 60.0}
+    for at, radiance in lamps.items():
+        truth[at], index[at] = np.array([1.0, 0.9, 0.7], np.float32) * radiance, SHARP_SLICE
+    layer = opaque(truth, np.ones(SIZE, np.float32))
+    blurred = [blur_layer(layer, 3.0 * (index - i), Aperture.blades(6)).rgb for i in range(8)]
+    restored, merged, lights = merged_with_lights([mosaicked(cv2.GaussianBlur(each, None, 0.6)) for each in blurred])
+    assert len(lights) == len(lamps)
+    for (row, column), radiance in lamps.items():
+        near = np.hypot(*np.ogrid[-row : SIZE[0] - row, -column : SIZE[1] - column])
+        assert restored[near < 4].sum() == pytest.approx(2.6 * radiance, rel=0.1), "all of its light is in its place"
+        assert merged[near < 4].sum() < 0.7 * 2.6 * radiance, "a slice alone has lost most of it"
+        assert restored[(near > 4) & (near < 12)].max() < 0.1, "the wall around it has 0.06 at most, its discs 0.4"
