@@ -46,9 +46,7 @@ LOSING_RANGE = 0.45
 LARGEST_DRAWN_PX = 30.0
 LARGEST_DRAWN_SHARE = 0.65
 CLEARLY = 1.3
-# Lights are small, and what else there is within their reach has at most this share of their contrast (squared).
 LARGEST_LIGHT_PX = 120.0
-LARGEST_SHARE_AROUND = 0.5
 # What is brighter than the light's own slice by this share of its widest disc was added by a disc.
 RING_SHARE = 0.3
 # Lights that hold this share of their flux in focus need no restoring.
@@ -98,12 +96,11 @@ def restored_lights(
     candidates = find_lights(slices, extremes)
     if len(candidates) == 0:
         return candidates, []
-    alone = [_Place.of(candidates, light) for light in range(len(candidates))]
-    alone = [each for index, rgb in enumerate(slices()) for each in alone if each.sharpest == index and _stands_alone(rgb[each.box], each)]
-    cut = [[rgb[each.box].copy() for each in alone] for rgb in slices()]
+    small = [each for light in range(len(candidates)) if (each := _Place.of(candidates, light)).area_px <= LARGEST_LIGHT_PX]
+    cut = [[rgb[each.box].copy() for each in small] for rgb in slices()]
     found = {
         place.light: drawn
-        for place, patches in zip(alone, zip(*cut, strict=True), strict=True)
+        for place, patches in zip(small, zip(*cut, strict=True), strict=True)
         if (drawn := _restored(np.stack(patches), merged[place.box], place, candidates.areas_px[:, place.light], guided, opening))
     }
     kept = np.isin(np.arange(len(candidates)), list(found))
@@ -262,17 +259,6 @@ def _restored(
     limit = min(LARGEST_ERROR_SHARE * compare.error(ordinary), (1.0 - LEAST_EXPLAINED) * compare.light)
     supported = float(np.median(discs.flux[discs.believable], axis=0).max()) + float(ordinary[zone & ~core].max(initial=0.0))
     return RestoredLight(place.box, (picture != ordinary).any(axis=2), picture, supported) if error < limit else None
-
-
-def _stands_alone(sharp: Rgb, place: _Place) -> bool:
-    """Return whether a small light is all that there is in its zone, in its sharpest slice: no edge, no print, no shining metal."""
-    y, x = np.mgrid[: place.zone.shape[0], : place.zone.shape[1]] + 0.5
-    near = np.hypot(x - place.centre_px[0], y - place.centre_px[1]) < _radius_px(place.area_px)
-    around = place.zone & ~near
-    if place.area_px > LARGEST_LIGHT_PX or not around.any():
-        return False
-    squared = (_grey(sharp) - np.median(_grey(sharp)[around])) ** 2
-    return bool(squared[around].sum() < LARGEST_SHARE_AROUND * squared[near & place.zone].sum())
 
 
 def _without_rings(ordinary: Rgb, sharp: Rgb, zone: Mask, discs: Discs, areas_px: Float[np.ndarray, " slices"]) -> Rgb:
