@@ -45,7 +45,7 @@ LOSING_RANGE = 0.45
 # the slices clearly better.
 LARGEST_DRAWN_PX = 30.0
 LARGEST_DRAWN_SHARE = 0.65
-CLEARLY = 1.3
+CLEARLY = 2.0
 LARGEST_LIGHT_PX = 120.0
 # What is brighter than the light's own slice by this share of its widest disc was added by a disc.
 RING_SHARE = 0.3
@@ -63,6 +63,7 @@ MARGIN_PX = 3
 # A light or the disc of a lens (a cat-eye) is an ellipse where its axes differ at least by this factor. Discs of a lens are measured within
 # a circle, which cuts longer ones off (5 % of the flux at 1.8, 15 % at 3).
 LEAST_ELONGATION, LARGEST_OF_LIGHTS, LARGEST_OF_LENSES = 1.2, 4.0, 1.8
+LEAST_BETTER_ELLIPSE = 1.3
 PIXEL_VARIANCE_PX2 = 1.0 / 12.0
 
 
@@ -421,7 +422,7 @@ def _fitting_disc(
     if np.array_equal(elongated, np.eye(2)):
         return round_disc
     ellipse_miss, ellipse = best(elongated)
-    return ellipse if ellipse_miss * CLEARLY < round_miss else round_disc
+    return ellipse if ellipse_miss * LEAST_BETTER_ELLIPSE < round_miss else round_disc
 
 
 def _raised(blank: Rgb, core: Mask, discs: Discs, sharpest: int) -> Rgb:

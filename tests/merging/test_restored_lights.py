@@ -93,7 +93,7 @@ def test_energy_lost_to_saturation_is_found_in_the_discs_and_light_that_fits_lef
 
 def test_a_light_that_moves_between_the_slices_is_left_as_it_is() -> None:
     """Its discs are alike in flux, but no one picture has them all; at half the bar for that a light was drawn in their midst."""
-    moving = [np.roll(each, 2 * index, axis=1) for index, each in enumerate(slices(scene()))]
+    moving = [np.roll(each, 3 * index, axis=1) for index, each in enumerate(slices(scene()))]
     assert len(find_lights(lambda: moving)) == 1
     restored, merged, _ = merged_with_lights(moving)
     np.testing.assert_array_equal(restored, merged)
