@@ -24,8 +24,8 @@ from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack
 from tests.support.traced_focal_stack import FOCUS_M, LENS, SLICES, TracedStack, traced, write_stack
 
-# Half the usual slices: half the time, and blur here is small.
-REBLUR = Reblur(PolygonDifferences(layering=Layering(slices=8), threads=1))
+# A third of the usual slices: less than half the time, and blur here is small.
+REBLUR = Reblur(PolygonDifferences(layering=Layering(slices=5), threads=1))
 
 
 @pytest.fixture(scope="module")
