@@ -44,7 +44,7 @@ def tone_map(rgb: Float32[np.ndarray, "*shape"], exposure_stops: float = 0.0) ->
     return np.where(exposed <= _SHOULDER, exposed, rolled_off).astype(np.float32)
 
 
-def display_rgb8(rgb: Float32[np.ndarray, "*batch 3"], exposure_stops: float = 0.0) -> UInt8[np.ndarray, "*batch 3"]:
+def display_rgb8(rgb: Float32[np.ndarray, "*shape"], exposure_stops: float = 0.0) -> UInt8[np.ndarray, "*shape"]:
     """Convert scene-linear light to 8-bit sRGB for people to look at."""
     return np.round(linear_to_srgb(tone_map(rgb, exposure_stops)) * 255.0).astype(np.uint8)
 

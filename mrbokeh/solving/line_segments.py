@@ -93,7 +93,7 @@ def working_copy(rgb: Float32[np.ndarray, "height width 3"]) -> UInt8[np.ndarray
     size_px = (max(1, round(width_px * shrink)), max(1, round(height_px * shrink)))
     small = cv2.resize(rgb, size_px, interpolation=cv2.INTER_AREA) if shrink < 1.0 else rgb
     grey = luminance(np.clip(np.nan_to_num(small), 0.0, 1.0)).astype(np.float32)
-    return np.ascontiguousarray(display_rgb8(np.repeat(grey[..., None], 3, axis=2))[..., 0])
+    return display_rgb8(grey)
 
 
 def find_segments(grey: UInt8[np.ndarray, "height width"]) -> Segments:

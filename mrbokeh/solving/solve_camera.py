@@ -78,14 +78,15 @@ def solve_camera(
         return _from_lines(lines, segments, known, (width_px, height_px))
     if len(segments) < _FEWEST:
         raise InputError(f"expected straight edges, but this picture shows {len(segments)} of them: {_ADVICE}")
-    free = best_frames(segments, np.random.default_rng(seed))
-    frames = free if known is None else best_frames(segments, np.random.default_rng(seed), known)
+    points = candidates(segments, np.random.default_rng(seed))
+    free = best_frames(segments, points)
+    frames = free if known is None else best_frames(segments, points, known)
     if not frames or frames[0].evidence < _REFUSED:
         raise InputError(f"the {len(segments)} straight edges of this picture agree on no upright world: {_ADVICE}")
     best = frames[0]
     guessed = known is None and (_sd(best, 4) > _TOLD or best.focal > _LONGEST_TOLD)
     if guessed:
-        frames = best_frames(segments, np.random.default_rng(seed), USUAL_FOCAL) or frames
+        frames = best_frames(segments, points, USUAL_FOCAL) or frames
         best = frames[0]
     found = _solved(best, (width_px, height_px), segments, source=GUESSED if guessed else SOLVED if known is None else KNOWN)
     if abs(found.distortion_percent) > _MOST_DISTORTION and abs(best.bending) > 4.0 * _sd(best, 3):

@@ -131,9 +131,8 @@ def _met(segments: Segments, point: Float64[np.ndarray, "3"]) -> Float64[np.ndar
     return point
 
 
-def best_frames(segments: Segments, rng: np.random.Generator, focal: float | None = None) -> list[Frame]:
-    """Return refined frames, the best first. focal: if it is known."""
-    points = candidates(segments, rng)
+def best_frames(segments: Segments, points: Float64[np.ndarray, "points 3"], focal: float | None = None) -> list[Frame]:
+    """Return refined frames of candidates, the best first. focal: if it is known."""
     rough = frames_of(segments, points, points, focal)
     refined = list[Frame]()
     for each in rough:
@@ -318,7 +317,7 @@ def fit(segments: Segments, frame: Frame, focal: float | None, noise: tuple[floa
 
 def turns(vectors: Float64[np.ndarray, "*turns 3"]) -> Float64[np.ndarray, "*turns 3 3"]:
     """Return the matrices of turns about vectors, by their length in radians (Rodrigues): for a few, in a tenth of Rotation's time."""
-    x, y, z = np.moveaxis(vectors, -1, 0)
+    x, y, z = (vectors[..., i] for i in range(3))
     none = np.zeros_like(x)
     cross = np.stack([none, -z, y, z, none, -x, -y, x, none], axis=-1).reshape(*x.shape, 3, 3)
     angle = np.sqrt(x * x + y * y + z * z)[..., None, None]

@@ -3,13 +3,14 @@
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
 from datasets_scripts.tracers.thin_lens import trace_pinhole
-from mrbokeh.depth.stereo_depth import Movement, _filled, _Matched, _rows, stereo_depth
+from mrbokeh.depth.stereo_depth import Movement, _filled, _Matched, _rows, camera_movement, stereo_depth
 from mrbokeh.images.color import srgb_to_linear
 from mrbokeh.images.image_io import read_image, write_image
 from mrbokeh.optics.camera import Camera
@@ -24,25 +25,30 @@ YAW_RAD = 0.02
 
 
 @cache
-def seen_from(x_m: float, y_m: float, z_m: float, yaw_rad: float = YAW_RAD) -> tuple[np.ndarray, np.ndarray]:
+def seen_from(
+    x_m: float, y_m: float, z_m: float, yaw_rad: float = YAW_RAD, size_px: tuple[int, int] = (480, 336)
+) -> tuple[np.ndarray, np.ndarray]:
     """Return what a camera at a place sees, linear, and depth: 480x336 px of cards 0.7 to 1.45 m away before a wall."""
     pose = np.eye(4)
     pose[:3, :3] = cv2.Rodrigues(np.array([0.3 * yaw_rad, yaw_rad, 0.2 * yaw_rad]))[0]
     pose[:3, 3] = -pose[:3, :3] @ np.array([x_m, y_m, z_m])
-    return trace_pinhole(scene(), replace(camera(), camera_from_world=pose), 8, seed=int(1000 * x_m) % 97)
+    return trace_pinhole(scene(), replace(camera(size_px), camera_from_world=pose), 8, seed=int(1000 * x_m) % 97)
 
 
-def camera() -> Camera:
-    return replace(true_camera(0).resized(480, 336), camera_from_world=np.eye(4))
+def camera(size_px: tuple[int, int] = (480, 336)) -> Camera:
+    return replace(true_camera(0).resized(*size_px), camera_from_world=np.eye(4))
 
 
 def first() -> tuple[np.ndarray, np.ndarray]:
     return seen_from(0.0, 0.0, 0.0, 0.0)
 
 
-def halved(rgb: np.ndarray) -> np.ndarray:
+SMALL_PX = (240, 168)
+
+
+def small(x_m: float = 0.0, y_m: float = 0.0, z_m: float = 0.0, yaw_rad: float = 0.0) -> np.ndarray:
     """A quarter of the pixels does where it does not matter how near depth comes to the truth."""
-    return cv2.resize(rgb, (300, 210), interpolation=cv2.INTER_AREA)
+    return seen_from(x_m, y_m, z_m, yaw_rad, SMALL_PX)[0]
 
 
 def errors(second_rgb: np.ndarray, baseline_m: float) -> tuple[float, float, float]:
@@ -95,16 +101,15 @@ def test_the_scale_is_that_of_the_baseline() -> None:
 )
 def test_pictures_that_show_no_depth_are_refused(place_m: tuple[float, float, float], yaw_rad: float, told: str) -> None:
     """A turn alone, 2 mm before things 0.7 m away, and a step ahead."""
-    pictures = halved(first()[0]), halved(seen_from(*place_m, yaw_rad)[0])
-    refused(told, stereo_depth, *pictures, camera().resized(300, 210), 0.1, PHOTOS)
+    refused(told, stereo_depth, small(), small(*place_m, yaw_rad), camera(SMALL_PX), 0.1, PHOTOS)
 
 
 def test_other_scenes_and_sizes_are_refused() -> None:
-    rgb, other = halved(first()[0]), np.random.default_rng(1).uniform(0.0, 1.0, (210, 300, 3)).astype(np.float32)
-    seen_by = camera().resized(300, 210)
+    rgb, other = small(), np.random.default_rng(1).uniform(0.0, 1.0, (*SMALL_PX[::-1], 3)).astype(np.float32)
+    seen_by = camera(SMALL_PX)
     refused("too little in common", stereo_depth, rgb, cv2.GaussianBlur(other, (0, 0), 2.0), seen_by, 0.1, PHOTOS)
     refused("too little in common", stereo_depth, rgb, np.full_like(rgb, 0.2), seen_by, 0.1, PHOTOS)
-    refused("expected two photographs of one camera", stereo_depth, rgb, other[:, :250], seen_by, 0.1, PHOTOS)
+    refused("expected two photographs of one camera", stereo_depth, rgb, other[:, :200], seen_by, 0.1, PHOTOS)
 
 
 def test_a_real_pair_has_the_depth_that_was_measured(shared_data: Path) -> None:
@@ -125,13 +130,23 @@ def _stored(path: Path) -> np.ndarray:
     return np.ascontiguousarray(cv2.imread(str(path))[..., ::-1], np.float32) / np.float32(255.0)
 
 
-def test_the_command_says_what_it_guesses(tmp_path: Path) -> None:
-    """Metres are guessed until the way of the camera is told."""
-    rgb = halved(first()[0])
+def test_the_command_says_what_it_guesses(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Metres are guessed until the way of the camera is told; how it moved is found once, of the same photographs."""
+    moved = cache(lambda *_: camera_movement(*taken[0]))
+    taken = list[tuple[np.ndarray, np.ndarray, Camera, str]]()
+
+    def found_once(*pictures: Any) -> Movement:
+        taken.append(pictures)
+        np.testing.assert_array_equal(pictures[0], taken[0][0])
+        np.testing.assert_array_equal(pictures[1], taken[0][1])
+        return moved()
+
+    monkeypatch.setattr("mrbokeh.depth.stereo_depth.camera_movement", found_once)
+    rgb = small()
     write_image(tmp_path / "photo.png", rgb)
-    write_image(tmp_path / "second.png", halved(seen_from(*WAYS_M["right"])[0]))
+    write_image(tmp_path / "second.png", small(*WAYS_M["right"], YAW_RAD))
     width_mm = 28.0 * camera().width_px / camera().focal_px[0]
-    words = ("--object", CAKE, "--at-pixel", "150,165", "--height", "60px", "--plain", "--focal-length", "28", "--f-number", "4")
+    words = ("--object", CAKE, "--at-pixel", "120,132", "--height", "48px", "--plain", "--focal-length", "28", "--f-number", "4")
     lens = ("--focus", "1", "--sensor-width", f"{width_mm:.6g}")
     done = mrbokeh("composite", tmp_path / "photo.png", "--stereo", tmp_path / "second.png", *words, *lens, "--out", tmp_path / "out.exr")
     assert done.returncode == 0, done.stderr
@@ -152,9 +167,9 @@ def test_the_command_says_what_it_guesses(tmp_path: Path) -> None:
     ],
 )
 def test_options_that_contradict_one_another_are_refused(words: tuple[str, ...], told: str, tmp_path: Path) -> None:
-    write_image(tmp_path / "photo.png", first()[0])
+    write_image(tmp_path / "photo.png", small())
     given = [str(tmp_path / each) if each.endswith(("png", "exr")) else each for each in words]
-    done = mrbokeh("composite", tmp_path / "photo.png", *given, "--object", CAKE, "--at-pixel", "300,330", "--out", tmp_path / "out.png")
+    done = mrbokeh("composite", tmp_path / "photo.png", *given, "--object", CAKE, "--at-pixel", "120,132", "--out", tmp_path / "out.png")
     assert done.returncode == 2 and told in done.stderr
 
 

@@ -35,7 +35,7 @@ SIZE = (132, 196)
 FOCI_M = (0.5, 0.68, 1.3)  # the wall lies from 0.6 m to 0.9 m
 LENS = Lens(50.0, 2.0, 0.68, 22.0 * 196 / 220)
 NOISE, DEPTH_NOISE = 0.01, 0.003
-ONE = FitSettings(diameters_px=(12.0,), regions=(1, 1), pixels=15_000)
+ONE = FitSettings(diameters_px=(12.0,), regions=(1, 1), pixels=8_000)
 HEPTAGON = Aperture.blades(7, 0.3)
 
 

@@ -1,11 +1,13 @@
 """Stacks of which no distance is known: every command works on them, gives what it gives in true metres, and says what is a guess."""
 
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from capture.merging.preferred_side import PREFERRED
 from capture.poses.lens_calibration import write_calibrated
@@ -14,6 +16,8 @@ from mrbokeh.images.image_io import read_image, write_layer
 from mrbokeh.images.layer import Layer
 from mrbokeh.lens_measuring.fitting.blur_pairs import StackSlices
 from mrbokeh.optics.lens_file import lens_to_json, write_lens
+from mrbokeh.optics.psf_bank import PsfBank
+from mrbokeh.optics.psf_bank_file import read_bank
 from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack, write_focal_stack
 from mrbokeh.stacks.focal_stack_dataset import read_focal_stack_dataset
@@ -53,9 +57,14 @@ def run(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> 
     return run
 
 
+@pytest.fixture(scope="module")
+def photographed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_card_stack(tmp_path_factory.mktemp("photographed") / "known", 3).folder
+
+
 @pytest.fixture
-def known(tmp_path: Path) -> FocalStack:
-    return make_card_stack(tmp_path / "scene" / "known", 3)
+def known(photographed: Path, tmp_path: Path) -> FocalStack:
+    return read_focal_stack(shutil.copytree(photographed, tmp_path / "scene" / "known"))
 
 
 @pytest.fixture
@@ -258,18 +267,27 @@ def test_fits_of_a_lens_see_the_same_blur(known: FocalStack, guessed: FocalStack
         np.testing.assert_array_equal(other.view(number).known, one.view(number).known)
 
 
-def test_a_lens_is_fitted_in_pixels(guessed: FocalStack, tmp_path: Path, run: Run) -> None:
+def test_a_lens_is_fitted_in_pixels(guessed: FocalStack, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sheet of kernels, which takes most of the time, is drawn in tests/optics."""
+    drawn = list[PsfBank]()
+    monkeypatch.setattr("mrbokeh.figures.psf_bank_drawing.draw_bank", lambda bank: (drawn.append(bank), Figure((1, 1)))[1])
     told = run("lens", "fit", guessed.folder, "--out", tmp_path / "bank", "--regions", "1x1", "--diameters", 8, "--pixels", 4000)
-    assert "metres are guessed" in told and "needs no metres" in told and (tmp_path / "bank" / "kernels.png").is_file()
+    assert "metres are guessed" in told and "needs no metres" in told
+    kept = read_bank(tmp_path / "bank")
+    assert [each.name for each in kept.axes] == [each.name for each in drawn[0].axes] == ["diameter_px"]
+    assert len(kept.kernels) == len(drawn[0].kernels) > 0
+    assert (tmp_path / "bank" / "kernels.png").is_file() and (tmp_path / "bank" / "evidence.png").is_file()
 
 
-def test_data_sets_record_it_and_networks_train(guessed: FocalStack, tmp_path: Path, run: Run) -> None:
+def test_data_sets_record_it_and_networks_train(
+    known: FocalStack, guessed: FocalStack, tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("training.fitting.record.draw_curve", lambda _folder, _curve: "<svg></svg>")
     guessed_twin(make_card_stack(tmp_path / "other", 4), guessed.folder.parent / "second")
     told = run("capture", "dataset", guessed.folder.parent, "--out", tmp_path / "set", "--licence", "CC0", "--renderer", "scatter")
     assert "metres are guessed" in told
     dataset = read_focal_stack_dataset(tmp_path / "set")
     assert dataset.metadata["metres_guessed"] == ["guesses/second", "guesses/twin"]
-    known = make_card_stack(tmp_path / "plain", 3)
     assert dataset.largest_coc_px == pytest.approx(max(float(np.abs(known.coc_px(i, known.depth_m())).max()) for i in range(3)), rel=1e-3)
     training = ("--preset", "demo", "--epochs", 1, "--threads", 1, "--set", "sheets=false", "--set", "crop_px=0")
     assert "metres are guessed" in run("train", "fit", tmp_path / "set", *training, "--out", tmp_path / "run")

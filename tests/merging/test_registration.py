@@ -30,12 +30,12 @@ MOVED_PX = (240, 160)
 
 @pytest.fixture(scope="module")
 def moved() -> JitteredStack:
-    return jittered_stack(size_px=MOVED_PX)
+    return jittered_stack(size_px=MOVED_PX, samples=4)
 
 
 @pytest.fixture(scope="module")
 def still() -> JitteredStack:
-    return jittered_stack(0.0, 0.0)
+    return jittered_stack(0.0, 0.0, samples=4)
 
 
 def prior_errors_px(stack: JitteredStack) -> list[float]:

@@ -1,6 +1,7 @@
 """Blur solved from slices alone: positions in pixels against those that the slices were rendered with, order and near end of the sweep."""
 
-from dataclasses import dataclass
+import shutil
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from mrbokeh.optics.aperture import Aperture
 from mrbokeh.optics.drawn_diameters import drawn_diameters_px
 from mrbokeh.optics.lens import Lens
 from mrbokeh.renderers.polygon.polygon_differences import PolygonDifferences
-from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack
 from tests.project.test_user_mistakes import said
 from tests.support.blended_slices import all_in_focus
 
@@ -48,6 +49,10 @@ class Rendered:
 
 @cache
 def rendered(noise: float = 0.0) -> Rendered:
+    if noise > 0.0:
+        rng, clean = np.random.default_rng(4), rendered()
+        noisy = (each + np.float32(noise) * rng.standard_normal(each.shape, np.float32) for each in clean.slices)
+        return replace(clean, slices=tuple(noisy))
     rng = np.random.default_rng(3)
     height, width = SIZE
     texture = 0.25 * rng.random((height, width, 3)) + 0.35 * cv2.resize(
@@ -65,7 +70,7 @@ def rendered(noise: float = 0.0) -> Rendered:
     for each in DIOPTRES:
         focused = lens.focused_at(1.0 / each)
         focused = Lens(35.0, focused.coc_px_per_dioptre(width) / GROWTH, 1.0 / each, 36.0)
-        slices.append((renderer.render([layer], focused).rgb + noise * rng.standard_normal((height, width, 3))).astype(np.float32))
+        slices.append(renderer.render([layer], focused).rgb)
     return Rendered(tuple(slices), sharp, dioptres.astype(np.float32))
 
 
@@ -187,9 +192,16 @@ def unmerged(folder: Path, order: tuple[int, ...], distances_m: dict[int, float]
     write_focal_stack(FocalStack(folder, tuple(slices), metadata=dict(metadata)))
 
 
-def test_a_stack_without_distances_gets_its_blur_and_says_that_metres_are_guessed(tmp_path: Path) -> None:
-    unmerged(tmp_path, (3, 0, 5, 1, 4, 2))
-    stack = merge_scene(tmp_path)[0]
+@pytest.fixture(scope="module")
+def merged(tmp_path_factory: pytest.TempPathFactory) -> FocalStack:
+    """A stack out of order without any distance, merged."""
+    folder = tmp_path_factory.mktemp("merged")
+    unmerged(folder, (3, 0, 5, 1, 4, 2))
+    return merge_scene(folder)[0]
+
+
+def test_a_stack_without_distances_gets_its_blur_and_says_that_metres_are_guessed(merged: FocalStack) -> None:
+    stack = merged
     assert [each.metadata["source"] for each in stack.slices] in ([f"{i}.jpg" for i in range(6)], [f"{i}.jpg" for i in range(5, -1, -1)])
     assert not stack.metres_known and stack.is_metric
     assert "no focus distance is stated" in stack.metadata["metres"]["why"]
@@ -204,9 +216,6 @@ def test_a_stack_without_distances_gets_its_blur_and_says_that_metres_are_guesse
         np.testing.assert_allclose(from_depth, from_position, atol=0.02)
     positions_px = [each.metadata["blur_position_px"] for each in stack.slices]
     assert np.ptp(positions_px) == pytest.approx(GROWTH * np.ptp(DIOPTRES), rel=0.06)
-    again = merge_scene(tmp_path, overwrite=True)[0]
-    assert again.focus_distances_m == stack.focus_distances_m, "nothing guessed is taken for stated"
-    assert [each.metadata["source"] for each in again.slices] == [each.metadata["source"] for each in stack.slices]
 
 
 def test_two_stated_distances_give_metres(tmp_path: Path) -> None:
@@ -272,17 +281,16 @@ def test_blur_is_right_in_pixels_beside_a_slice_at_infinity(tmp_path: Path) -> N
             np.testing.assert_allclose(on_other_px, positions_px[index] - positions_px[other], atol=0.05)
 
 
-def test_merging_anew_says_what_was_told_before(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+def test_merging_anew_says_what_was_told_before_and_takes_nothing_guessed_for_stated(
+    merged: FocalStack, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    unmerged(tmp_path, (0, 1, 2, 3, 4, 5))
+    shutil.copytree(merged.folder, tmp_path, dirs_exist_ok=True)
 
     def run(*arguments: object) -> str:
         code, told = said(capsys, monkeypatch, "capture", *arguments)
         assert code == 0, told
         return told
 
-    assert "without what was told" not in run("merge", tmp_path)
     assert run("merge", tmp_path).startswith(f"all of {tmp_path} was merged before and stays as it is (--overwrite merges it again)")
     run("scale", tmp_path, "--nearest", "last", "--distance-at", "100.5,90,0.35")
     run("scale", tmp_path, "--ruler", "70,60,130,140,0.125")
@@ -290,6 +298,9 @@ def test_merging_anew_says_what_was_told_before(
     assert "stays as it is" not in told
     assert f"capture scale {tmp_path} --distance-at 100.5,90,0.35 --ruler 70,60,130,140,0.125 --nearest last`" in told
     assert "without what was told" not in run("merge", tmp_path, "--overwrite")
+    again = read_focal_stack(tmp_path)
+    assert again.focus_distances_m == merged.focus_distances_m
+    assert [each.metadata["source"] for each in again.slices] == [each.metadata["source"] for each in merged.slices]
 
 
 def test_discs_of_the_evidence_are_those_that_renderers_draw() -> None:

@@ -57,20 +57,26 @@ def _card(x_m: float, z_m: float, size_m: float, texture: np.ndarray) -> Quad:
 
 
 @cache
-def traced(view: int = 0, card_x_m: float = 0.1) -> TracedStack:
-    """All slices are seen with the focal length of the first, as registration would make them; blur is larger by the same factor."""
+def traced(view: int = 0, card_x_m: float = 0.1, from_slice: int = 0) -> TracedStack:
+    """All slices are seen with the focal length of the first, as registration would make them; blur is larger by the same factor.
+
+    from_slice: those before it are left out.
+    """
     scene = still_life(card_x_m)
     camera = desk_camera(view, WIDTH_PX, HEIGHT_PX, LENS)
     lenses = [LENS.focused_at(each) for each in FOCUS_M]
     enlarged = [replace(lens, sensor_width_mm=23.5 * lens.image_distance_mm / lenses[0].image_distance_mm) for lens in lenses]
-    slices = [trace(scene, camera, lens, SAMPLES, 100 * view + index) for index, lens in enumerate(enlarged)]
+    slices = [trace(scene, camera, enlarged[index], SAMPLES, 100 * view + index) for index in range(from_slice, SLICES)]
     rgb, depth_m = trace_pinhole(scene, camera, SAMPLES, 1)
     scales = tuple(lenses[0].image_distance_mm / lens.image_distance_mm for lens in lenses)
     return TracedStack(np.stack(slices).astype(np.float32), rgb.astype(np.float32), depth_m.astype(np.float32), camera, scales)
 
 
 def write_stack(folder: Path, truth: TracedStack, *, noise: float = 0.005, seed: int = 1) -> FocalStack:
-    """A merged stack whose all-in-focus picture and depth are the truth; noise: of a slice's radiance 1, growing as photons do."""
+    """A merged stack whose all-in-focus picture and depth are the truth; noise: of a slice's radiance 1, growing as photons do.
+
+    It has the slices of the truth, at the first focus distances.
+    """
     rng = np.random.default_rng(seed)
     slices = []
     for index, rgb in enumerate(truth.slices):
@@ -80,7 +86,7 @@ def write_stack(folder: Path, truth: TracedStack, *, noise: float = 0.005, seed:
         slices.append(Slice(path, FOCUS_M[index], truth.scales[index]))
     height, width = truth.depth_m.shape
     dioptres = 1.0 / truth.depth_m
-    index = np.interp(-dioptres, [-1.0 / each for each in FOCUS_M], np.arange(SLICES)).astype(np.float32)
+    index = np.interp(-dioptres, [-1.0 / each for each in FOCUS_M[: len(slices)]], np.arange(len(slices))).astype(np.float32)
     write_merged(folder, truth.all_in_focus, index, np.ones((height, width), np.float32), truth.depth_m)
     stack = FocalStack(folder, tuple(slices), LENS, truth.camera, 0, registered=True, merged=True)
     write_focal_stack(stack)

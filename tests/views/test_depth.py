@@ -184,30 +184,30 @@ def test_a_stack_without_a_pose_keeps_its_depth_from_focus(merged: Path, truths:
     assert (scene / VIEWS[2] / "depth.exr").read_bytes() == before
 
 
-def test_what_is_missing_is_said_before_anything_changes(merged: Path, tmp_path: Path) -> None:
-    scene = tmp_path / "desk"
-    shutil.copytree(merged, scene, ignore=shutil.ignore_patterns("reconstruction"))
+def test_what_is_missing_is_said_before_anything_changes(small: Path, tmp_path: Path) -> None:
+    scene = tmp_path / "without"
+    shutil.copytree(small, scene, ignore=shutil.ignore_patterns("reconstruction", "without"))
     refused("capture poses", printed_by, app, "depth", scene)
-    write_sparse_model(scene / "reconstruction", read_sparse_model(merged / "reconstruction"))
+    write_sparse_model(scene / "reconstruction", read_sparse_model(small / "reconstruction"))
     refused("capture scale", deepen_scene, scene)
-    assert len(find_focal_stacks(scene)) == 3
+    assert len(find_focal_stacks(scene)) == 2
     # The package pycolmap of the extra is built without CUDA.
     write_json(scene / "reconstruction" / "scale.json", {"metres_per_unit": 1.0})
     refused("pycolmap-cuda12", deepen_scene, scene, SceneDepthSettings(patch_match=True))
     assert not list(scene.rglob("first_pass"))
 
 
-def test_depths_of_patch_match_come_in_metres(merged: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_depths_of_patch_match_come_in_metres(small: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its maps are in COLMAP's unit, here half a metre: a map of 3 units is 1.5 m. COLMAP itself is stood in for."""
-    scene, model = tmp_path / "desk", replace(read_sparse_model(merged / "reconstruction"), metres_per_unit=0.5)
-    job = ColmapJob((ColmapPicture(VIEWS[0], f"{VIEWS[0]}.png", "", 0),), (None,))
+    scene, model = tmp_path / "desk", replace(read_sparse_model(small / "reconstruction"), metres_per_unit=0.5)
+    job = ColmapJob((ColmapPicture("a", "a.png", "", 0),), (None,))
     write_json(scene / "reconstruction" / "colmap_job.json", job_to_json(job))
     ran: list[Path] = []
     monkeypatch.setattr("capture.dense.scene_depth.patch_match_obstacle", lambda: None)
     monkeypatch.setattr("capture.dense.scene_depth.run_patch_match", lambda _s, _p, folder: (folder.mkdir(), ran.append(folder)))
     monkeypatch.setattr("capture.dense.scene_depth.read_patch_match", lambda *_: np.full((2, 3), 3.0, np.float32))
     for _ in range(2):
-        found = PatchMatchScene(scene, model).depths_in(VIEWS[0])
+        found = PatchMatchScene(scene, model).depths_in("a")
     np.testing.assert_array_equal(found.depth_m, 1.5)
     assert len(found.xy_px) == 6 and len(ran) == 1, "what is finished is not run again"
 
@@ -242,7 +242,7 @@ def small(tmp_path: Path) -> Path:
         slices = tuple(Slice(f"{index}.exr", distance_m) for index, distance_m in enumerate(SMALL_FOCUS_M))
         one = np.ones(SMALL, np.float32)
         write_merged(folder, np.full((*SMALL, 3), 0.5, np.float32), one, one, one)
-        metadata = {DEPTH_SOURCE: "focus", RETOUCHES: ["by hand"], PREFERRED: "near"}
+        metadata = {DEPTH_SOURCE: "focus", RETOUCHES: [{"slice": 1, "source": "b.png", "mask": "man.png", "share": 0.1}], PREFERRED: "near"}
         write_focal_stack(FocalStack(folder, slices, lens, registered=True, merged=True, metadata=metadata))
     points = np.random.default_rng(1).uniform([-0.1, -0.1, 0.95], [0.1, 0.1, 1.05], (25, 3))
     views = tuple(SparseView(name, at(x_m)) for name, x_m in (("a", 0.0), ("b", 0.14)))

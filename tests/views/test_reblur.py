@@ -24,8 +24,8 @@ from mrbokeh.renderers.scatter_reference import ScatterReference
 from mrbokeh.stacks.focal_stack import FocalStack
 from tests.support.traced_focal_stack import FOCUS_M, LENS, SLICES, TracedStack, traced, write_stack
 
-# Half the usual slices: half the time, and blur here is small.
-REBLUR = Reblur(PolygonDifferences(layering=Layering(slices=8), threads=1))
+# A third of the usual slices: less than half the time, and blur here is small.
+REBLUR = Reblur(PolygonDifferences(layering=Layering(slices=5), threads=1))
 
 
 @pytest.fixture(scope="module")
@@ -122,8 +122,8 @@ def brighter(_: FocalStack, truth: TracedStack, folder: Path) -> FocalStack:
 
 def moved(_: FocalStack, truth: TracedStack, folder: Path) -> FocalStack:
     """The card at 1 m goes 3 cm to the right after slice 2."""
-    later = traced(0, 0.13)
-    return write_stack(folder, replace(truth, slices=np.concatenate([truth.slices[:3], later.slices[3:]])))
+    later = traced(0, 0.13, from_slice=3)
+    return write_stack(folder, replace(truth, slices=np.concatenate([truth.slices[:3], later.slices])))
 
 
 def depth_wrong(_: FocalStack, truth: TracedStack, folder: Path) -> FocalStack:
@@ -169,8 +169,8 @@ def test_what_moved_is_found_where_it_moved(truth: TracedStack, tmp_path: Path) 
 
     Where blur washes out the checks of the card, before and after look alike: 17 % here.
     """
-    later = traced(0, 0.13)
-    transient = np.concatenate([truth.slices[:3], later.slices[3:4], truth.slices[4:]])
+    later = traced(0, 0.13, from_slice=3)
+    transient = np.concatenate([truth.slices[:3], later.slices[:1], truth.slices[4:]])
     found = examined(write_stack(tmp_path / "view_0", replace(truth, slices=transient))).moving
     differs = (np.abs(truth.all_in_focus - later.all_in_focus).max(axis=2) > 0.1) & inside(truth.depth_m.shape)
     assert found[differs].mean() > 0.75

@@ -28,9 +28,10 @@ from mrbokeh.optics.lens import Lens
 from mrbokeh.stacks.focal_stack import FocalStack, read_focal_stack, write_focal_stack
 from mrbokeh.system.atomic_files import read_json, write_json
 from tests.support.command_line import printed_by
-from tests.support.traced_focal_stack import HEIGHT_PX, SLICES, WIDTH_PX, traced, write_stack
+from tests.support.traced_focal_stack import HEIGHT_PX, WIDTH_PX, TracedStack, traced, write_stack
 
 NAMES = ("view_0", "view_1")
+SLICES = 3
 
 
 @dataclass
@@ -51,9 +52,13 @@ OF_STACK = 3 * SLICES
 """Renderings of a stack: each slice, and with blur a pixel smaller and larger."""
 
 
+def short() -> TracedStack:
+    return replace(traced(), slices=traced().slices[:SLICES])
+
+
 def scene_in(folder: Path) -> Path:
     for name in NAMES:
-        write_stack(folder / "scene" / name, traced())
+        write_stack(folder / "scene" / name, short())
     return folder / "scene"
 
 
@@ -148,7 +153,7 @@ def spoiled(stack: Path) -> None:
 
 def test_whatever_findings_depend_on_is_looked_at(reported: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert report(reported, width=80) == 2 * OF_STACK
-    for change in (touch("stack.json"), touch("depth.exr"), touch("registered/03.exr"), registered_otherwise, picture_lost, spoiled):
+    for change in (touch("stack.json"), touch("depth.exr"), touch("registered/02.exr"), registered_otherwise, picture_lost, spoiled):
         change(reported / "view_0")
         assert [report(reported, width=80) for _ in range(2)] == [OF_STACK, 0], change
     assert report(reported, width=80, name="other") == 2 * OF_STACK
@@ -209,6 +214,6 @@ def test_finished_stacks_hold_neither_pictures_nor_maps(reported: Path) -> None:
 
 def test_the_command_tells_what_was_kept(tmp_path: Path) -> None:
     """Examined, kept, examined again. Without a lens nothing is rendered."""
-    write_focal_stack(replace(write_stack(tmp_path / "view_0", traced()), lens=None))
+    write_focal_stack(replace(write_stack(tmp_path / "view_0", short()), lens=None))
     told = [printed_by(report_command, tmp_path, *more) for more in ([], [], ["--overwrite"])]
     assert ["1 of 1 stacks were examined before" in each for each in told] == [False, True, False]

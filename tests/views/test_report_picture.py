@@ -30,6 +30,7 @@ from tests.support.refusals import refused
 
 Rgb = Float32[np.ndarray, "height width 3"]
 Made = tuple[list[Rgb], Rgb]
+Reported = Callable[[Callable[[], Made]], SceneReport]
 
 WIDTH_PX, HEIGHT_PX = 600, 384
 FOCUS_COLUMNS = (75, 225, 375, 525)
@@ -118,7 +119,7 @@ def shifted_slice() -> Made:
     return slices, merged_from(slices)
 
 
-def write_made(folder: Path, made: Made, highlights: dict[str, float] | None = None) -> FocalStack:
+def write_made(folder: Path, made: Made) -> FocalStack:
     """A merged stack of a camera about which nothing is known."""
     slices, picture = made
     described = []
@@ -128,15 +129,27 @@ def write_made(folder: Path, made: Made, highlights: dict[str, float] | None = N
         described.append(Slice(path, None))
     sharpest = focus_index()[: picture.shape[0], : picture.shape[1]]
     write_merged(folder, picture, sharpest, np.ones_like(sharpest), None)
-    metadata = {} if highlights is None else {"highlights": highlights}
-    stack = FocalStack(folder, tuple(described), registered=True, merged=True, metadata=metadata)
+    stack = FocalStack(folder, tuple(described), registered=True, merged=True)
     write_focal_stack(stack)
     return stack
 
 
-def report_of(folder: Path, made: Made, highlights: dict[str, float] | None = None) -> SceneReport:
-    write_made(folder / "view_0", made, highlights)
+def report_of(folder: Path, made: Made) -> SceneReport:
+    write_made(folder / "view_0", made)
     return report_scene(folder)
+
+
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory: pytest.TempPathFactory) -> Reported:
+    """The report of a right merge or of one with a fault, made once."""
+    return cache(lambda made: report_of(tmp_path_factory.mktemp(made.__name__), made()))
+
+
+def judged_with(report: SceneReport, **metadata: object) -> dict[str, Gate]:
+    """The gates of the picture by name, where merging and retouching say this in the stack."""
+    findings = report.stacks[0].findings
+    stack = replace(findings.stack, metadata=findings.stack.metadata | metadata)
+    return {each.name: each for each in picture_gates(replace(findings, stack=stack))}
 
 
 def gate(report: SceneReport, name: str) -> Gate:
@@ -147,12 +160,12 @@ def places(report: SceneReport, name: str) -> list[CachedPlace]:
     return [each for each in report.stacks[0].places if each.gate == name]
 
 
-def test_a_right_merge_passes_without_any_lens(tmp_path: Path) -> None:
+def test_a_right_merge_passes_without_any_lens(reported: Reported) -> None:
     """The picture was looked at and no gate failed: passed, with what could not be judged counted."""
-    report = report_of(tmp_path, right())
+    report = reported(right)
     assert not report.failures
     assert {each.name for each in report.gates if each.verdict == "passed"} >= {SHARP.name, SEAMS.name, LIGHT.name, PLACES.name}
-    document = json.loads((tmp_path / "report.json").read_text())
+    document = json.loads((report.scene / "report.json").read_text())
     assert document["passed"] is True
     assert (document["judged"], document["failed"], document["absent"]) == (10, 0, 11)
     picture = document["stacks"]["view_0"]["picture"]
@@ -173,54 +186,48 @@ def test_a_right_merge_passes_without_any_lens(tmp_path: Path) -> None:
     ],
 )
 def test_each_fault_fails_its_gate_and_is_shown(
-    fault: Callable[[], Made], rule: object, around: tuple[int, int], reach_px: int, tmp_path: Path
+    fault: Callable[[], Made], rule: object, around: tuple[int, int], reach_px: int, reported: Reported
 ) -> None:
     """And no other gate; the block that is shown lies where the fault was made."""
-    report = report_of(tmp_path, fault())
+    report = reported(fault)
     name = getattr(rule, "name", "")
     assert [each.name for each in report.failures] == [name]
-    assert json.loads((tmp_path / "report.json").read_text())["passed"] is False
+    assert json.loads((report.scene / "report.json").read_text())["passed"] is False
     shown = places(report, name)
     assert shown
     x, y = shown[0].at_px
     assert abs(x + BLOCK_PX / 2 - around[0]) <= reach_px + BLOCK_PX and abs(y + BLOCK_PX / 2 - around[1]) <= reach_px + BLOCK_PX
-    assert f"x {x}, y {y}" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert f"x {x}, y {y}" in (report.scene / "report.html").read_text(encoding="utf-8")
 
 
-def test_what_was_taken_on_purpose_is_told_where_pictures_are_judged(tmp_path: Path) -> None:
+def test_what_was_taken_on_purpose_is_told_where_pictures_are_judged(reported: Reported) -> None:
     """By merging, where something moved, and by hand."""
-    stack = write_made(tmp_path / "view_0", right())
-    taken = {
-        "ghosts": {"before": 0.02, "after": 0.0, "share": 0.125},
-        "retouches": [{"slice": 2, "source": "b.png", "mask": "man.png", "share": 0.1}],
-    }
-    write_focal_stack(replace(stack, metadata=stack.metadata | taken))
-    report = report_scene(tmp_path)
+    retouches = [{"slice": 2, "source": "b.png", "mask": "man.png", "share": 0.1}]
+    gates = judged_with(reported(right), ghosts={"before": 0.02, "after": 0.0, "share": 0.125}, retouches=retouches)
     told = "; something moved between the slices: 12.5% of the picture is taken whole from one slice each; retouched: slice 2 by man.png"
-    assert gate(report, SHARP.name).measured.endswith(told) and gate(report, GHOSTS.name).measured.endswith(told)
-    assert "moved" not in gate(report, SEAMS.name).measured
+    assert gates[SHARP.name].measured.endswith(told) and gates[GHOSTS.name].measured.endswith(told)
+    assert "moved" not in gates[SEAMS.name].measured
 
 
-def test_crops_are_at_100_percent_beside_the_slices_on_both_sides_of_a_seam(tmp_path: Path) -> None:
+def test_crops_are_at_100_percent_beside_the_slices_on_both_sides_of_a_seam(reported: Reported) -> None:
     """Of the lost disc: 160 px of the picture around the block, and of the slice that is sharpest there, which is slice 0."""
-    report = report_of(tmp_path / "disc", lost_disc())
-    shown = places(report, SHARP.name)[0]
+    shown = places(reported(lost_disc), SHARP.name)[0]
     assert [each.caption for each in shown.pictures] == ["all in focus", "slice 0, the sharpest here"]
     crops = [read_image(each.path) for each in shown.pictures]
     assert all(each.shape == (160, 160, 3) for each in crops)
     inside = np.s_[69:91, 69:91]  # The block lies in the middle of a crop that does not touch the border.
     assert crops[0][inside].std() < 0.6 * crops[1][inside].std()
     # A jigsaw on the border between slices 1 and 2, at column 300.
-    captions = [each.caption for each in places(report_of(tmp_path, jigsaw()), SEAMS.name)[0].pictures]
+    captions = [each.caption for each in places(reported(jigsaw), SEAMS.name)[0].pictures]
     assert [each.split(", contrast")[0] for each in captions] == ["all in focus", "slice 1, sharp here", "slice 2, sharp here"]
     assert len({each.split(", contrast")[1] for each in captions}) == 1, "seen with one contrast"
 
 
-def test_measured_flux_supports_what_no_slice_shows(tmp_path: Path) -> None:
+def test_measured_flux_supports_what_no_slice_shows(reported: Reported) -> None:
     """The dot of 4.0: allowed where merging says that discs speak for 4.0, not where they speak for 3.0 or for nothing."""
-    made = invented_light()
-    for name, largest, verdict in (("more", 4.0, "passed"), ("less", 3.0, "failed")):
-        assert gate(report_of(tmp_path / name, made, {"drawn": 1, "largest_supported": largest}), LIGHT.name).verdict == verdict
+    for largest, verdict in ((4.0, "passed"), (3.0, "failed")):
+        gates = judged_with(reported(invented_light), highlights={"drawn": 1, "largest_supported": largest})
+        assert gates[LIGHT.name].verdict == verdict
 
 
 def test_shifts_and_turns_are_measured_where_there_is_data() -> None:
