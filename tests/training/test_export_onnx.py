@@ -36,10 +36,8 @@ FORMS = {
     "gated, tiles, unsigned": replace(demo_settings().network, tile_px=32, overlap_px=6, signed_coc=False),
     "gated, place": better_settings().network,
 }
-FORMS["published, 3x3, tiles, place and lens"] = replace(
-    FORMS["published"], kernels="3x3", field_position=True, lens_inputs=True, headroom=1.5
-)
-FORMS["published, 3x3, place and lens"] = replace(FORMS["published, 3x3, tiles, place and lens"], tile_px=0, overlap_px=0)
+FORMS["published, 3x3, tiles, all inputs"] = replace(FORMS["published"], kernels="3x3", field_position=True, lens_inputs=True, headroom=1.5)
+FORMS["published, 3x3, all inputs"] = replace(FORMS["published, 3x3, tiles, all inputs"], tile_px=0, overlap_px=0)
 
 
 def _network(settings: NetworkSettings, seed: int = 0) -> BlurNetwork:
