@@ -437,7 +437,7 @@ def test_metres_of_depth_without_a_unit_are_doubted(shared_data: Path, tmp_path:
     assert open_plate(path).metres_guessed
     told = plate_by(CompositeOptions(path, PlateOptions(disparity="0.5:4")), None, lens=None, focus_m=None)
     assert not told.metres_guessed
-    words = ("--object", CAKE, "--at-pixel", "380,700", "--height", "0.1", "--out", tmp_path / "out.png")
+    words = ("--object", CAKE, "--at-pixel", "380,700", "--height", "0.1", "--mode", "front", "--shadow", 0, "--out", tmp_path / "out.png")
     assert "--height 0.1 counts metres, but those of the photograph's depth are guessed" in mrbokeh("composite", path, *words).stderr
 
 
