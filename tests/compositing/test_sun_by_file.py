@@ -43,9 +43,8 @@ def test_options_replace_the_sun_of_the_file(tmp_path: Path) -> None:
     for options in (("--sun", "-30,50"), ("--sun-by", "200,60:200,160:240,170"), ("--plain",)):
         standing = ("--at", "0,0.5,2") if options == ("--plain",) else ()
         words = [each for each in STANDING if not (standing and each in ("--at-pixel", "150,150"))]
-        done = run(
-            "composite", photo, *words, *standing, *options, "--focus", 3, "--shadow", 0, "--out", tmp_path / "out.png", "--overwrite"
-        )
+        words += [*standing, *options, "--focus", 3, "--shadow", 0]
+        done = run("composite", photo, *words, "--out", tmp_path / "out.png", "--overwrite")
         assert done.returncode == 0, done.stderr
         assert "in the file it stood" not in done.stdout
 
