@@ -364,7 +364,8 @@ def few_rays(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_lens_beam, "_AREA_RAYS", 1 << 12)
 
 
-def test_a_bank_ends_where_the_lens_goes_black(few_rays: None) -> None:
+@pytest.mark.usefixtures("few_rays")
+def test_a_bank_ends_where_the_lens_goes_black() -> None:
     """Rims of 12 mm on both sides of the stop leave nothing for the corners of a sensor twice as large as the lens is made for."""
     model = PhysicalLens(pair(12.0), sensor_mm=(72.0, 48.0))
     field = model.axes[1]
@@ -387,8 +388,9 @@ def test_mistakes_are_named() -> None:
     assert lens().exact(np.array([2.0, 0.0])) is None
 
 
+@pytest.mark.usefixtures("few_rays")
 @pytest.mark.parametrize("name", ["dgauss.50mm", "wide.22mm", "fisheye.10mm"])
-def test_published_lenses_pass_light_as_far_as_they_reach(shared_data, few_rays: None, name: str) -> None:
+def test_published_lenses_pass_light_as_far_as_they_reach(shared_data, name: str) -> None:
     """The axes end at the corner or before it; there still is light there, and less than in the middle."""
     model = PhysicalLens(shared_data / "lens" / "prescriptions" / f"{name}.dat")
     depth, field = model.axes
