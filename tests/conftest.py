@@ -205,3 +205,16 @@ def shared_data() -> Path:
     if not SHARED_DATA.is_dir():
         pytest.skip("the shared test data folder (../shared/data) is not beside the checkout")
     return SHARED_DATA
+
+
+@pytest.fixture(autouse=True)
+def operators_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """PyTorch's exporter reads the sources of its 500 operators for each network that it writes: a third of the time."""
+    exporter = sys.modules.get("torch.onnx._internal.exporter._registration")
+    if exporter is not None:
+        monkeypatch.setattr(exporter.onnxscript_apis, "get_torchlib_ops", _operators)
+
+
+@functools.cache
+def _operators() -> list[Any]:
+    return importlib.import_module("onnxscript._framework_apis.torch_2_5").get_torchlib_ops()

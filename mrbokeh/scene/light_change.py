@@ -12,6 +12,7 @@ caster needs anyway.
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
@@ -84,8 +85,7 @@ def _lost(
 ) -> tuple[Float32[np.ndarray, "points 3"], Float32[np.ndarray, "points 3"]]:
     """Return the radiance of white surfaces before objects came, and what these take of it."""
     lights, environment = scene.lighting
-    objects = _Objects(scene.drawn_meshes)
-    apart = [_Objects(each.drawn_meshes) for each in scene.parts if each.drawn_meshes] if len(scene.parts) > 1 else [objects]
+    objects, apart = _objects_of(scene)
     total, taken = (np.zeros((len(surfaces.alpha), 3), np.float32) for _ in range(2))
     for light in lights:
         towards, distance_m, irradiance = light.arriving_at(surfaces.shadow_origin + centre_m)
@@ -138,6 +138,13 @@ class _Objects:
     ) -> Float32[np.ndarray, " points"]:
         """Return the share of light, from so far away, that the objects keep from points."""
         return 1.0 - visible(self._rays, points_m - self._rays.centre_m, towards, distance_m)
+
+
+@lru_cache(maxsize=1)
+def _objects_of(scene: Scene) -> tuple[_Objects, list[_Objects]]:
+    """All of a scene, and each of its objects. The light on one ground is asked for some ten times, in more and more pixels."""
+    objects = _Objects(scene.drawn_meshes)
+    return objects, [_Objects(each.drawn_meshes) for each in scene.parts if each.drawn_meshes] if len(scene.parts) > 1 else [objects]
 
 
 def _hidden_sky(

@@ -1,13 +1,13 @@
 """What each option of `mrbokeh composite` changes in the picture, and what stays bit for bit."""
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from mrbokeh import composite
 from mrbokeh.commands._composite_files import plate_by
@@ -33,7 +33,7 @@ from mrbokeh.stacks.exr_layers.deep_layers import DeepSamples, DeepSurfaces
 from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from tests.project.test_user_mistakes import said
 from tests.support.card_stack import SIZE, make_card_stack
-from tests.support.command_line import mrbokeh
+from tests.support.command_line import mrbokeh, printed_by
 from tests.support.composite_exr_reader import read_composite_exr
 from tests.support.refusals import refused
 
@@ -47,9 +47,10 @@ def plate_rgb() -> np.ndarray:
     return np.random.default_rng(0).normal(GREY, 0.02, (HEIGHT, WIDTH, 3)).astype(np.float32)
 
 
-@pytest.fixture
-def files(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A grey wall at 2 m in focus, a post at 0.8 m in its left third, and a white card at 1.3 m."""
+    tmp_path = tmp_path_factory.mktemp("files")
     write_image(tmp_path / "photo.exr", plate_rgb(), half=False)
     depth_m = np.full((HEIGHT, WIDTH), 2.0, np.float32)
     depth_m[:, : WIDTH // 3] = 0.8
@@ -65,13 +66,18 @@ def files(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.fixture
+def files(written: Path, tmp_path: Path) -> Path:
+    """Those files, to write beside."""
+    return shutil.copytree(written, tmp_path, dirs_exist_ok=True)
+
+
 def put_in(files: Path, *words: object, photo: str = "photo.exr", card: str | None = "card.exr") -> np.ndarray:
     """The picture in linear light. Errors are raised here."""
     out = files / f"out{len(list(files.iterdir()))}.exr"
     virtual = () if card is None else ("--layer", files / card)
-    arguments = (files / photo, "--lens", files / "lens.json", *virtual, *words, "--out", out)
-    result = CliRunner().invoke(app, [str(word) for word in arguments], catch_exceptions=False)
-    assert result.exit_code == 0, result.output
+    arguments = (files / photo, "--lens", files / "lens.json", *virtual, *words)
+    printed_by(app, *arguments, "--out", out)
     return read_image(out)
 
 
@@ -385,7 +391,7 @@ def test_all_slices_get_one_scene(files: Path, tmp_path_factory: pytest.TempPath
     write_focal_stack(replace(FocalStack(stack, slices, LENS, camera, registered=True), merged=True))
     out = files / "stack_with_card"
     words = (stack, "--all-slices", "--layer", files / "card.exr", "--out", out)
-    assert CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False).exit_code == 0
+    printed_by(app, *words)
     made = read_focal_stack(out)
     sharp, blurred = (made.slice_rgb(index)[50].mean(axis=1) for index in range(2))
     assert np.abs(np.diff(sharp)).max() > 0.5 > np.abs(np.diff(blurred)).max(), "sharp where it is in focus"
@@ -431,7 +437,7 @@ def test_metres_of_depth_without_a_unit_are_doubted(shared_data: Path, tmp_path:
     assert open_plate(path).metres_guessed
     told = plate_by(CompositeOptions(path, PlateOptions(disparity="0.5:4")), None, lens=None, focus_m=None)
     assert not told.metres_guessed
-    words = ("--object", CAKE, "--at-pixel", "380,700", "--height", "0.1", "--out", tmp_path / "out.png")
+    words = ("--object", CAKE, "--at-pixel", "380,700", "--height", "0.1", "--mode", "front", "--shadow", 0, "--out", tmp_path / "out.png")
     assert "--height 0.1 counts metres, but those of the photograph's depth are guessed" in mrbokeh("composite", path, *words).stderr
 
 

@@ -43,7 +43,8 @@ def test_options_replace_the_sun_of_the_file(tmp_path: Path) -> None:
     for options in (("--sun", "-30,50"), ("--sun-by", "200,60:200,160:240,170"), ("--plain",)):
         standing = ("--at", "0,0.5,2") if options == ("--plain",) else ()
         words = [each for each in STANDING if not (standing and each in ("--at-pixel", "150,150"))]
-        done = run("composite", photo, *words, *standing, *options, "--focus", 3, "--out", tmp_path / "out.png", "--overwrite")
+        words += [*standing, *options, "--focus", 3, "--shadow", 0]
+        done = run("composite", photo, *words, "--out", tmp_path / "out.png", "--overwrite")
         assert done.returncode == 0, done.stderr
         assert "in the file it stood" not in done.stdout
 
@@ -60,7 +61,7 @@ def test_options_replace_the_sun_of_the_file(tmp_path: Path) -> None:
     ids=["no compass", "magnetic north", "a room", "night", "no place"],
 )
 def test_what_is_taken_is_said(tmp_path: Path, gps: dict[int, Any], exif: dict[int, Any], said: str) -> None:
-    _, told = composited(write_sunny(tmp_path / "photo.jpg", gps, TAKEN | EXPOSED | exif), tmp_path / "out.png", "--preview")
+    _, told = composited(write_sunny(tmp_path / "photo.jpg", gps, TAKEN | EXPOSED | exif), tmp_path / "out.png", "--preview", "--shadow", 0)
     assert said in told
 
 

@@ -1,5 +1,7 @@
 """Models of PSFs in closed form: rays against the closed form, the capsule against area sampling, sums, places and symmetry."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 from jaxtyping import Float
@@ -40,6 +42,7 @@ MODELS: dict[str, tuple[PsfModel, list[list[float]]]] = {
 }
 
 
+@cache
 def kernel_of(name: str, rays: int) -> tuple[np.ndarray, np.ndarray]:
     """(kernel in float64, the box)."""
     model, ends = MODELS[name]

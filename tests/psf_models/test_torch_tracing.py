@@ -32,7 +32,7 @@ from mrbokeh.psf_models.torch_tracing._rays import summed  # noqa: E402
 from tests.support.torch_device import NAME  # noqa: E402
 
 DEVICES = [NAME]
-RAYS = 1 << 15
+RAYS = 1 << 13
 Model = Callable[..., PsfModel]
 
 

@@ -21,8 +21,8 @@ from tests.support.renderer_banks import FEW, LENS, SIZE, depth_m, renderers, ri
 
 MODELS: dict[str, Any] = {
     "simple": lambda: SimpleLens(diameter_px=14.0, counts=(14,)),
-    "signed": lambda: SimpleLens(replace(Aperture.disc(), spherical_aberration=0.4), diameter_px=14.0, counts=(28,)),
-    "stylized": lambda: Stylized(np.ones((3, 2, 3), np.float32), diameter_px=14.0, counts=(14,)),
+    "signed": lambda: SimpleLens(replace(Aperture.disc(), spherical_aberration=0.4), diameter_px=14.0, counts=(14,)),
+    "stylized": lambda: Stylized(np.ones((3, 2, 3), np.float32), diameter_px=14.0, counts=(7,)),
     "combined": lambda: Combined(diameter_px=14.0, motion_px=4.0, counts=(8, 4)),
     "physical": lambda: PhysicalLens(
         sensor_mm=(22.0, 14.7), focus_distance_m=0.5, image_width_px=96, nearest_m=0.3, farthest_m=2.0, counts=(4, 3)

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -84,8 +85,8 @@ def name_of(renderer: Renderer) -> str:
     return next(name for name, each in RENDERERS.items() if each is renderer)
 
 
-def depth_for_coc_m(coc_px: float, lens: Lens = LENS) -> float:
-    """The depth at which the lens makes this (signed) circle of confusion: coc = k (1 / focus - 1 / depth)."""
+def depth_for_coc_m(coc_px: Any, lens: Lens = LENS) -> Any:
+    """The depth, or depths, at which the lens makes this (signed) circle of confusion: coc = k (1 / focus - 1 / depth)."""
     return 1.0 / (1.0 / lens.focus_distance_m - coc_px / lens.coc_px_per_dioptre(SIZE_PX))
 
 
@@ -245,7 +246,7 @@ def test_a_lamp_and_a_wire_over_far_depth_stay_where_they_are(renderer: Renderer
     rgb, coc_px = np.zeros((SIZE_PX, SIZE_PX, 3), np.float32), np.zeros((SIZE_PX, SIZE_PX))
     rgb[12, 36], rgb[:, 12] = 100.0, 1.0
     coc_px[12, 36] = coc_px[:, 12] = front_px
-    light = renderer.render([opaque(rgb, np.vectorize(depth_for_coc_m)(coc_px).astype(np.float32))], LENS).rgb[..., 0]
+    light = renderer.render([opaque(rgb, depth_for_coc_m(coc_px).astype(np.float32))], LENS).rgb[..., 0]
     assert centroid(light[:25, 24:]) == pytest.approx((12, 12), abs=0.05)
     assert centroid(light[30:, :25].sum(axis=0)) == pytest.approx((12,), abs=0.05)
 
@@ -253,7 +254,7 @@ def test_a_lamp_and_a_wire_over_far_depth_stay_where_they_are(renderer: Renderer
 def test_alpha_stays_a_share(renderer: Renderer) -> None:
     rng = np.random.default_rng(7)
     alpha = rng.uniform(0.0, 1.0, (SIZE_PX, SIZE_PX)) * (rng.uniform(0.0, 1.0, (SIZE_PX, SIZE_PX)) > 0.5)
-    depth_m = np.vectorize(depth_for_coc_m)(rng.uniform(-9.0, 9.0, alpha.shape)).astype(np.float32)
+    depth_m = depth_for_coc_m(rng.uniform(-9.0, 9.0, alpha.shape)).astype(np.float32)
     layer = Layer((texture(8) * alpha[..., None]).astype(np.float32), alpha.astype(np.float32), depth_m)
     result = renderer.render([layer, flat_layer(texture(9) * alpha[..., None], alpha, 12.0)], LENS)
     assert result.alpha.min() >= 0.0 and result.alpha.max() <= 1.0 + 1e-6
@@ -348,7 +349,7 @@ def two_halves(left_px: float, right_px: float) -> tuple[np.ndarray, np.ndarray]
 def with_a_lamp(seed: int, coc_px: np.ndarray) -> Layer:
     rgb = texture(seed).astype(np.float32)
     rgb[22, 38] = 50.0
-    return opaque(rgb, np.vectorize(depth_for_coc_m)(coc_px).astype(np.float32))
+    return opaque(rgb, depth_for_coc_m(coc_px).astype(np.float32))
 
 
 SCENES = {

@@ -16,13 +16,15 @@ from tests.support.command_line import printed_by
 from tests.support.made_networks import GATED, PARITY, PUBLISHED, SIZE, TOP, blurred, pictures, session_of, twin, untrained
 from tests.support.refusals import refused
 from training.commands.export import export_command
+from training.export import fast_onnx
 from training.export.fast_onnx import ASSUMED_PSNR_DB, export_fast_network, loss_db, made_up_sample, model_of, plans
 from training.export.graph_builder import coarse_kernel, place_responses, tent
 from training.export.onnx_export import network_facts_of, record_path
 from training.export.published_graph import BlockPlan, PublishedGraph, separable_kernels
 from training.fitting.run_folder import RunFacts, save_network, write_facts
 from training.fitting.settings import TrainSettings, write_settings
-from training.networks.network import TileGrid
+from training.networks.network import BlurNetwork, TileGrid
+from training.networks.network_settings import NetworkSettings
 
 
 @pytest.mark.parametrize("padding", ["replicate", "reflect", "zeros"])
@@ -108,7 +110,12 @@ def test_what_keeps_no_budget_or_has_no_fast_graph_is_said(tmp_path: Path) -> No
     refused("channel by channel", PublishedGraph, untrained(replace(PUBLISHED, mixing="colour", width=2)), [BlockPlan()] * 4)
 
 
-def test_the_command_writes_a_fast_network(tmp_path: Path) -> None:
+def whole_graph(network: BlurNetwork, settings: NetworkSettings, facts: RunFacts, path: Path) -> None:
+    fast_onnx.write_model(network, plans(network)[-1], network_facts_of(network, settings, facts), path)
+
+
+def test_the_command_writes_a_fast_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Compared on a small picture with the graph of the boldest plan's opposite, which computes all; the plain export has its own tests."""
     settings = TrainSettings(network=replace(PUBLISHED, blocks=2))
     run = tmp_path / "run"
     run.mkdir()
@@ -116,5 +123,7 @@ def test_the_command_writes_a_fast_network(tmp_path: Path) -> None:
     write_facts(run, _facts())
     save_network(run, untrained(settings.network, 5.0))
     out = tmp_path / "fast.onnx"
+    monkeypatch.setattr(fast_onnx, "TIMED_SIZE_PX", SIZE)
+    monkeypatch.setattr(fast_onnx, "export_network", whole_graph)
     told = printed_by(export_command, run, "--out", out, "--fast", "--max-psnr-loss", 0.1)
     assert "times faster" in told and "of at most 0.1 dB" in told and out.is_file()

@@ -84,8 +84,10 @@ def _open_stretches(aperture: Aperture, v: float) -> list[tuple[float, float, fl
 def _crossings(outline: Float64[np.ndarray, "points 2"], v: float) -> list[float]:
     """Return where a closed outline crosses the line of this v, from left to right."""
     closed = np.concatenate([outline, outline[:1]])
-    pairs = ((a, b) for a, b in pairwise(closed) if (a[1] <= v) != (b[1] <= v))
-    return sorted(float(a[0] + (v - a[1]) / (b[1] - a[1]) * (b[0] - a[0])) for a, b in pairs)
+    below = closed[:, 1] <= v
+    at = np.flatnonzero(below[1:] != below[:-1])
+    a, b = closed[at], closed[at + 1]
+    return sorted((a[:, 0] + (v - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])).tolist())
 
 
 BLOCKS_ACROSS = 4

@@ -45,9 +45,9 @@ def write_deep_exr(path: Path | str, layers: Sequence[Layer], *, half: bool = Tr
     begins = np.flatnonzero(np.diff(rows, prepend=-1) | np.diff(columns, prepend=-1))
     values = {name: rgba[which, rows, columns, i].astype(dtype) for i, name in enumerate("RGBA")} | {"Z": depth_m[which, rows, columns]}
     planes = {name: np.full(depth_m.shape[1:], None, object) for name in values}
-    for name, of_samples in values.items():
-        for y, x, samples in zip(rows[begins], columns[begins], np.split(of_samples, begins[1:]), strict=True):
-            planes[name][y, x] = samples
+    for y, x, begin, end in np.column_stack([rows[begins], columns[begins], begins, np.append(begins, len(rows))[1:]]).tolist():
+        for name, of_samples in values.items():
+            planes[name][y, x] = of_samples[begin:end]
     header = {"type": OpenEXR.deepscanline, "compression": OpenEXR.ZIPS_COMPRESSION, "comments": _DEEP_COMMENTS}
     with atomic_path(path) as temporary:
         OpenEXR.File([OpenEXR.Part(header, planes, "rgba")]).write(str(temporary))
