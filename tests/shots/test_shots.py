@@ -255,14 +255,14 @@ def test_parts_of_other_settings_are_refused_but_not_a_folder_without_parts(tmp_
 
 
 @contextmanager
-def opened_once_three_worked(recipe: Brighter) -> Iterator[None]:
-    """No held frame is made before three workers have come, so that none of them finds all done."""
+def opened_once_all_work(recipe: Brighter, count: int = 2) -> Iterator[None]:
+    """No held frame is made before so many workers have come, so that none of them finds all done."""
     assert recipe.gate is not None and recipe.pids is not None
     gate, pids = recipe.gate, recipe.pids
     pids.mkdir()
 
     def open_it() -> None:
-        wait_for(lambda: len(list(pids.iterdir())) == 3)
+        wait_for(lambda: len(list(pids.iterdir())) == count)
         gate.touch()
 
     opener = threading.Thread(target=open_it, daemon=True)
@@ -288,7 +288,7 @@ def test_worker_processes_make_the_same_file_and_a_killed_one_loses_nothing(tmp_
     fatal = tmp_path / "fatal"
     fatal.touch()
     recipe = Brighter(gate=tmp_path / "gate", held_from=4, killing=fatal, pids=tmp_path / "pids")
-    with opened_once_three_worked(recipe):
+    with opened_once_all_work(recipe, 3):
         render_shot(shot_of(clip, VideoTarget(tmp_path / "two.mp4"), recipe), ProcessExecutor(2), progress=told.append)
     assert not fatal.exists() and len(list((tmp_path / "pids").iterdir())) == 3
     assert sum(told) == COUNT
