@@ -85,7 +85,7 @@ def _checked(plain: Callable[..., Any], check: Callable[..., Any]) -> Callable[.
         return check(plain)
     from beartype.roar import BeartypeCallHintViolation
 
-    once = tests.checked(plain)  # type: ignore[misc]
+    once = tests.checked(plain)
 
     def either(*args: Any, **kwargs: Any) -> Any:
         try:

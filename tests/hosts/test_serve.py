@@ -177,7 +177,7 @@ def test_ctrl_c_ends_it_within_two_seconds_in_the_middle_of_a_picture(tmp_path: 
     rgb, depth_m = np.full((1200, 1600, 3), 0.5, np.float32), np.full((1200, 1600), 4.0, np.float32)
     with ThreadPoolExecutor(1) as callers:
         asked = callers.submit(blurred, rgb, depth_m, what="render", renderer="scatter", focus=0.3, f_number=1.4, connection=str(path))
-        time.sleep(1.0)
+        time.sleep(0.6)
         assert not asked.done()
         server.send_signal(signal.SIGINT)
         begun_s = time.monotonic()

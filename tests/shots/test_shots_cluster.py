@@ -16,7 +16,7 @@ from mrbokeh import __version__
 from mrbokeh.shots.executors import DaskExecutor, Executor, SerialExecutor, require_same_files
 from mrbokeh.shots.render_shot import VideoTarget, render_shot
 from mrbokeh.system.errors import InputError
-from tests.shots.test_shots import COUNT, clip_of_blobs, opened_once_two_work, shot_of
+from tests.shots.test_shots import COUNT, clip_of_blobs, opened_once_all_work, shot_of
 from tests.support.refusals import refused
 from tests.support.shot_makers import Brighter, wait_for
 
@@ -64,7 +64,7 @@ def test_a_cluster_makes_the_same_file(tmp_path: Path, address: str) -> None:
     render_shot(shot_of(clip, VideoTarget(tmp_path / "one.mp4")), SerialExecutor())
     told: list[int] = []
     recipe = Brighter(gate=tmp_path / "gate", pids=tmp_path / "pids")
-    with opened_once_two_work(recipe):
+    with opened_once_all_work(recipe):
         render_shot(shot_of(clip, VideoTarget(tmp_path / "two.mp4"), recipe), executor, progress=told.append)
     assert len(list((tmp_path / "pids").iterdir())) == 2, "both workers took part"
     assert str(os.getpid()) not in {file.name for file in (tmp_path / "pids").iterdir()}

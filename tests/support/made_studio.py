@@ -24,15 +24,23 @@ WIDTH, HEIGHT = 240, 180
 CAKE, ALIEN = SHIPPED / "cakeBirthday.glb", SHIPPED / "alien.glb"
 
 
+_floors: dict[tuple[str, int, int], bytes] = {}
+
+
 def write_floor(path: Path, width: int = WIDTH, height: int = HEIGHT) -> Path:
-    """Write a chequered floor below a level horizon, and an even wall above it."""
-    rows, columns = np.mgrid[:height, :width] + 0.5
+    """Write a chequered floor below a level horizon, and an even wall above it; large ones take a second, and are made once."""
+    key = (path.suffix, width, height)
+    if key in _floors:
+        path.write_bytes(_floors[key])
+        return path
+    rows, columns = np.arange(height)[:, None] + 0.5, np.arange(width) + 0.5
     down = np.maximum(rows - height / 2, 0.5) / width
     across, ahead = (columns - width / 2) / width / down, 1.0 / down
     tiles = (np.floor(across) + np.floor(ahead / 2)) % 2
     light = np.where(rows > height / 2, 0.25 + 0.35 * tiles, 0.5)
     rgb = (light[..., None] * [1.0, 0.95, 0.85]).astype(np.float32)
     write_image(path, rgb)
+    _floors[key] = path.read_bytes()
     return path
 
 
@@ -50,6 +58,11 @@ def solved_once(told: Any, lines: Any = ()) -> Any:
     if isinstance(_answers[key], InputError):
         raise _answers[key]
     return _answers[key]
+
+
+def unsolved(_told: Any, _lines: Any = ()) -> Any:
+    """In place of `photograph.solved` where a large picture's tilt is given: to look for its camera takes a second."""
+    raise InputError("nobody looks for lines in this test")
 
 
 @dataclass

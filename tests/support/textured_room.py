@@ -37,10 +37,10 @@ PAPERS = [paper(seed) for seed in range(3)]
 def picture(camera: Camera) -> np.ndarray:
     """Grey, 8 bits; four rays for each pixel."""
     fine = camera.resized(2 * camera.width_px, 2 * camera.height_px)
-    origin = camera.world_from_camera[:3, 3]
-    rays = (fine.unproject(fine.pixel_centres_px(), np.ones((fine.height_px, fine.width_px))) - origin).astype(np.float32)
-    rays, origin = np.ascontiguousarray(np.moveaxis(rays, 2, 0)), origin.astype(np.float32)
-    best, grey = np.full(rays.shape[1:], np.inf, np.float32), np.zeros(rays.shape[1:], np.uint8)
+    size_px, origin = (fine.width_px, fine.height_px), camera.world_from_camera[:3, 3].astype(np.float32)
+    right, down = ((np.arange(n) + 0.5 - middle) / f for n, middle, f in zip(size_px, fine.principal_px, fine.focal_px, strict=True))
+    rays = [(x * right + (y * down + z)[:, None]).astype(np.float32) for x, y, z in fine.world_from_camera[:3, :3]]
+    best, grey = np.full(size_px[::-1], np.inf, np.float32), np.zeros(size_px[::-1], np.uint8)
     for texture, axis, place, across in zip(PAPERS, (0, 1, 2), (1.5, 0.8, 3.5), ((1, 2), (0, 2), (0, 1)), strict=True):
         with np.errstate(divide="ignore", invalid="ignore"):
             far = (np.float32(place) - origin[axis]) / rays[axis]

@@ -74,5 +74,5 @@ def camera_frames(clip: BoardClip) -> Iterator[tuple[CameraFrame, Camera]]:
 
 @cache
 def small_clip() -> tuple[tuple[CameraFrame, Camera], ...]:
-    """12 frames of 640x360, sharp where the board is."""
-    return tuple(camera_frames(clip_of(640, 360, 12)))
+    """8 frames of 640x360, sharp where the board is."""
+    return tuple(camera_frames(clip_of(640, 360, 8)))

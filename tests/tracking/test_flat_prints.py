@@ -21,7 +21,7 @@ from tests.support.textured_room import PAPERS
 from tests.support.traced_board_clip import MOTION
 from tests.support.video_files import filmed
 
-SIZE_PX, FOCAL_PX, FRAMES, HIDDEN = (480, 360), 460.0, 12, (5, 6)
+SIZE_PX, FOCAL_PX, FRAMES, HIDDEN = (480, 360), 460.0, 8, (4, 5)
 WIDTH_M = 0.24
 
 

@@ -243,12 +243,12 @@ for i in range(3000):
 def test_a_killed_process_loses_less_than_a_second_and_the_take_is_recovered(tmp_path: Path) -> None:
     with subprocess.Popen([sys.executable, "-c", CHILD, str(tmp_path / "take.mp4")], stdout=subprocess.PIPE, text=True) as child:
         assert child.stdout is not None
-        while float(child.stdout.readline()) < 3.0:
+        while float(child.stdout.readline()) < 2.3:
             pass
         # It is being recorded: another viewfinder that starts here leaves it alone.
         assert recover_takes(tmp_path) == [] and under_way(tmp_path / "take.mp4").exists()
         child.send_signal(signal.SIGKILL)
-        told_s = max(map(float, child.stdout.read().split()), default=3.0)
+        told_s = max(map(float, child.stdout.read().split()), default=2.3)
     shutil.copy(under_way(tmp_path / "take.mp4"), tmp_path / "as_it_is.mp4")
     [sentence] = recover_takes(tmp_path)
     assert sentence.startswith("a take that was cut off was recovered: take.mp4 (")
@@ -260,6 +260,12 @@ def test_a_killed_process_loses_less_than_a_second_and_the_take_is_recovered(tmp
         container.seek(round(1.8 / stream.time_base), stream=stream)
         # A keyframe at least at every thirtieth picture.
         assert 0.8 - 1e-3 <= next(container.decode(stream)).time <= 1.8
+
+
+def played(path: Path) -> int:
+    """How many pictures a player shows of a file."""
+    with av.open(str(path)) as container:
+        return sum(1 for _ in container.decode(video=0))
 
 
 def test_a_file_cut_anywhere_plays_up_to_there_or_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -287,7 +293,7 @@ def test_a_file_cut_anywhere_plays_up_to_there_or_is_removed(tmp_path: Path, mon
             under_way(tmp_path / "take.mp4").write_bytes(whole[:length])
             told = recover_takes(tmp_path)
             left = tmp_path / "take-2.mp4"
-            counts.append(len(list(read_frames(left))) if told else 0)
+            counts.append(played(left) if told else 0)
             assert left.exists() == bool(told) and not under_way(tmp_path / "take.mp4").exists()
             left.unlink(missing_ok=True)
         assert counts == sorted(counts) and counts[-1] >= 30

@@ -21,8 +21,9 @@ from mrbokeh.images.image_io import write_image
 from mrbokeh.solving.solved_camera import read_solved_camera
 from mrbokeh.system.errors import InputError
 from tests.support.command_line import mrbokeh
-from tests.support.made_studio import ALIEN, CAKE, HEIGHT, WIDTH, made_studio, write_floor
+from tests.support.made_studio import ALIEN, CAKE, HEIGHT, WIDTH, made_studio, unsolved, write_floor
 from tests.support.waiting import comes_true
+from viewfinder.studio import photograph
 from viewfinder.studio.brush import Brush, as_shown, snapped, tinted
 from viewfinder.studio.command_line import options_of, words_of
 from viewfinder.studio.desk import Desk
@@ -233,8 +234,9 @@ def test_strokes_that_cannot_be_meant_are_refused(message: dict[str, object], wh
         stroke_of(message)
 
 
-async def test_a_shadow_tells_the_sun_in_pixels_of_the_whole_photograph(tmp_path: Path) -> None:
+async def test_a_shadow_tells_the_sun_in_pixels_of_the_whole_photograph(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A level camera, a post of 30 px and its shadow of 60 px straight to the left, in a photograph that is larger than its preview."""
+    monkeypatch.setattr(photograph, "solved", unsolved)
     photo = write_floor(tmp_path / "floor.png", 5 * WIDTH, 5 * HEIGHT)
     async with made_studio(tmp_path, StudioState(photo=photo, object=CAKE, pitch_deg=0.0, plain=True)) as made:
         desk = made.desk
@@ -273,17 +275,18 @@ async def test_drawn_lines_give_the_camera_until_they_are_taken_away(tmp_path: P
         assert desk.state.lines == () and desk.state.camera == expected != first.camera
 
 
-async def test_a_known_height_tells_how_high_the_camera_stands(tmp_path: Path) -> None:
+async def test_a_known_height_tells_how_high_the_camera_stands(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A level camera, a foot 60 px below the horizon and a head 10 px below it: the camera is 60 / 50 times as high as that is."""
-    photo = write_floor(tmp_path / "floor.png", 8 * WIDTH, 8 * HEIGHT)
-    first = StudioState(photo=photo, object=CAKE, pitch_deg=0.0, at_px=(960.0, 1200.0))
+    monkeypatch.setattr(photograph, "solved", unsolved)
+    photo = write_floor(tmp_path / "floor.png", 5 * WIDTH, 5 * HEIGHT)
+    first = StudioState(photo=photo, object=CAKE, pitch_deg=0.0, at_px=(600.0, 750.0))
     async with made_studio(tmp_path, first) as made:
         desk = made.desk
         await opened_desk(desk)
         await comes_true(lambda: desk.state.camera_height_m is not None)
         before = desk.state
         assert before.camera_height_m == 1.5 and before.height is not None
-        person = [8 * 120, 8 * 150, 8 * 121, 8 * 100, 1.75]
+        person = [5 * 120, 5 * 150, 5 * 121, 5 * 100, 1.75]
         await desk.change({"measured": person})
         assert desk.state.camera_height_m == pytest.approx(1.75 * 60 / 50, rel=1e-3)
         assert float(desk.state.height or 0) == pytest.approx(float(before.height) * 2.1 / 1.5, rel=1e-3), "as large in the picture"
@@ -294,14 +297,14 @@ async def test_a_known_height_tells_how_high_the_camera_stands(tmp_path: Path) -
         # Tilted down by 20 degrees the same pixels are another height: of the rays' own geometry.
         await desk.change({"pitch_deg": 20.0})
         assert desk.photograph is not None
-        focal_px = desk.photograph.plate_for(options_of(desk.state), 1e5)[0].lens.focal_px(8 * WIDTH)
-        down = np.radians(20.0) + np.arctan(np.array([8 * 60, 8 * 10]) / focal_px)
+        focal_px = desk.photograph.plate_for(options_of(desk.state), 1e5)[0].lens.focal_px(5 * WIDTH)
+        down = np.radians(20.0) + np.arctan(np.array([5 * 60, 5 * 10]) / focal_px)
         wanted_m = 0.875 / (1.0 - np.tan(down[1]) / np.tan(down[0]))
         assert desk.state.camera_height_m == pytest.approx(wanted_m, rel=2e-3)
         for measured, why in (
-            ([8, 8 * 60, 8, 8 * 20, 1.7], "below the horizon"),
+            ([5, 5 * 60, 5, 5 * 20, 1.7], "below the horizon"),
             ([8, 8, 8, 9], "metres"),
-            ([0, 1300, 1900, 1300, 2], "leans"),
+            ([0, 800, 1180, 800, 2], "leans"),
         ):
             with pytest.raises(InputError, match=why):
                 await desk.change({"measured": measured, "pitch_deg": 0.0})

@@ -5,7 +5,7 @@ import json
 import time
 from dataclasses import replace
 from functools import cache
-from itertools import pairwise
+from itertools import islice, pairwise
 from pathlib import Path
 from threading import enumerate as threads
 
@@ -86,7 +86,7 @@ def test_a_picture_without_a_board_gives_no_corners() -> None:
 def test_poses_are_exact_with_a_search_in_every_frame_and_flow_bridges_frames_without_one() -> None:
     poses, detector = tracked(1)
     assert_exact(poses)
-    assert detector.searches == 12
+    assert detector.searches == 8
     assert all(pose is not None and pose.points >= 36 and pose.residual_px < 0.3 and pose.quality > 0.5 for pose in poses)
     poses, detector = tracked(100)
     assert detector.searches == 1
@@ -229,7 +229,8 @@ def test_a_failing_search_does_not_end_the_thread(caplog: pytest.LogCaptureFixtu
 
 
 def test_a_real_dark_clip_is_tracked_in_most_frames(shared_data: Path) -> None:
-    """320x180, mean code 14, glare on a tablet in the last third. OpenCV alone finds 6 corners in 77 % of the frames.
+    """The harder two thirds of a clip of 320x180, mean code 14, with glare on a tablet in the last. OpenCV alone finds 6 corners in 77 % of
+    all frames.
 
     Its intrinsics are not known: 300 px fit best; its scale neither, which changes nothing in pixels.
     """
@@ -241,10 +242,10 @@ def test_a_real_dark_clip_is_tracked_in_most_frames(shared_data: Path) -> None:
     camera = Camera(320, 180, (300.0, 300.0), (160.0, 90.0))
     poses = [
         tracker.track(CameraFrame(frame.bgr, number / 60.0, number), camera)
-        for number, frame in enumerate(read_display_frames(path, 320, 180))
+        for number, frame in enumerate(islice(read_display_frames(path, 320, 180), 150, None))
     ]
     fresh = [pose for number, pose in enumerate(poses) if pose is not None and pose.captured_s == number / 60.0]
-    assert len(poses) == 443 and len(fresh) > 0.82 * len(poses) and np.mean([pose.residual_px for pose in fresh]) < 0.4
+    assert len(poses) == 293 and len(fresh) > 0.82 * len(poses) and np.mean([pose.residual_px for pose in fresh]) < 0.4
     steps = [np.linalg.norm(one.camera_from_world[:3, 3] - other.camera_from_world[:3, 3]) for one, other in pairwise(fresh)]
     assert np.median(steps) < 0.01, "poses jump about"
 

@@ -89,7 +89,7 @@ def _solved(board: FlatPrint, views: Sequence[Corners], size_px: tuple[int, int]
         return None
     rms_px, matrix, coefficients, sigmas = found[0], found[1], np.ravel(found[2]), np.ravel(found[5])
     focal_px, count = float(matrix[0, 0]), 2 * sum(map(len, views))
-    if max(sigmas[2:4]) > _WORST_PRINCIPAL * max(size_px):
+    if focal_px <= 0.0 or max(sigmas[2:4]) > _WORST_PRINCIPAL * max(size_px):
         return None
     others_px = [_rms_px(points, pixels, size_px, matrix * _scaled(factor), coefficients, flags) for factor in _PROBES]
     focal_sigma = _focal_sigma(rms_px, others_px, count)
