@@ -45,7 +45,7 @@ REGISTERED_PX = 1.3
 
 @pytest.fixture(scope="module")
 def clip(tmp_path_factory: pytest.TempPathFactory) -> LiveClip:
-    return write_live_clip(tmp_path_factory.mktemp("clip"), WIDTH, HEIGHT, 9)
+    return write_live_clip(tmp_path_factory.mktemp("clip"), WIDTH, HEIGHT, 12)
 
 
 def off_px(seen: Seen | np.ndarray, clip: LiveClip, moved_m: tuple[float, float] = (0.0, 0.0), capture: int = 0) -> float:
