@@ -120,14 +120,14 @@ def test_without_depth_an_object_stands_on_level_ground(files: Path, composite: 
 
 
 def test_a_preview_is_small_and_tells_the_size_in_pixels_of_the_photograph(tmp_path: Path, composite: Composite) -> None:
-    """24 px of 144 are 192 of 1152; the picture is 1000 px wide and has the grid's colour beside the object, not on it."""
+    """24 px of 144 are 240 of 1440; the picture is 1000 px wide and has the grid's colour beside the object, not on it."""
     photo, out = tmp_path / "large.exr", tmp_path / "preview.png"
-    write_image(photo, np.repeat(np.repeat(plate_rgb(), 8, axis=0), 8, axis=1))
-    words = (photo, "--object", CAKE, "--at-pixel", "800,560", "--pitch", 10, "--height", "192px", "--preview", "--out", out)
+    write_image(photo, np.repeat(np.repeat(plate_rgb(), 10, axis=0), 10, axis=1))
+    words = (photo, "--object", CAKE, "--at-pixel", "1000,700", "--height", "240px", "--preview", "--out", out)
     code, told = composite(*words, "--focal-length", 35, "--sensor-width", 23.5, "--f-number", 4, "--focus", 3)
     assert code == 0, told
     height_px = int(re.search(r"x(\d+) px, ", told).group(1))  # type: ignore[union-attr]
-    assert 176 < height_px < 232 and "cells of 0.2 m" in told, told
+    assert 220 < height_px < 290 and "cells of 0.2 m" in told, told
     shown = cv2.imread(str(out))[..., ::-1].astype(int)
     assert shown.shape == (667, 1000, 3)
     yellow = np.abs(shown - (255, 225, 40)).max(axis=2) < 60

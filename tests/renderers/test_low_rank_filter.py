@@ -13,13 +13,13 @@ from mrbokeh.renderers.low_rank.low_rank_filter import LowRankFilter, depth_edge
 from mrbokeh.renderers.scatter_reference import scatter
 from mrbokeh.system.errors import InputError
 
-HEIGHT_PX, WIDTH_PX = 110, 150
+HEIGHT_PX, WIDTH_PX = 150, 190
 SLOPE = np.tile(np.linspace(1.0, 36.0, WIDTH_PX, dtype=np.float32), (HEIGHT_PX, 1))
 MAPS = {
     "even": np.full((HEIGHT_PX, WIDTH_PX), 20.3, np.float32),
     "slope": SLOPE,
     "through the focus": 2.0 * SLOPE - 37.0,
-    "two planes": np.where(np.arange(WIDTH_PX) < 70, -25.0, 17.0).astype(np.float32) * np.ones((HEIGHT_PX, 1), np.float32),
+    "two planes": np.where(np.arange(WIDTH_PX) < 90, -25.0, 17.0).astype(np.float32) * np.ones((HEIGHT_PX, 1), np.float32),
     "any": np.random.default_rng(5).uniform(-20.0, 20.0, (HEIGHT_PX, WIDTH_PX)).astype(np.float32),
 }
 APERTURES = {"disc": Aperture.disc(), "5 blades": Aperture.blades(5, 0.3), "ring": Aperture.disc().obstructed(0.5)}

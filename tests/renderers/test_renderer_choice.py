@@ -89,17 +89,17 @@ def test_in_python_a_lens_that_was_read_keeps_its_kernels(folder: Path) -> None:
 
 def test_the_opening_of_banks_without_diameters() -> None:
     """A lens by its prescription shows the round opening of its stop; a medium has none, for which a disc stands."""
-    model = PhysicalLens(focus_distance_m=1.0, image_width_px=100, nearest_m=0.6, farthest_m=1.0e4, counts=(4, 2))
+    model = PhysicalLens(focus_distance_m=1.0, image_width_px=400, nearest_m=0.6, farthest_m=1.0e4, counts=(4, 2))
     made = [model.kernel(box, 1 << 10, 0) for box in _boxes(model)]
     traced = PsfBank("physical", model.axes, model.counts, tuple(made), "field", settings=model.settings)
     lens = lens_of(traced)
     assert lens is not None and lens.focal_length_mm == pytest.approx(50.0, rel=0.02) and lens.focus_distance_m == 1.0
     assert 0.7 < opening_of(traced).unit_radius < 1.4
-    scene, renderer = [opaque(np.ones((20, 100, 3), np.float32), np.full((20, 100), 2.0, np.float32))], LaplacianSpreadlets(traced)
+    scene, renderer = [opaque(np.ones((20, 400, 3), np.float32), np.full((20, 400), 2.0, np.float32))], LaplacianSpreadlets(traced)
     assert renderer.render(scene, lens).rgb.max() > 0.0
-    refused("is focused at 1 m from the lens.*--focus 4", renderer.render, scene, lens.focused_at(4.0))
+    refused("is focused at 1 m from the lens.*--focus 2", renderer.render, scene, lens.focused_at(2.0))
     small = [opaque(each.rgb[:, :40], each.depth_m[:, :40]) for each in scene]
-    refused("for pictures 100 px wide, but this one is 40 px", renderer.render, small, lens)
+    refused("for pictures 400 px wide, but this one is 40 px", renderer.render, small, lens)
     fog = Volume(focal_px=64.0, size_px=15, counts=(1,))
     scattering = PsfBank("volume", fog.axes, (1,), (np.ones((1, 1, 3), np.float32),), nested=False)
     assert lens_of(scattering) is None and opening_of(scattering).unit_radius == pytest.approx(1.0, abs=0.01)
