@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,10 +13,11 @@ import pytest
 
 from mrbokeh.images.image_io import write_image
 from mrbokeh.scene.staging.scene_description import looking_down
-from mrbokeh.solving.line_segments import Segments
+from mrbokeh.solving import vanishing_points
+from mrbokeh.solving.line_segments import find_segments, working_copy
 from mrbokeh.solving.solve_camera import Line, solve_camera
 from mrbokeh.solving.solved_camera import SolvedCamera, read_solved_camera, write_solved_camera
-from mrbokeh.solving.vanishing_points import Frame, best_frames
+from mrbokeh.solving.vanishing_points import Frame, best_frames, candidates, fit
 from mrbokeh.system.errors import InputError
 from tests.support.command_line import mrbokeh
 from tests.support.projected_places import KINDS, LENSES_MM, Place, place
@@ -32,19 +34,8 @@ def room() -> tuple[Place, np.ndarray]:
 
 @cache
 def camera_of_room(focal_px: float | None = None) -> SolvedCamera:
-    """The camera of the room, for each focal length that is stated; what its segments alone say is looked for once."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("mrbokeh.solving.solve_camera.best_frames", frames_of_room)
-        return solve_camera(room()[1], focal_px)
-
-
-FRAMES_OF_ROOM = dict[float | None, list[Frame]]()
-
-
-def frames_of_room(segments: Segments, points: np.ndarray, focal: float | None = None) -> list[Frame]:
-    if focal not in FRAMES_OF_ROOM:
-        FRAMES_OF_ROOM[focal] = best_frames(segments, points, focal)
-    return FRAMES_OF_ROOM[focal]
+    """The camera of the room, for each focal length that is stated."""
+    return solve_camera(room()[1], focal_px)
 
 
 def horizon_off_deg(camera: SolvedCamera, made: Place) -> float:
@@ -93,6 +84,27 @@ def test_a_known_focal_length_is_kept_and_compared() -> None:
     assert horizon_off_deg(camera, made) < 0.3
     wrong = camera_of_room(1.3 * made.focal_px)
     assert "are stated" in wrong.disagreement()
+
+
+def test_what_was_fitted_once_is_not_fitted_again_and_the_frames_are_those_of_every_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    segments = find_segments(working_copy(room()[1]))
+    points, fits = candidates(segments, np.random.default_rng(0)), [0]
+
+    def counted(*args: Any) -> Frame:
+        fits[0] += 1
+        return fit(*args)
+
+    monkeypatch.setattr(vanishing_points, "fit", counted)
+    found, few = best_frames(segments, points), fits[0]
+    refined = vanishing_points._refined
+    forgetting = lambda segments, frame, focal, _fitted, start: refined(segments, frame, focal, {}, start)  # noqa: E731
+    monkeypatch.setattr(vanishing_points, "_refined", forgetting)
+    plain = best_frames(segments, points)
+    assert few < 0.8 * (fits[0] - few)
+    assert len(found) == len(plain)
+    for one, other in zip(found, plain, strict=True):
+        np.testing.assert_array_equal(one.axes, other.axes)
+        np.testing.assert_allclose([*one.directions.ravel(), one.focal], [*other.directions.ravel(), other.focal], atol=1e-9)
 
 
 def test_distortion_of_a_lens_does_not_bend_the_camera_and_a_fisheye_is_refused() -> None:
