@@ -28,7 +28,7 @@ Kernel = Float32[np.ndarray, "_ _"]
 # Slices that tell one light's flux may differ by this share; what differs more is no single light.
 LARGEST_SPREAD = 0.25
 RING_PX = 3.0
-# Of slices that tell no common flux, so many tell the largest; blur does not add light, and a full sensor only takes some away.
+# So many slices tell the largest flux of a light.
 FEWEST_BRIGHTEST = 2
 # Slices in which a light is seen whole.
 FEWEST_SLICES = 3
@@ -45,7 +45,7 @@ LOSING_RANGE = 0.45
 # the slices clearly better.
 LARGEST_DRAWN_PX = 30.0
 LARGEST_DRAWN_SHARE = 0.65
-CLEARLY = 2.0
+CLEARLY = 3.0
 LARGEST_LIGHT_PX = 120.0
 # What is brighter than the light's own slice by this share of its widest disc was added by a disc.
 RING_SHARE = 0.3
@@ -179,10 +179,9 @@ class Discs:
         if not good.any():
             return good
         alike = good & (np.abs(flux - np.median(flux[good])) < LARGEST_SPREAD * np.median(flux[good]))
-        # Channels are full at different values, below the peak of the brightest: the light that is lost there is missing in its slices.
-        widest = self.whole & (flux > (1.0 - LARGEST_SPREAD) * flux[self.whole].max())
-        agree = widest & good
-        return agree if agree.sum() >= FEWEST_SLICES or (not alike.any() and widest.sum() >= FEWEST_BRIGHTEST) else alike
+        # Blur adds no light, and full channels, which are so at different values below the peak of the brightest, lose some.
+        most = self.whole & (flux > (1.0 - LARGEST_SPREAD) * flux[self.whole].max())
+        return most & good if (most & good).any() and most.sum() >= FEWEST_BRIGHTEST else alike
 
 
 def measured_discs(patches: Patches, zone: Mask, centre_px: Float[np.ndarray, "2"], areas_px: Float[np.ndarray, " slices"]) -> Discs:
