@@ -30,15 +30,13 @@ LARGEST_SPREAD = 0.25
 RING_PX = 3.0
 # So many slices tell the largest flux of a light.
 FEWEST_BRIGHTEST = 2
-# Slices in which a light is seen whole.
+# In so many slices a light is seen whole.
 FEWEST_SLICES = 3
 # A drawn light explains its slices, to this share of the light in them, and leaves at most this share of the ordinary merge's error.
 LEAST_EXPLAINED = 0.9
 LARGEST_ERROR_SHARE = 0.7
 # Slices to which a drawn light is blurred again: from the sharpest to the widest.
 COMPARED_SLICES = 5
-# A disc is as much larger than what is seen of it above its surroundings.
-RIM_SHARE = 1.15
 # Demosaicing and resampling spread what is full: in slices that lose light, what is brighter than this, and beside it, is a lower bound.
 LOSING_RANGE = 0.45
 # Small lights that hold less than this share of their flux in focus do not show their shape: a disc is drawn, unless another way explains
@@ -47,6 +45,8 @@ LARGEST_DRAWN_PX = 30.0
 LARGEST_DRAWN_SHARE = 0.65
 CLEARLY = 3.0
 LARGEST_LIGHT_PX = 120.0
+# So many pixels around lights, of all slices, are held at once: 0.4 GB.
+MOST_CUT_PX = 32_000_000
 # What is brighter than the light's own slice by this share of its widest disc was added by a disc.
 RING_SHARE = 0.3
 # Lights that hold this share of their flux in focus need no restoring.
@@ -98,12 +98,15 @@ def restored_lights(
     if len(candidates) == 0:
         return candidates, []
     small = [each for light in range(len(candidates)) if (each := _Place.of(candidates, light)).area_px <= LARGEST_LIGHT_PX]
-    cut = [[rgb[each.box].copy() for each in small] for rgb in slices()]
-    found = {
-        place.light: drawn
-        for place, patches in zip(small, zip(*cut, strict=True), strict=True)
-        if (drawn := _restored(np.stack(patches), merged[place.box], place, candidates.areas_px[:, place.light], guided, opening))
-    }
+    pixels = np.cumsum([each.zone.size for each in small]) * len(candidates.areas_px)
+    found = {}
+    for group in np.unique(pixels // MOST_CUT_PX):
+        places = [each for each, number in zip(small, pixels // MOST_CUT_PX, strict=True) if number == group]
+        cut = [[rgb[each.box].copy() for each in places] for rgb in slices()]
+        for place, patches in zip(places, zip(*cut, strict=True), strict=True):
+            areas_px = candidates.areas_px[:, place.light]
+            if drawn := _restored(np.stack(patches), merged[place.box], place, areas_px, guided, opening):
+                found[place.light] = drawn
     kept = np.isin(np.arange(len(candidates)), list(found))
     return candidates.only(kept), [found[light] for light in sorted(found)]
 
@@ -173,15 +176,18 @@ class Discs:
 
     @property
     def believable(self) -> Bool[np.ndarray, " slices"]:
-        """Slices in which the light is whole, below saturation and about as bright as in the others."""
+        """Slices in which the light is whole, below the peak of the brightest, and as bright as in most of them.
+
+        Where all of these are full, and so have lost some, the largest flux that two tell: blur adds no light.
+        """
         flux = self.flux.sum(axis=1)
         good = self.whole & (self.peak < UNSATURATED_SHARE * self.peak.max()) & (flux > 0)
         if not good.any():
             return good
         alike = good & (np.abs(flux - np.median(flux[good])) < LARGEST_SPREAD * np.median(flux[good]))
-        # Blur adds no light, and full channels, which are so at different values below the peak of the brightest, lose some.
         most = self.whole & (flux > (1.0 - LARGEST_SPREAD) * flux[self.whole].max())
-        return most & good if (most & good).any() and most.sum() >= FEWEST_BRIGHTEST else alike
+        lost = (self.peak[alike & ~most] > OVER_RANGE).all()
+        return most & good if lost and (most & good).any() and most.sum() >= FEWEST_BRIGHTEST else alike
 
 
 def measured_discs(patches: Patches, zone: Mask, centre_px: Float[np.ndarray, "2"], areas_px: Float[np.ndarray, " slices"]) -> Discs:
@@ -248,7 +254,9 @@ def _restored(
         return None
     spread = _without_rings(ordinary, patches[sharpest], zone, discs, areas_px)
     # In the light's own slice nothing of it lies on its surroundings. Another base has to be clearly better.
-    bases, lost = ((spread, CLEARLY if guided else 1.0), (ordinary, 1.0 if guided else CLEARLY)), _mostly_lost(discs, areas_px, sharpest)
+    bases, lost = [(spread, CLEARLY if guided else 1.0), (ordinary, 1.0 if guided else CLEARLY)], _mostly_lost(discs, areas_px, sharpest)
+    if np.array_equal(spread, ordinary):
+        bases = [(ordinary, 1.0)]
     compare, ways = _Comparison.of(patches, zone, discs, areas_px, sharpest, opening), []
     for base, handicap in bases:
         drawn = _drawn(base, discs, areas_px[sharpest])
@@ -299,7 +307,7 @@ class _Comparison:
         open_share = 1.0 if opening is None else _open_share(opening)
 
         def kernel(index: int, own_area_px: float) -> Kernel:
-            area_px = 0.0 if index == sharpest else max(RIM_SHARE * areas_px[index] - own_area_px, 0.0)
+            area_px = 0.0 if index == sharpest else max(areas_px[index] - own_area_px, 0.0)
             radius_px = float(np.sqrt(area_px / open_share / np.pi))
             return _disc_kernel(radius_px, shape) if opening is None else opening_kernel(opening, radius_px)
 
@@ -307,13 +315,13 @@ class _Comparison:
         for index in chosen:
             full = LOSING_RANGE if discs.flux[index].sum() < LARGEST_HELD_SHARE * flux else OVER_RANGE
             least = cv2.dilate((patches[index].max(axis=2) > full).astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-            looks.append((patches[index], least, (kernel(index, 0.0), kernel(index, RIM_SHARE * areas_px[sharpest]))))
-            grey = _grey(patches[index])
-            light += float(((grey - np.median(grey[~zone] if (~zone).any() else grey)) ** 2)[zone].sum())
+            looks.append((patches[index], least, (kernel(index, 0.0), kernel(index, areas_px[sharpest]))))
+            around = np.median(patches[index][~zone] if (~zone).any() else patches[index].reshape(-1, 3), axis=0)
+            light += float(((patches[index] - around) ** 2)[zone].sum() / 3.0)
         return cls(zone, tuple(looks), light)
 
     def error(self, picture: Rgb) -> float:
-        """Return the squared difference, in the light's zone, between the slices and a picture blurred as they are; full is full."""
+        """Return the squared difference, in the light's zone, between the slices and a picture blurred in the better of both ways."""
         errors = [[self._missed(seen, least, kernel, picture) for kernel in kernels] for seen, least, kernels in self.looks]
         return float(np.min(np.sum(errors, axis=0)))
 

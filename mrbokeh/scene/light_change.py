@@ -12,7 +12,7 @@ caster needs anyway.
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from functools import lru_cache
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64
@@ -140,11 +140,16 @@ class _Objects:
         return 1.0 - visible(self._rays, points_m - self._rays.centre_m, towards, distance_m)
 
 
-@lru_cache(maxsize=1)
+_KEPT = WeakKeyDictionary[Scene, tuple[_Objects, list[_Objects]]]()
+
+
 def _objects_of(scene: Scene) -> tuple[_Objects, list[_Objects]]:
-    """All of a scene, and each of its objects. The light on one ground is asked for some ten times, in more and more pixels."""
-    objects = _Objects(scene.drawn_meshes)
-    return objects, [_Objects(each.drawn_meshes) for each in scene.parts if each.drawn_meshes] if len(scene.parts) > 1 else [objects]
+    """Return all of a scene, and each of its objects; kept as long as the scene: light on one ground is asked for some ten times."""
+    if scene not in _KEPT:
+        objects = _Objects(scene.drawn_meshes)
+        apart = [_Objects(each.drawn_meshes) for each in scene.parts if each.drawn_meshes] if len(scene.parts) > 1 else [objects]
+        _KEPT[scene] = objects, apart
+    return _KEPT[scene]
 
 
 def _hidden_sky(

@@ -62,10 +62,10 @@ def over_time(renderer: Renderer, frames: list[list[Layer]]) -> np.ndarray:
 
 @pytest.mark.parametrize("coc_px", [0.0, pytest.param(9.0, marks=pytest.mark.slow), -13.0])
 def test_a_moving_card_before_a_still_background(renderer: Renderer, coc_px: float) -> None:
-    """6 px to the right: 7 frames a whole pixel apart. Nearer than its background, so that it hides it in every frame."""
+    """12 px to the right: 13 frames a whole pixel apart. Nearer than its background, so that it hides it in every frame."""
     still = background(18.0)
-    frames = [[object_layer(37 + step, coc_px), still] for step in range(7)]
-    blurred = renderer.render([moving(object_layer(40, coc_px), (6.0, 0.0)), moving(still, (0.0, 0.0))], LENS).rgb
+    frames = [[object_layer(34 + step, coc_px), still] for step in range(13)]
+    blurred = renderer.render([moving(object_layer(40, coc_px), (12.0, 0.0)), moving(still, (0.0, 0.0))], LENS).rgb
     assert psnr(blurred, over_time(renderer, frames)) > 45.0
 
 
