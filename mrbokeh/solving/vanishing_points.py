@@ -232,10 +232,10 @@ def _is_found(gains: Float64[np.ndarray, " segments"], axes: Axes, axis: int) ->
 
 
 def _refined(segments: Segments, frame: Frame, focal: float | None, fitted: dict[bytes, int], start: int) -> Frame | None:
-    """Return the frame by least squares over its segments; None where an earlier start had the same, and ended alike.
+    """Return the frame by least squares over its segments; None where an earlier start was fitted to the same, and most likely ended alike.
 
-    focal: held if known. fitted: from the axes of segments to the start that was fitted to them first. (A third of the fits is saved; of
-    88 photographs of strangers every camera is the same.)
+    focal: held if known. fitted: from the axes of segments to the start that was fitted to them first. (A third of the fits is saved. Of 88
+    photographs of strangers every camera is the same; of 96 drawn places the best frame is another in four, no better or worse.)
     """
     frame = scored(segments, frame, focal is not None)
     for _ in range(3):

@@ -139,6 +139,7 @@ def test_the_command_says_what_it_guesses(tmp_path: Path, monkeypatch: pytest.Mo
         taken.append(pictures)
         np.testing.assert_array_equal(pictures[0], taken[0][0])
         np.testing.assert_array_equal(pictures[1], taken[0][1])
+        assert pictures[2].focal_px == taken[0][2].focal_px
         return moved()
 
     monkeypatch.setattr("mrbokeh.depth.stereo_depth.camera_movement", found_once)

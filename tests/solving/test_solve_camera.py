@@ -86,7 +86,7 @@ def test_a_known_focal_length_is_kept_and_compared() -> None:
     assert "are stated" in wrong.disagreement()
 
 
-def test_what_was_fitted_once_is_not_fitted_again_and_the_frames_are_those_of_every_start(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_fitted_once_is_not_fitted_again_and_a_room_has_the_same_frames(monkeypatch: pytest.MonkeyPatch) -> None:
     segments = find_segments(working_copy(room()[1]))
     points, fits = candidates(segments, np.random.default_rng(0)), [0]
 

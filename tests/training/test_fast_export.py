@@ -115,7 +115,7 @@ def whole_graph(network: BlurNetwork, settings: NetworkSettings, facts: RunFacts
 
 
 def test_the_command_writes_a_fast_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Compared on a small picture with the graph of the boldest plan's opposite, which computes all; the plain export has its own tests."""
+    """Compared on a small picture with the graph of the last plan; the plain export has its own tests."""
     settings = TrainSettings(network=replace(PUBLISHED, blocks=2))
     run = tmp_path / "run"
     run.mkdir()

@@ -23,7 +23,7 @@ from capture.report.stack_gates import picture_gates, stack_gates
 from capture.stacks.slice_looks import BLOCK_PX
 from mrbokeh.images.camera_rgb import write_camera_rgb
 from mrbokeh.images.image_io import read_image
-from mrbokeh.stacks.focal_stack import FocalStack, Slice, write_focal_stack, write_merged
+from mrbokeh.stacks.focal_stack import FocalStack, Slice, read_focal_stack, write_focal_stack, write_merged
 from mrbokeh.system.atomic_files import write_json
 from tests.support.command_line import printed_by
 from tests.support.refusals import refused
@@ -146,10 +146,13 @@ def reported(tmp_path_factory: pytest.TempPathFactory) -> Reported:
 
 
 def judged_with(report: SceneReport, **metadata: object) -> dict[str, Gate]:
-    """The gates of the picture by name, where merging and retouching say this in the stack."""
+    """The gates of the picture by name, where merging and retouching say this in the stack, as its file brings it back."""
     findings = report.stacks[0].findings
     stack = replace(findings.stack, metadata=findings.stack.metadata | metadata)
-    return {each.name: each for each in picture_gates(replace(findings, stack=stack))}
+    write_focal_stack(stack)
+    read = read_focal_stack(stack.folder)
+    write_focal_stack(findings.stack)
+    return {each.name: each for each in picture_gates(replace(findings, stack=read))}
 
 
 def gate(report: SceneReport, name: str) -> Gate:
