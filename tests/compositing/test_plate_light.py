@@ -179,7 +179,7 @@ def test_a_wall_and_noise_are_no_ground() -> None:
 def test_light_in_few_pixels_is_that_of_all_pixels(sun_degrees: tuple[float, float] | None) -> None:
     """A cake of 0.3 m; where lights throw sharp shadows the truth has four rays a pixel. Under the cake, where nobody sees it, it is as
     light as beside it: the dark there would show as dashes through the rim."""
-    camera = Camera(200, 150, (300.0, 300.0), (100.0, 75.0))
+    camera = Camera(300, 225, (450.0, 450.0), (150.0, 112.5))
     made = picture_light(photograph(), (60.0, 60.0), looking_down(0.5), sun_degrees)
     one = OneObject(
         DATA / "objects" / "cakeBirthday.glb",
@@ -193,9 +193,9 @@ def test_light_in_few_pixels_is_that_of_all_pixels(sun_degrees: tuple[float, flo
     objects, shadow = filmed.at(lambda _: one.seen_by(camera))
     scene, catcher = filmed._staged.scene_at(0.0), filmed._staged.catcher
     assert catcher is not None
-    fine = upright_camera(one.seen_by(camera), filmed._staged.description.up).resized(400, 300)
-    lost = 1.0 - luminance(light_left(scene, fine, catcher, np.arange(400 * 300), samples=24))
-    whole = cv2.resize(lost.reshape(300, 400), (200, 150), interpolation=cv2.INTER_AREA)
+    fine = upright_camera(one.seen_by(camera), filmed._staged.description.up).resized(600, 450)
+    lost = 1.0 - luminance(light_left(scene, fine, catcher, np.arange(600 * 450), samples=24))
+    whole = cv2.resize(lost.reshape(450, 600), (300, 225), interpolation=cv2.INTER_AREA)
     seen, apart = objects.alpha == 0.0, np.abs(shadow.alpha - whole)
     assert whole[seen].max() > 0.5
     assert np.percentile(apart[seen & (whole > 0.01)], 95) < 0.04
